@@ -1,0 +1,137 @@
+"""What the FAISS kinds share: FAISS names the candidates, `indexes.scores` scores and orders them."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import faiss as _faiss
+import numpy as np
+
+from indexes.base import VectorIndex
+from indexes.errors import CorruptIndex, EngineError
+from indexes.scores import Doubles, Floats, Mask, Slots, best, grid_scores, on_grid, scan, slack
+
+faiss: Any = _faiss
+"""The library, untyped: its stubs leave out half of it."""
+
+GROWTH = 4
+"""How much further each round looks than the one before."""
+
+
+@contextmanager
+def guarded(doing: str, threads: int | None) -> Iterator[None]:
+    """Run FAISS with `threads` threads (None: its own setting) and turn what it raises into `EngineError`."""
+    before = faiss.omp_get_max_threads()
+    if threads is not None:
+        faiss.omp_set_num_threads(threads)
+    try:
+        yield
+    except (RuntimeError, AssertionError, ValueError, TypeError, MemoryError) as error:
+        raise EngineError(f"FAISS failed while {doing}: {error or type(error).__name__}") from error
+    finally:
+        faiss.omp_set_num_threads(before)
+
+
+class FaissIndex(VectorIndex):
+    """A kind whose candidates come from a FAISS structure.
+
+    Rounds: the structure names some candidates; they are scored and ordered exactly; a query is settled when
+    k live ones are there and, for an exact kind, no slot outside can reach the last of them. The unsettled
+    look `GROWTH` times further, and once everything would be asked for the vectors are scanned instead.
+    """
+
+    structure_type: ClassVar[str]
+    """Name of the FAISS class."""
+    build_threads: ClassVar[int | None] = None
+    """Threads of a build unless the caller names a number."""
+
+    _structure: Any
+
+    def copy(self) -> Self:
+        """An index whose `add` leaves this one as it is. The vectors are shared, the structure is copied."""
+        other = super().copy()
+        with guarded("copying an index", self.threads):
+            other._structure = faiss.clone_index(self._structure)
+        return other
+
+    @abstractmethod
+    def _make(self) -> Any:
+        """An empty, untrained structure for the resolved parameters."""
+
+    @abstractmethod
+    def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
+        """FAISS's own scores and slots (Q, fetch), best first, -1 where it found none.
+
+        `effort` is 1 in the first round and grows; a kind that can look further multiplies by it.
+        """
+
+    def _first_fetch(self, k: int) -> int:
+        """How many candidates the first round asks for when every slot is live."""
+        return k
+
+    def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
+        scores = np.empty((len(queries), k), dtype=np.float32)
+        slots = np.empty((len(queries), k), dtype=np.int64)
+        dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
+        fetch, effort = math.ceil(self._first_fetch(k) * dilution), 1
+        pending = np.arange(len(queries))
+        while pending.size and fetch < self.count:
+            with guarded("searching", 1 if len(pending) == 1 else self.threads):
+                rough, found = self._candidates(queries[pending], fetch, effort)
+            gridded, open_still = on_grid(queries[pending]), []
+            for place, query in enumerate(pending):
+                ranked = self._rescored(gridded[place], found[place], k, live)
+                if self._settled(ranked[0], rough[place], k):
+                    scores[query], slots[query] = ranked
+                else:
+                    open_still.append(query)
+            pending = np.array(open_still, dtype=np.int64)
+            fetch, effort = fetch * GROWTH, effort * GROWTH
+        if pending.size:
+            scores[pending], slots[pending] = scan(self._vectors, queries[pending], k, live)
+        return scores, slots
+
+    def _rescored(self, query: Doubles, found: Slots, k: int, live: Mask | None) -> tuple[Floats, Slots]:
+        kept = found[found >= 0]
+        if live is not None:
+            kept = kept[live[kept]]
+        return best(grid_scores(query, on_grid(self._vectors[kept])), kept, k)
+
+    def _settled(self, scores: Floats, rough: Floats, k: int) -> bool:
+        if len(scores) < k:
+            return False
+        return not self.exact or float(scores[-1]) > float(rough.min()) + slack(self.dim)
+
+    def _building_threads(self) -> int | None:
+        return self.build_threads if self.threads is None else self.threads
+
+    def _build(self) -> None:
+        with guarded(f"building {self.kind}", self._building_threads()):
+            self._structure = self._make()
+            if not self._structure.is_trained:
+                self._structure.train(self._vectors)
+            self._structure.add(self._vectors)
+
+    def _append(self, fresh: Floats) -> None:
+        with guarded(f"adding to {self.kind}", self._building_threads()):
+            self._structure.add(fresh)
+
+    def _write(self, path: Path) -> None:
+        with guarded(f"writing {path}", None):
+            faiss.write_index(self._structure, str(path))
+
+    def _read(self, path: Path) -> None:
+        try:
+            structure = faiss.read_index(str(path))
+        except Exception as error:
+            raise CorruptIndex(f"{path}: FAISS cannot read it; build the index again ({error})") from error
+        got = (type(structure).__name__, structure.ntotal, structure.d, structure.metric_type)
+        must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
+        if got != must:
+            raise CorruptIndex(
+                f"{path}: must hold (type, count, size, metric) {must}, holds {got}; build the index again"
+            )
+        self._structure = structure

@@ -1,0 +1,59 @@
+"""One writer at a time: a lock that the operating system drops when its holder dies."""
+
+import fcntl
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from indexes.errors import LockedIndex, WriteFailed
+
+
+class WriterLock:
+    """`with WriterLock(path):` holds the lock file for this process, or raises `LockedIndex` at once.
+
+    Entering it again inside the block is allowed. The file stays when the lock is given up; it holds the last
+    holder's process id for messages, and means nothing by being there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._depth = 0
+        self._descriptor = -1
+
+    def __enter__(self) -> Self:
+        if self._depth == 0:
+            self._descriptor = self._take()
+        self._depth += 1
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            os.close(self._descriptor)
+
+    def _take(self) -> int:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise WriteFailed(f"{self.path}: the lock file cannot be opened; {error.strerror}") from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = _holder(descriptor)
+            os.close(descriptor)
+            who = "an unknown process" if holder is None else f"process {holder}"
+            raise LockedIndex(
+                f"{self.path.parent}: one writer at a time; {who} is writing. Wait for it to end", holder
+            ) from error
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()}\n".encode())
+        return descriptor
+
+
+def _holder(descriptor: int) -> int | None:
+    text = os.pread(descriptor, 32, 0).strip()
+    return int(text) if text.isdigit() else None

@@ -1,0 +1,129 @@
+"""`manifest.json`: what a generation is and what its files must be."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from indexes.errors import CorruptIndex, UnsupportedFormat
+from indexes.files import digest, durable, encoded
+
+FORMAT = 1
+NAME = "manifest.json"
+AGAIN = "run `retrieve build-index` again"
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Rows; slots (distinct vectors); tombstones (slots without a row); slots of the last full build."""
+
+    rows: int
+    slots: int
+    tombstones: int
+    built_slots: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The fields of the file, in its order. `asked` are the parameters before None was filled in."""
+
+    generation: str
+    parent: str | None
+    created: str
+    software: str
+    fingerprint: dict[str, str]
+    about: dict[str, Any]
+    dim: int
+    metric: str
+    kind: str
+    parameters: dict[str, Any]
+    asked: dict[str, Any]
+    seed: int
+    recall: dict[str, Any]
+    counts: Counts
+    arrays: list[str]
+    documents: list[str]
+    files: dict[str, dict[str, Any]]
+    format: int = FORMAT
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content as JSON types, the format first."""
+        return {"format": self.format} | asdict(self)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the file, with a digest of its own content at the end."""
+    content = manifest.as_dict()
+    content["sha256"] = _own_digest(content)
+    with durable(folder / NAME) as handle:
+        handle.write(encoded(content, indent=2) + b"\n")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a generation's folder; `CorruptIndex` or `UnsupportedFormat` where it is bad."""
+    path = folder / NAME
+    try:
+        content = json.loads(path.read_bytes())
+    except OSError as error:
+        raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+    except (ValueError, RecursionError) as error:
+        raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
+    if not isinstance(content, dict):
+        raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
+    _check_format(path, content.get("format"))
+    if content.pop("sha256", None) != _own_digest(content):
+        raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
+    return _parsed(path, content)
+
+
+def sealed(folder: Path) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file in the folder."""
+    return {
+        path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())
+    }
+
+
+def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
+    """Every file has its size and, with `verify`, its SHA-256; or `CorruptIndex` naming the file."""
+    for name, must in manifest.files.items():
+        path = folder / name
+        try:
+            size = path.stat().st_size
+            fits = size == must["bytes"] and (not verify or digest(path) == must["sha256"])
+        except OSError as error:
+            raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+        if size != must["bytes"]:
+            raise CorruptIndex(f"{path}: must have {must['bytes']} bytes, has {size}; {AGAIN}")
+        if not fits:
+            raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest's, it was altered; {AGAIN}")
+
+
+def _check_format(path: Path, version: object) -> None:
+    if not isinstance(version, int) or isinstance(version, bool):
+        raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
+    if version == FORMAT:
+        return
+    if version > FORMAT:
+        raise UnsupportedFormat(
+            f"{path}: has format {version}, this software reads {FORMAT}; update the software, or {AGAIN}"
+        )
+    raise UnsupportedFormat(f"{path}: has the older format {version}, this software reads {FORMAT}; {AGAIN}")
+
+
+def _own_digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
+    known = {field.name for field in fields(Manifest)}
+    if set(content) != known:
+        odd = ", ".join(sorted(set(content) ^ known))
+        raise CorruptIndex(
+            f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}"
+        )
+    try:
+        return Manifest(**content | {"counts": Counts(**content["counts"])})
+    except TypeError as error:
+        raise CorruptIndex(f"{path}: the counts are not usable ({error}); {AGAIN}") from error

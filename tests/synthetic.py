@@ -1,0 +1,515 @@
+"""Drawn test pictures, not a simulation of contact: matching photos and gel-like touches of made-up textures.
+
+An object is a relief (family, pitch, depth, ...) and, from another random stream, its looks (colours, paint,
+outline). The SAME relief field shades the photo and dents the gel; nothing else is common to the two, so a
+model that matches them has read the relief. Lengths are in millimetres, pictures are uint8 RGB (height,
+width, 3), `px` is (width, height). Everything is a function of its seeds.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from robot.recording import RecordingWriter
+
+FloatImage = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+
+PX_PER_MM = 8.0  # of the relief field, and of a touch 160 px wide
+FIELD_PX = 512  # the field is a 64 mm square, mirrored beyond its edges
+TOUCH_WIDTH_MM = 20.0
+PHOTO_WIDTH_MM = 44.0
+FORCE_N = (4.0, 15.0)
+_CATALOGUE, _QUERIES = 10**6, 2 * 10**6  # first seeds of pictures outside recordings
+_RELIEF, _LOOKS, _FIELD, _PHOTO, _TOUCH, _SENSOR, _FRAME, _GRASP = range(
+    8
+)  # one random stream for each purpose
+
+
+@dataclass(frozen=True)
+class DrawnObject:
+    """What can be felt (first group) and what can only be seen (second group) of one made-up object."""
+
+    object_id: str
+    seed: int
+    family: str
+    pitch_mm: float
+    depth_mm: float
+    anisotropy: float  # 0 the same in all directions, 1 strongly drawn out
+    regularity: float  # 0 scattered, 1 machine-made
+    sharpness: float  # 0 rounded profile, 1 flat-topped
+
+    colour: tuple[float, float, float]
+    paint: tuple[float, float, float]
+    paint_share: float
+    gloss: float
+    outline: tuple[float, float, float]  # half width and half height as shares of the photo, corner exponent
+
+
+def make_object(seed: int) -> DrawnObject:
+    """The object of this seed; consecutive seeds walk through the families."""
+    feel, looks = np.random.default_rng([_RELIEF, seed]), np.random.default_rng([_LOOKS, seed])
+    family = list(FAMILIES)[seed % len(FAMILIES)]
+    return DrawnObject(
+        object_id=f"{family}-{seed:04d}",
+        seed=seed,
+        family=family,
+        pitch_mm=float(np.exp(feel.uniform(np.log(1.6), np.log(6.5)))),
+        depth_mm=float(np.exp(feel.uniform(np.log(0.25), np.log(0.9)))),
+        anisotropy=float(feel.uniform()),
+        regularity=float(feel.uniform()),
+        sharpness=float(feel.uniform()),
+        colour=_colour(looks),
+        paint=_colour(looks),
+        paint_share=float(looks.uniform(0.0, 0.35)),
+        gloss=float(looks.uniform(0.0, 0.35)),
+        outline=(
+            float(looks.uniform(0.36, 0.47)),
+            float(looks.uniform(0.36, 0.47)),
+            float(looks.uniform(2, 8)),
+        ),
+    )
+
+
+def make_objects(count: int, seed: int = 0) -> list[DrawnObject]:
+    """`count` different objects; other seeds give other objects."""
+    return [make_object(1000 * seed + number) for number in range(count)]
+
+
+def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
+    """One of the stock colours, a little off: many objects share it, so that colour names none of them."""
+    red, green, blue = np.array(_STOCK[int(rng.integers(len(_STOCK)))]) + rng.normal(0, 0.02, 3)
+    return float(red), float(green), float(blue)
+
+
+# Steel, plaster, sand, terracotta, slate blue, olive.
+_STOCK = (
+    (0.6, 0.62, 0.64),
+    (0.8, 0.78, 0.75),
+    (0.72, 0.62, 0.46),
+    (0.7, 0.42, 0.33),
+    (0.4, 0.48, 0.6),
+    (0.52, 0.56, 0.4),
+)
+
+
+# Relief: one field, seen by the eye and felt by the gel -----------------------------------------------------
+
+
+@lru_cache(maxsize=128)
+def relief(obj: DrawnObject) -> FloatImage:
+    """Height in mm, 0..depth_mm, (FIELD_PX, FIELD_PX)."""
+    rng = np.random.default_rng([_FIELD, obj.seed])
+    axis = (np.arange(FIELD_PX, dtype=np.float32) + 0.5) / PX_PER_MM
+    x, y = np.meshgrid(axis, axis)
+    wander = 0.2 * (1.0 - obj.regularity) * obj.pitch_mm
+    x, y = x + wander * _noise(rng, 3 * obj.pitch_mm), y + wander * _noise(rng, 3 * obj.pitch_mm)
+    shape = FAMILIES[obj.family](obj, x, y, rng)
+    low, high = np.percentile(shape, [0.5, 99.5])
+    flat = np.clip((shape - low) / max(high - low, 1e-6), 0.0, 1.0)
+    field = cv2.GaussianBlur((obj.depth_mm * flat).astype(np.float32), (0, 0), 1.0)
+    field.flags.writeable = False
+    return field
+
+
+def _noise(rng: np.random.Generator, pitch_mm: float, stretch: float = 1.0) -> FloatImage:
+    """Smooth noise of unit deviation with its power around one wavelength; `stretch` draws it out along y."""
+    f = np.fft.fftfreq(FIELD_PX, 1 / PX_PER_MM)
+    radius = np.hypot(np.fft.rfftfreq(FIELD_PX, 1 / PX_PER_MM)[None, :], f[:, None] * stretch) * pitch_mm
+    band = np.exp(-0.5 * ((radius - 1.0) / 0.35) ** 2)
+    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((FIELD_PX, FIELD_PX))) * band)
+    return (noise / noise.std()).astype(np.float32)
+
+
+def _profile(obj: DrawnObject, phase: FloatImage) -> FloatImage:
+    """One period of a wave, 0..1, from a cosine (sharpness 0) to a flat-topped bar (sharpness 1)."""
+    steep = 0.4 + 4.0 * obj.sharpness**2
+    return 0.5 + 0.5 * np.tanh(steep * np.cos(2 * np.pi * phase)) / np.tanh(steep)
+
+
+def _cells(
+    obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator
+) -> tuple[FloatImage, FloatImage]:
+    """Distances, in pitches, to the nearest and second nearest point of a (scattered) hexagonal lattice."""
+    stretch = 1.0 + 0.8 * obj.anisotropy
+    rows, columns = np.meshgrid(np.arange(-4, int(70 / obj.pitch_mm)), np.arange(-4, int(70 / obj.pitch_mm)))
+    points = np.stack([rows + 0.5 * (columns % 2), 0.87 * columns], -1).reshape(-1, 2).astype(np.float64)
+    points += rng.normal(0, 0.16 * (1 - obj.regularity), points.shape)
+    half = np.stack(
+        [cv2.resize(c, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for c in (x, y / stretch)], -1
+    )
+    near = cKDTree(points).query(half.reshape(-1, 2) / obj.pitch_mm, k=2)[0].astype(np.float32)
+    size = (FIELD_PX, FIELD_PX)
+    first, second = (
+        cv2.resize(d.reshape(half.shape[:2]), size, interpolation=cv2.INTER_CUBIC) for d in near.T
+    )
+    return first, second
+
+
+def _waves(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    swing = (0.25 + 0.35 * obj.anisotropy) * np.sin(2 * np.pi * y / (3 * obj.pitch_mm))
+    return _profile(obj, x / obj.pitch_mm + swing)
+
+
+def _bumps(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    first, _ = _cells(obj, x, y, rng)
+    radius = 0.30 + 0.15 * obj.sharpness
+    return np.sqrt(np.maximum(1 - (first / radius) ** 2, 0))
+
+
+def _pebble(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    first, second = _cells(obj, x, y, rng)
+    return np.sqrt(np.clip((second - first) / 0.8, 0, 1))
+
+
+def _honeycomb(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    first, second = _cells(obj, x, y, rng)
+    return np.exp(-(((second - first) / (0.15 + 0.2 * obj.sharpness)) ** 2))
+
+
+def _knurl(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    lean = 0.45 + 0.55 * (1 - obj.anisotropy)
+    one, two = (_profile(obj, (x + sign * lean * y) / (1.3 * obj.pitch_mm)) for sign in (-1, 1))
+    return np.minimum(one, two)
+
+
+def _tiles(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    wide, high = x / obj.pitch_mm, y / (obj.pitch_mm * (1 + obj.anisotropy))
+    edge = np.minimum(0.5 - np.abs(wide % 1 - 0.5), (0.5 - np.abs(high % 1 - 0.5)) * (1 + obj.anisotropy))
+    return np.clip(edge / (0.25 - 0.15 * obj.sharpness), 0, 1)
+
+
+def _weave(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    u, v = x / obj.pitch_mm, y / (obj.pitch_mm * (1 + 0.6 * obj.anisotropy))
+    warp = np.abs(np.sin(np.pi * u)) ** 0.7 * (1 + 0.9 * np.sin(np.pi * v) * np.sign(np.sin(np.pi * u)))
+    weft = np.abs(np.sin(np.pi * v)) ** 0.7 * (1 - 0.9 * np.sin(np.pi * u) * np.sign(np.sin(np.pi * v)))
+    return np.maximum(warp, weft)
+
+
+def _lines(obj: DrawnObject, rng: np.random.Generator, per_pitch: float, width_mm: float) -> FloatImage:
+    """Straight strokes, 0..1, at angles that spread out as anisotropy falls."""
+    canvas = np.zeros((FIELD_PX, FIELD_PX), np.float32)
+    side = FIELD_PX / PX_PER_MM
+    for _ in range(int(per_pitch * side / obj.pitch_mm)):
+        angle = np.pi / 2 + rng.normal(0, 1.3 * (1 - obj.anisotropy) + 0.05)
+        start = rng.uniform(0, FIELD_PX, 2)
+        reach = rng.uniform(0.3, 0.9) * FIELD_PX * np.array([np.cos(angle), np.sin(angle)])
+        ends = [tuple(int(16 * value) for value in start + sign * reach / 2) for sign in (-1, 1)]
+        cv2.line(canvas, ends[0], ends[1], 1.0, max(1, round(width_mm * PX_PER_MM)), cv2.LINE_8, 4)
+    return cv2.GaussianBlur(canvas, (0, 0), 1.0 + 1.2 * (1 - obj.sharpness))
+
+
+def _grain(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    noise = _noise(rng, obj.pitch_mm, 1 + 2 * obj.anisotropy)
+    return np.tanh((0.4 + 2 * obj.sharpness) * noise)
+
+
+def _smooth(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
+    """Nearly flat: a few shallow pits."""
+    return np.minimum(_noise(rng, 2 * obj.pitch_mm, 1 + obj.anisotropy) + 1.2 + obj.sharpness, 0)
+
+
+Family = Callable[[DrawnObject, FloatImage, FloatImage, np.random.Generator], FloatImage]
+FAMILIES: Mapping[str, Family] = {
+    "ribs": lambda obj, x, y, rng: _profile(obj, x / obj.pitch_mm),
+    "bumps": _bumps,
+    "scratches": lambda obj, x, y, rng: 1 - _lines(obj, rng, per_pitch=3.0, width_mm=0.5),
+    "weave": _weave,
+    "pebble": _pebble,
+    "knurl": _knurl,
+    "grain": _grain,
+    "dimples": lambda obj, x, y, rng: 1 - _bumps(obj, x, y, rng),
+    "waves": _waves,
+    "tiles": _tiles,
+    "ridges": lambda obj, x, y, rng: _lines(obj, rng, per_pitch=1.6, width_mm=0.9),
+    "honeycomb": _honeycomb,
+    "smooth": _smooth,
+}
+
+
+def _patch(
+    obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float, centre: NDArray[Any]
+) -> FloatImage:
+    """The relief, in mm, under a turned window whose centre lies at `centre` (mm) of the field."""
+    scale = width_mm / px[0] * PX_PER_MM
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    x0 = centre[0] * PX_PER_MM - cos * px[0] / 2 + sin * px[1] / 2
+    y0 = centre[1] * PX_PER_MM - sin * px[0] / 2 - cos * px[1] / 2
+    window = np.array([[cos, -sin, x0], [sin, cos, y0]], np.float32)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(relief(obj), window, px, flags=flags, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def _slopes(height: FloatImage, mm_per_px: float) -> tuple[FloatImage, FloatImage]:
+    """Central differences along x and y, without unit."""
+    x = cv2.Sobel(
+        height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE
+    )
+    y = cv2.Sobel(
+        height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE
+    )
+    return x, y
+
+
+def _grid(px: tuple[int, int]) -> tuple[FloatImage, FloatImage]:
+    """x and y of every pixel, -1..1 across the picture's width, square pixels."""
+    x = (np.arange(px[0], dtype=np.float32) + 0.5) * 2 / px[0] - 1
+    y = ((np.arange(px[1], dtype=np.float32) + 0.5) * 2 - px[1]) / px[0]
+    x, y = np.meshgrid(x, y)
+    return x, y
+
+
+def _turned(x: FloatImage, y: FloatImage, angle: float) -> tuple[FloatImage, FloatImage]:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return x * cos + y * sin, y * cos - x * sin
+
+
+def _blotches(rng: np.random.Generator, px: tuple[int, int], cells: int) -> FloatImage:
+    """Soft random blotches, 0..1."""
+    coarse = rng.uniform(size=(cells, cells)).astype(np.float32)
+    return np.clip(cv2.resize(coarse, px, interpolation=cv2.INTER_CUBIC), 0, 1)
+
+
+def _to_picture(values: FloatImage, rng: np.random.Generator, noise: float) -> Picture:
+    """0..255 with sensor noise of `noise` grey levels, clipped and rounded."""
+    row, column = rng.integers(0, 512 - np.array(values.shape[:2]), endpoint=True)
+    grain = _grain_tile()[row : row + values.shape[0], column : column + values.shape[1]]
+    return np.clip(values + noise * grain + 0.5, 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _grain_tile() -> FloatImage:
+    """White noise to cut each picture's sensor noise from: drawing it anew would cost half a picture."""
+    return np.random.default_rng(0).standard_normal((512, 512, 3), np.float32)
+
+
+# Photo ------------------------------------------------------------------------------------------------------
+
+
+def draw_photo(obj: DrawnObject, seed: int, px: int = 256) -> Picture:
+    """The object lying on a table, turned and lit at random: (px, px, 3)."""
+    rng = np.random.default_rng([_PHOTO, obj.seed, seed])
+    size, angle = (px, px), rng.uniform(0, 2 * math.pi)
+    width_mm = PHOTO_WIDTH_MM * rng.uniform(0.92, 1.08)
+    height = _patch(obj, size, width_mm, angle, rng.uniform(20, 44, 2))
+    mask, shadow = _outline(obj, rng, size, angle)
+    surface = _albedo(obj, size, angle) * _shading(obj, rng, height, width_mm / px, mask)[..., None]
+    table = np.array(_colour(rng), np.float32) * (0.85 + 0.15 * _blotches(rng, size, 9))[..., None]
+    picture = table * shadow[..., None] * (1 - mask[..., None]) + surface * mask[..., None]
+    return _to_picture(255 * picture * rng.uniform(0.85, 1.1), rng, 2.0)
+
+
+def _shading(
+    obj: DrawnObject, rng: np.random.Generator, height: FloatImage, mm_per_px: float, mask: FloatImage
+) -> FloatImage:
+    """Lambert and a highlight under one lamp, valleys darker. The mean over the object is always 0.8."""
+    turn, tilt = rng.uniform(0, 2 * math.pi), rng.uniform(0.6, 1.0)
+    sx, sy = _slopes(height, mm_per_px)
+    lamp = math.cos(tilt) * math.cos(turn), math.cos(tilt) * math.sin(turn), math.sin(tilt)
+    facing = (lamp[2] - sx * lamp[0] - sy * lamp[1]) / np.sqrt(1 + sx * sx + sy * sy)
+    hollow = cv2.GaussianBlur(height, (0, 0), 1.2 / mm_per_px) - height
+    light = (0.25 + np.maximum(facing, 0)) * np.exp(-0.9 * np.maximum(hollow, 0))
+    light += obj.gloss * np.maximum(facing, 0) ** 16
+    return 0.8 * light / max(float((light * mask).sum() / mask.sum()), 1e-3)
+
+
+def _albedo(obj: DrawnObject, size: tuple[int, int], angle: float) -> FloatImage:
+    """Base colour with painted blotches that have nothing to do with the relief."""
+    blotches = _blotches(np.random.default_rng([_LOOKS, obj.seed, 1]), size, 7)
+    turn = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), -float(np.degrees(angle)), 1.0)
+    blotches = cv2.warpAffine(blotches, turn, size, borderMode=cv2.BORDER_REFLECT_101)
+    share = np.clip((blotches - 1 + obj.paint_share) * 6, 0, 1)[..., None]
+    return (1 - share) * np.array(obj.colour, np.float32) + share * np.array(obj.paint, np.float32)
+
+
+def _outline(
+    obj: DrawnObject, rng: np.random.Generator, size: tuple[int, int], angle: float
+) -> tuple[FloatImage, FloatImage]:
+    """Where the object is (0..1), and how much light the table keeps beside it (0..1)."""
+    x, y = _grid(size)
+    x, y = x - rng.uniform(-0.06, 0.06), y - rng.uniform(-0.06, 0.06)
+    u, v = _turned(x, y, angle)
+    wide, high, corner = obj.outline
+    radius = (np.abs(u / (2 * wide)) ** corner + np.abs(v / (2 * high)) ** corner) ** (1 / corner)
+    mask = np.clip((1 - radius) * 0.4 * size[0], 0, 1).astype(np.float32)
+    shift = np.array([[1, 0, rng.uniform(-6, 6)], [0, 1, rng.uniform(-6, 6)]], np.float32)
+    shadow = cv2.GaussianBlur(cv2.warpAffine(mask, shift, size), (0, 0), 5)
+    return mask, 1 - 0.55 * shadow
+
+
+# Touch ------------------------------------------------------------------------------------------------------
+
+
+def draw_touch(
+    obj: DrawnObject,
+    seed: int,
+    px: tuple[int, int] = (160, 120),
+    fingers: Sequence[str] = ("a", "b"),
+    force_n: float | None = None,
+    sensor: int = 0,
+) -> dict[str, Picture]:
+    """Gel pictures of one grasp, one for each finger; each finger meets another patch of the relief."""
+    force = grasp_force(obj, seed) if force_n is None else force_n
+    return {finger: _draw_finger(obj, seed, px, finger, force, sensor) for finger in fingers}
+
+
+def grasp_force(obj: DrawnObject, seed: int) -> float:
+    """The closing force that grasp `seed` of the object was drawn with."""
+    return float(np.random.default_rng([_GRASP, obj.seed, seed]).uniform(*FORCE_N))
+
+
+def draw_background(
+    seed: int, finger: str = "a", px: tuple[int, int] = (160, 120), sensor: int = 0
+) -> Picture:
+    """The gel with nothing on it: the sensor's own tint, with this frame's noise."""
+    rng = np.random.default_rng([_FRAME, seed, *finger.encode()])
+    return _to_picture(_tint(finger, px, sensor), rng, 1.5)
+
+
+def _draw_finger(
+    obj: DrawnObject, seed: int, px: tuple[int, int], finger: str, force_n: float, sensor: int
+) -> Picture:
+    rng = np.random.default_rng([_TOUCH, obj.seed, seed, *finger.encode()])
+    mm_per_px = TOUCH_WIDTH_MM / px[0]
+    height = _patch(obj, px, TOUCH_WIDTH_MM, rng.uniform(0, 2 * np.pi), rng.uniform(10, 54, 2))
+    dent = _indent(height + _body(rng, px, mm_per_px), force_n, mm_per_px)
+    sx, sy = _slopes(dent, mm_per_px)
+    light = np.stack([1 + 0.75 * np.tanh(1.1 * (sx * c + sy * s)) for c, s in _lamps()], -1)
+    values = _tint(finger, px, sensor) * light * (1 - 0.06 * dent)[..., None]
+    return _to_picture(values, rng, 1.5)
+
+
+def _body(rng: np.random.Generator, px: tuple[int, int], mm_per_px: float) -> FloatImage:
+    """How the object's body curves away under the finger: drawn anew for each touch, so it tells nothing."""
+    x, y = (axis * px[0] * mm_per_px / 2 for axis in _grid(px))
+    x, y = x - rng.uniform(-2, 2), y - rng.uniform(-2, 2)
+    turn, radii = (
+        rng.uniform(0, math.pi),
+        [math.exp(rng.uniform(math.log(25), math.log(200))) for _ in range(2)],
+    )
+    u, v = _turned(x, y, turn)
+    return -u * u / (2 * radii[0]) - v * v / (2 * radii[1])
+
+
+def _indent(surface: FloatImage, force_n: float, mm_per_px: float) -> FloatImage:
+    """How deep (mm) the gel is pushed in: the overlap, and a soft skirt where the gel is stretched."""
+    if force_n <= 0:
+        return np.zeros_like(surface)
+    press_mm = 0.9 * (force_n / 10.0) ** (2 / 3)
+    overlap = np.maximum(surface - float(np.percentile(surface, 98)) + press_mm, 0)
+    skirt = overlap
+    for sigma_mm in (1.0, 0.5, 0.25):
+        skirt = np.maximum(overlap, 0.92 * cv2.GaussianBlur(skirt, (0, 0), sigma_mm / mm_per_px))
+    return cv2.GaussianBlur(skirt, (0, 0), 0.16 / mm_per_px)
+
+
+def _lamps() -> list[tuple[float, float]]:
+    """Directions of the red, green and blue lamps."""
+    return [(math.cos(angle), math.sin(angle)) for angle in (2.6, 4.7, 0.5)]
+
+
+@lru_cache(maxsize=16)
+def _tint(finger: str, px: tuple[int, int], sensor: int) -> FloatImage:
+    """The untouched gel: each lamp brighter on its own side, darker edges, a mixture of the sensor's own."""
+    rng = np.random.default_rng([_SENSOR, sensor, *finger.encode()])
+    base = np.array([142, 124, 134], np.float32) + rng.normal(0, 7, 3).astype(np.float32)
+    x, y = _grid(px)
+    lean = [1 - rng.uniform(0.1, 0.22) * (x * c + y * s) for c, s in _lamps()]
+    tint: FloatImage = base * np.stack(lean, -1) * (1 - rng.uniform(0.1, 0.2) * (x * x + y * y))[..., None]
+    return tint
+
+
+# Folders ----------------------------------------------------------------------------------------------------
+
+
+def write_recording(
+    folder: Path,
+    objects: Sequence[DrawnObject],
+    grasps: int,
+    seed: int = 0,
+    fingers: Sequence[str] = ("a", "b"),
+    before: bool = True,
+    misses: int = 0,
+) -> Path:
+    """A recording: for each object, `grasps` successes, then `misses` that closed on nothing.
+
+    `before` adds the untouched gel to each grasp. Returns the folder.
+    """
+    info = {"source": "drawn test pictures, not a simulation of contact", "sensor": "drawn gel", "seed": seed}
+    with RecordingWriter(folder, info) as writer:
+        for obj in objects:
+            for number in range(grasps + misses):
+                key, missed = 1000 * seed + number, number >= grasps
+                force_n = 0.0 if missed else grasp_force(obj, key)
+                images = {"photo": _jpeg(draw_photo(obj, key))}
+                images |= _touch_files(obj, key, fingers, force_n, before)
+                fields = {"force_n": force_n, "grasped": not missed, "sequence_id": f"of-{obj.object_id}"}
+                writer.append(f"{obj.object_id}-{key:06d}", obj.object_id, images, **fields)
+    return Path(folder)
+
+
+def _touch_files(
+    obj: DrawnObject, key: int, fingers: Sequence[str], force_n: float, before: bool
+) -> dict[str, bytes]:
+    touches = draw_touch(obj, key, fingers=fingers, force_n=force_n)
+    files = {f"touch_{finger}": _png(picture) for finger, picture in touches.items()}
+    if before:
+        frame = 1_000_000 * obj.seed + key
+        files |= {f"touch_{finger}_before": _png(draw_background(frame, finger)) for finger in fingers}
+    return files
+
+
+def write_catalogue(
+    folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3, seed: int = 0
+) -> Path:
+    """`<folder>/<object_id>/<n>.jpg`, photos that no recording holds. Returns the folder."""
+    for obj in objects:
+        (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
+        for number in range(photos_per_object):
+            photo = draw_photo(obj, _CATALOGUE + 1000 * seed + number)
+            (Path(folder) / obj.object_id / f"{number + 1}.jpg").write_bytes(_jpeg(photo))
+    return Path(folder)
+
+
+def write_queries(
+    folder: Path,
+    objects: Sequence[DrawnObject],
+    touches_per_object: int = 1,
+    seed: int = 0,
+    fingers: Sequence[str] = ("a", "b"),
+) -> dict[str, list[tuple[Path, ...]]]:
+    """`<folder>/<object_id>/<n>_<finger>.png`, new touches. Returns the files of each touch by object_id."""
+    queries: dict[str, list[tuple[Path, ...]]] = {}
+    for obj in objects:
+        (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
+        for number in range(touches_per_object):
+            touch = draw_touch(obj, _QUERIES + 1000 * seed + number, fingers=fingers)
+            files = {
+                Path(folder) / obj.object_id / f"{number + 1}_{finger}.png": touch[finger]
+                for finger in fingers
+            }
+            for path, picture in files.items():
+                path.write_bytes(_png(picture))
+            queries.setdefault(obj.object_id, []).append(tuple(files))
+    return queries
+
+
+def _jpeg(picture: Picture) -> bytes:
+    return _encode(picture, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 92])
+
+
+def _png(picture: Picture) -> bytes:
+    return _encode(picture, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def _encode(picture: Picture, suffix: str, settings: list[int]) -> bytes:
+    """The file's bytes; OpenCV wants BGR."""
+    return bytes(cv2.imencode(suffix, picture[..., ::-1], settings)[1])
