@@ -84,9 +84,7 @@ class VectorIndex(ABC):
             raise VectorError("an index needs at least one vector; got none")
         asked = cls.parameters_type() if parameters is None else parameters
         if not isinstance(asked, cls.parameters_type):
-            raise ParameterError(
-                f"{cls.kind} takes {cls.parameters_type.__name__}; got {type(asked).__name__}"
-            )
+            raise ParameterError(f"{cls.kind} takes {cls.parameters_type.__name__}; got {type(asked).__name__}")
         index = cls(table, cls._resolve(asked, *table.shape), seed, check_threads(threads))
         index._build()
         return index

@@ -53,9 +53,7 @@ def row_norms(table: Floats) -> Doubles:
 def _check_shape(vectors: object, dim: int | None, what: str) -> Floats:
     if not isinstance(vectors, np.ndarray) or vectors.ndim != 2 or vectors.dtype != np.float32:
         got = " ".join(str(getattr(vectors, name, "")) for name in ("dtype", "shape")).strip()
-        raise VectorError(
-            f"{what} vectors must be float32 of shape (count, size); got {got or type(vectors).__name__}"
-        )
+        raise VectorError(f"{what} vectors must be float32 of shape (count, size); got {got or type(vectors).__name__}")
     if vectors.shape[1] == 0:
         raise VectorError(f"{what} vectors must have at least one component; got shape {vectors.shape}")
     if dim is not None and vectors.shape[1] != dim:

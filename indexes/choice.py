@@ -106,9 +106,7 @@ def choose_kind(
     return _said(taken, exact, budget_ms, min_recall, k)
 
 
-def _said(
-    taken: OperatingPoint, exact: OperatingPoint, budget_ms: float, min_recall: float, k: int
-) -> Choice:
+def _said(taken: OperatingPoint, exact: OperatingPoint, budget_ms: float, min_recall: float, k: int) -> Choice:
     over = f"takes {exact.ms:.3g} ms, over the budget of {budget_ms:g} ms"
     if taken is exact:
         reason = f"Exact search: it {over}, but nothing faster reaches a recall@{k} of {min_recall:g}."

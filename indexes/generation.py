@@ -13,6 +13,7 @@ from indexes.base import VectorIndex
 from indexes.errors import (
     CorruptIndex,
     IndexesError,
+    MismatchedIndex,
     ParameterError,
     SelfRetrievalFailed,
     UnsupportedFormat,
@@ -52,9 +53,7 @@ class Generation:
         self.arrays, self.documents, self.index = arrays, documents, index
         self._number = {row["id"]: number for number, row in enumerate(rows)}
         self._id_rank = np.empty(len(rows), dtype=np.int64)
-        self._id_rank[sorted(range(len(rows)), key=lambda number: str(rows[number]["id"]))] = np.arange(
-            len(rows)
-        )
+        self._id_rank[sorted(range(len(rows)), key=lambda number: str(rows[number]["id"]))] = np.arange(len(rows))
         self._by_slot = np.argsort(slots, kind="stable")
         self._per_slot = np.bincount(slots, minlength=len(embeddings))
         self._starts = np.cumsum(self._per_slot) - self._per_slot
@@ -80,6 +79,16 @@ class Generation:
         """What made the vectors."""
         return self.manifest.fingerprint
 
+    def require(self, expect: Mapping[str, str]) -> None:
+        """Check that the fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
+        for key, value in expect.items():
+            got = self.fingerprint.get(key)
+            if got != value:
+                raise MismatchedIndex(
+                    f"{self.folder.parent}: the index was made with {key} {got!r}, asked for is {value!r}; "
+                    f"use what made it, or {AGAIN}"
+                )
+
     def row_number(self, row_id: str) -> int:
         """The number of the row with that id; KeyError where there is none."""
         return self._number[row_id]
@@ -97,9 +106,7 @@ class Generation:
         return {
             row_id: self._number[row_id]
             for row_id, digest in wanted.items()
-            if digest is not None
-            and row_id in self._number
-            and self.rows[self._number[row_id]].get("digest") == digest
+            if digest is not None and row_id in self._number and self.rows[self._number[row_id]].get("digest") == digest
         }
 
     def self_check(self, sample: int = 256, seed: int = 0) -> None:
@@ -162,9 +169,7 @@ def _mapped(path: Path) -> NDArray[Any]:
     return array
 
 
-def _check_counts(
-    manifest: Manifest, slots: Slots, embeddings: Floats, arrays: Mapping[str, NDArray[Any]]
-) -> None:
+def _check_counts(manifest: Manifest, slots: Slots, embeddings: Floats, arrays: Mapping[str, NDArray[Any]]) -> None:
     counts = manifest.counts
     empty = counts.slots - len(np.unique(slots))
     got = {

@@ -46,7 +46,5 @@ class HNSWIndex(FaissIndex):
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         breadth = max(fetch, self.parameters.ef_search * effort)
-        rough, found = self._structure.search(
-            queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth)
-        )
+        rough, found = self._structure.search(queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth))
         return rough, found

@@ -105,16 +105,12 @@ class IVFPQIndex(IVFFlatIndex):
             )
         if asked.code_bytes is not None and dim % asked.code_bytes:
             raise ParameterError(f"code_bytes must divide the vector size {dim}; got {asked.code_bytes}")
-        return replace(
-            super()._resolve(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim)
-        )
+        return replace(super()._resolve(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim))
 
     def _make(self) -> Any:
         bits = min(8, int(math.log2(self.count / POINTS_PER_CENTRE)))
         parts = self.parameters.code_bytes or 1
-        structure = faiss.IndexIVFPQ(
-            self._centres(), self.dim, self._lists, parts, bits, faiss.METRIC_INNER_PRODUCT
-        )
+        structure = faiss.IndexIVFPQ(self._centres(), self.dim, self._lists, parts, bits, faiss.METRIC_INNER_PRODUCT)
         structure.pq.cp.seed = self.seed
         structure.pq.cp.min_points_per_centroid = 1
         return self._prepared(structure)

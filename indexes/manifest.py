@@ -80,9 +80,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def sealed(folder: Path) -> dict[str, dict[str, Any]]:
     """Size and SHA-256 of every file in the folder."""
-    return {
-        path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())
-    }
+    return {path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -120,9 +118,7 @@ def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
     known = {field.name for field in fields(Manifest)}
     if set(content) != known:
         odd = ", ".join(sorted(set(content) ^ known))
-        raise CorruptIndex(
-            f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}"
-        )
+        raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}")
     try:
         return Manifest(**content | {"counts": Counts(**content["counts"])})
     except TypeError as error:

@@ -54,9 +54,7 @@ def query_ms(index: VectorIndex, queries: Floats, k: int = 10, *, clock: Clock =
     return 1e3 * median(taken)
 
 
-def disagreements(
-    vectors: Floats, queries: Floats, scores: Floats, slots: Slots, tolerance: float
-) -> list[str]:
+def disagreements(vectors: Floats, queries: Floats, scores: Floats, slots: Slots, tolerance: float) -> list[str]:
     """Where results (Q, k) claimed to be the best k differ from the exact search; empty when they hold.
 
     Each score must be the exact score of its slot, the scores must be the best k exact scores (so that a tie

@@ -116,8 +116,7 @@ def check_name(name: str) -> None:
     """`name` can be a file's name in a generation, or `RowError`."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
         raise RowError(
-            f"names of arrays and documents must be lower-case words, not {', '.join(sorted(RESERVED))}; "
-            f"got {name!r}"
+            f"names of arrays and documents must be lower-case words, not {', '.join(sorted(RESERVED))}; got {name!r}"
         )
 
 
@@ -197,9 +196,7 @@ def _fresh_arrays(
     if not ids and not arrays:
         return {name: array[:0] for name, array in parent.arrays.items()}
     if set(arrays) != set(parent.arrays):
-        raise RowError(
-            f"the parent has the arrays {sorted(parent.arrays)}, the new rows have {sorted(arrays)}"
-        )
+        raise RowError(f"the parent has the arrays {sorted(parent.arrays)}, the new rows have {sorted(arrays)}")
     for name, array in arrays.items():
         old = parent.arrays[name]
         if array.dtype != old.dtype or array.shape[1:] != old.shape[1:]:
@@ -216,14 +213,10 @@ def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
     if 0 in array.shape[1:]:
         raise RowError(f"array {name!r} must hold at least one number for each row; got {array.shape[1:]}")
     if len(array) != len(ids):
-        raise RowError(
-            f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}"
-        )
+        raise RowError(f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}")
     for start in range(0, len(array), BLOCK_ROWS):
         block = array[start : start + BLOCK_ROWS]
         good = np.isfinite(block).reshape(len(block), -1).all(axis=1)
         if not good.all():
             row = ids[start + int(np.argmin(good))]
-            raise RowError(
-                f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row
-            )
+            raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from indexes import files, load_kind
 from indexes.base import Parameters, VectorIndex
-from indexes.errors import CorruptIndex, MismatchedIndex, NoIndex, RowError, WriteFailed
+from indexes.errors import CorruptIndex, NoIndex, RowError, WriteFailed
 from indexes.generation import EMBEDDINGS, ROWS, STRUCTURE, Generation, read_generation
 from indexes.locking import WriterLock
 from indexes.manifest import AGAIN, Counts, Manifest, sealed, write_manifest
@@ -65,7 +65,7 @@ class IndexStore:
             if newer == name:
                 raise
             generation = self._read(newer, verify, threads)  # a writer replaced it while it was being read
-        self._check_fingerprint(generation, expect or {})
+        generation.require(expect or {})
         return generation
 
     def current(self) -> str:
@@ -188,9 +188,7 @@ class IndexStore:
             yield
         except OSError as error:
             where = error.filename or self.path
-            raise WriteFailed(
-                f"{where}: the disk refused ({error.strerror or error}); write again"
-            ) from error
+            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
 
     def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
         folder = self.path / name
@@ -200,15 +198,6 @@ class IndexStore:
         if generation.name != name:
             raise CorruptIndex(f"{folder}: the manifest is that of {generation.name}; {AGAIN}")
         return generation
-
-    def _check_fingerprint(self, generation: Generation, expect: Mapping[str, str]) -> None:
-        for key, value in expect.items():
-            got = generation.fingerprint.get(key)
-            if got != value:
-                raise MismatchedIndex(
-                    f"{self.path}: the index was made with {key} {got!r}, asked for is {value!r}; "
-                    f"use what made it, or {AGAIN}"
-                )
 
     def _numbers(self) -> list[int]:
         found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
@@ -234,9 +223,7 @@ class IndexStore:
 
 def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> None:
     """The fingerprint is text, and `about` JSON; or `RowError`."""
-    odd = [
-        key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)
-    ]
+    odd = [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]
     if odd:
         raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
     files.check_json(dict(about), "about")

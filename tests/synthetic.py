@@ -29,9 +29,7 @@ TOUCH_WIDTH_MM = 20.0
 PHOTO_WIDTH_MM = 44.0
 FORCE_N = (4.0, 15.0)
 _CATALOGUE, _QUERIES = 10**6, 2 * 10**6  # first seeds of pictures outside recordings
-_RELIEF, _LOOKS, _FIELD, _PHOTO, _TOUCH, _SENSOR, _FRAME, _GRASP = range(
-    8
-)  # one random stream for each purpose
+_RELIEF, _LOOKS, _FIELD, _PHOTO, _TOUCH, _SENSOR, _FRAME, _GRASP = range(8)  # one random stream for each purpose
 
 
 @dataclass(frozen=True)
@@ -135,22 +133,16 @@ def _profile(obj: DrawnObject, phase: FloatImage) -> FloatImage:
     return 0.5 + 0.5 * np.tanh(steep * np.cos(2 * np.pi * phase)) / np.tanh(steep)
 
 
-def _cells(
-    obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator
-) -> tuple[FloatImage, FloatImage]:
+def _cells(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> tuple[FloatImage, FloatImage]:
     """Distances, in pitches, to the nearest and second nearest point of a (scattered) hexagonal lattice."""
     stretch = 1.0 + 0.8 * obj.anisotropy
     rows, columns = np.meshgrid(np.arange(-4, int(70 / obj.pitch_mm)), np.arange(-4, int(70 / obj.pitch_mm)))
     points = np.stack([rows + 0.5 * (columns % 2), 0.87 * columns], -1).reshape(-1, 2).astype(np.float64)
     points += rng.normal(0, 0.16 * (1 - obj.regularity), points.shape)
-    half = np.stack(
-        [cv2.resize(c, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for c in (x, y / stretch)], -1
-    )
+    half = np.stack([cv2.resize(c, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for c in (x, y / stretch)], -1)
     near = cKDTree(points).query(half.reshape(-1, 2) / obj.pitch_mm, k=2)[0].astype(np.float32)
     size = (FIELD_PX, FIELD_PX)
-    first, second = (
-        cv2.resize(d.reshape(half.shape[:2]), size, interpolation=cv2.INTER_CUBIC) for d in near.T
-    )
+    first, second = (cv2.resize(d.reshape(half.shape[:2]), size, interpolation=cv2.INTER_CUBIC) for d in near.T)
     return first, second
 
 
@@ -235,9 +227,7 @@ FAMILIES: Mapping[str, Family] = {
 }
 
 
-def _patch(
-    obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float, centre: NDArray[Any]
-) -> FloatImage:
+def _patch(obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float, centre: NDArray[Any]) -> FloatImage:
     """The relief, in mm, under a turned window whose centre lies at `centre` (mm) of the field."""
     scale = width_mm / px[0] * PX_PER_MM
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
@@ -250,12 +240,8 @@ def _patch(
 
 def _slopes(height: FloatImage, mm_per_px: float) -> tuple[FloatImage, FloatImage]:
     """Central differences along x and y, without unit."""
-    x = cv2.Sobel(
-        height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE
-    )
-    y = cv2.Sobel(
-        height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE
-    )
+    x = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
+    y = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
     return x, y
 
 
@@ -366,17 +352,13 @@ def grasp_force(obj: DrawnObject, seed: int) -> float:
     return float(np.random.default_rng([_GRASP, obj.seed, seed]).uniform(*FORCE_N))
 
 
-def draw_background(
-    seed: int, finger: str = "a", px: tuple[int, int] = (160, 120), sensor: int = 0
-) -> Picture:
+def draw_background(seed: int, finger: str = "a", px: tuple[int, int] = (160, 120), sensor: int = 0) -> Picture:
     """The gel with nothing on it: the sensor's own tint, with this frame's noise."""
     rng = np.random.default_rng([_FRAME, seed, *finger.encode()])
     return _to_picture(_tint(finger, px, sensor), rng, 1.5)
 
 
-def _draw_finger(
-    obj: DrawnObject, seed: int, px: tuple[int, int], finger: str, force_n: float, sensor: int
-) -> Picture:
+def _draw_finger(obj: DrawnObject, seed: int, px: tuple[int, int], finger: str, force_n: float, sensor: int) -> Picture:
     rng = np.random.default_rng([_TOUCH, obj.seed, seed, *finger.encode()])
     mm_per_px = TOUCH_WIDTH_MM / px[0]
     height = _patch(obj, px, TOUCH_WIDTH_MM, rng.uniform(0, 2 * np.pi), rng.uniform(10, 54, 2))
@@ -456,9 +438,7 @@ def write_recording(
     return Path(folder)
 
 
-def _touch_files(
-    obj: DrawnObject, key: int, fingers: Sequence[str], force_n: float, before: bool
-) -> dict[str, bytes]:
+def _touch_files(obj: DrawnObject, key: int, fingers: Sequence[str], force_n: float, before: bool) -> dict[str, bytes]:
     touches = draw_touch(obj, key, fingers=fingers, force_n=force_n)
     files = {f"touch_{finger}": _png(picture) for finger, picture in touches.items()}
     if before:
@@ -467,9 +447,7 @@ def _touch_files(
     return files
 
 
-def write_catalogue(
-    folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3, seed: int = 0
-) -> Path:
+def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3, seed: int = 0) -> Path:
     """`<folder>/<object_id>/<n>.jpg`, photos that no recording holds. Returns the folder."""
     for obj in objects:
         (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
@@ -492,10 +470,7 @@ def write_queries(
         (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
         for number in range(touches_per_object):
             touch = draw_touch(obj, _QUERIES + 1000 * seed + number, fingers=fingers)
-            files = {
-                Path(folder) / obj.object_id / f"{number + 1}_{finger}.png": touch[finger]
-                for finger in fingers
-            }
+            files = {Path(folder) / obj.object_id / f"{number + 1}_{finger}.png": touch[finger] for finger in fingers}
             for path, picture in files.items():
                 path.write_bytes(_png(picture))
             queries.setdefault(obj.object_id, []).append(tuple(files))

@@ -49,9 +49,7 @@ def test_approximate_kinds_find_most_of_the_best_in_clustered_data(kind):
     assert recall_against_exact(index, sample_queries(vectors, 100), 10) > 0.9
 
 
-@pytest.mark.parametrize(
-    ("kind", "setting"), [("hnsw", "ef_search"), ("ivf_flat", "probes"), ("ivf_pq", "refine")]
-)
+@pytest.mark.parametrize(("kind", "setting"), [("hnsw", "ef_search"), ("ivf_flat", "probes"), ("ivf_pq", "refine")])
 def test_looking_further_finds_more(kind, setting):
     vectors = unit(2000, 32)
     index, queries = load_kind(kind).build(vectors, threads=1), sample_queries(vectors, 100)

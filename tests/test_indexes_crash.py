@@ -114,9 +114,7 @@ while True:
 def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
     store, rng = IndexStore(tmp_path), np.random.default_rng(0)
     for _ in range(3):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind], stdout=subprocess.PIPE
-        )
+        writer = subprocess.Popen([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind], stdout=subprocess.PIPE)
         with writer:
             assert writer.stdout is not None
             writer.stdout.readline()

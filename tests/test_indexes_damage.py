@@ -60,9 +60,7 @@ def test_a_file_in_the_place_of_the_folder_is_no_index(tmp_path):
         IndexStore(tmp_path / "index").open()
 
 
-@pytest.mark.parametrize(
-    "text", ["", "\n", "gen-1", "gen-000001x", "../gen-000001", "\xff\x00", "gen-000001 gen"]
-)
+@pytest.mark.parametrize("text", ["", "\n", "gen-1", "gen-000001x", "../gen-000001", "\xff\x00", "gen-000001 gen"])
 def test_a_current_file_of_garbage_is_corrupt(folder, text):
     (folder.parent / "CURRENT").write_text(text)
     with pytest.raises(CorruptIndex, match="CURRENT: must name a generation"):
@@ -163,9 +161,7 @@ def test_a_pickled_array_is_not_loaded(folder):
         reopened(folder, verify=False)
 
 
-@pytest.mark.parametrize(
-    ("version", "words"), [(2, "has format 2.*update"), (0, "older format 0"), (-1, "older")]
-)
+@pytest.mark.parametrize(("version", "words"), [(2, "has format 2.*update"), (0, "older format 0"), (-1, "older")])
 def test_other_formats_say_whether_they_are_newer_or_older(folder, version, words):
     rewrite_manifest(folder, format=version)
     with pytest.raises(UnsupportedFormat, match=words):

@@ -211,9 +211,7 @@ def test_copies_are_left_out_of_the_measurement(monkeypatch):
 
 def test_operating_points_come_for_each_kind_and_setting_with_the_exact_one_at_recall_one():
     ticks = itertools.count()
-    points = list(
-        operating_points(VECTORS, ("flat", "hnsw", "ivf_flat", "ivf_pq"), clock=lambda: next(ticks))
-    )
+    points = list(operating_points(VECTORS, ("flat", "hnsw", "ivf_flat", "ivf_pq"), clock=lambda: next(ticks)))
     assert [point.kind for point in points] == ["flat"] + ["hnsw"] * 6 + ["ivf_flat"] * 5 + ["ivf_pq"] * 5
     assert points[0].recall == 1.0
     assert all(point.ms == 1000.0 for point in points)

@@ -146,9 +146,7 @@ def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path,
     assert sorted(reuse) == names(count - 2, start=2)
     assert reuse["p00005"] == 5
     fresh, extra = unit(2, seed=9), np.array([[-1.0], [-2.0]], np.float32)
-    second = store.write(
-        wanted, fresh, {"halves": extra}, fingerprint=FINGERPRINT, kind=kind, parent=first, threads=1
-    )
+    second = store.write(wanted, fresh, {"halves": extra}, fingerprint=FINGERPRINT, kind=kind, parent=first, threads=1)
     assert second.manifest.parent == "gen-000001"
     assert second.rows == wanted
     expected = np.concatenate([fresh[:1], unit(count)[2:][::-1], fresh[1:]])
@@ -187,9 +185,7 @@ def test_removed_rows_leave_tombstones_until_a_tenth_is_gone(tmp_path, kind):
 @pytest.mark.parametrize("kind", ["exact", "flat"])
 def test_exact_kinds_never_keep_tombstones(tmp_path, kind):
     first = filled(tmp_path, 50, kind)
-    second = IndexStore(tmp_path).write(
-        rows_of(names(49)), None, fingerprint=FINGERPRINT, kind=kind, parent=first
-    )
+    second = IndexStore(tmp_path).write(rows_of(names(49)), None, fingerprint=FINGERPRINT, kind=kind, parent=first)
     assert (second.manifest.counts.slots, second.manifest.counts.tombstones) == (49, 0)
 
 
@@ -336,16 +332,12 @@ def test_bad_input_is_refused_in_words_and_leaves_the_old_index(tmp_path, change
 def test_arrays_that_differ_from_the_parents_are_refused(tmp_path, arrays, words):
     parent = filled(tmp_path, arrays={"halves": np.zeros((20, 2))})
     with pytest.raises(RowError, match=words):
-        IndexStore(tmp_path).write(
-            rows_of(names(21)), unit(1, seed=3), arrays, fingerprint=FINGERPRINT, parent=parent
-        )
+        IndexStore(tmp_path).write(rows_of(names(21)), unit(1, seed=3), arrays, fingerprint=FINGERPRINT, parent=parent)
 
 
 def test_new_vectors_of_another_size_than_the_parents_are_refused(tmp_path):
     with pytest.raises(VectorError, match="must have 8 components"):
-        IndexStore(tmp_path).write(
-            rows_of(names(21)), unit(1, 5), fingerprint=FINGERPRINT, parent=filled(tmp_path)
-        )
+        IndexStore(tmp_path).write(rows_of(names(21)), unit(1, 5), fingerprint=FINGERPRINT, parent=filled(tmp_path))
 
 
 def test_a_build_whose_rows_do_not_find_themselves_never_becomes_current(tmp_path, monkeypatch):
@@ -432,9 +424,7 @@ def test_any_changes_of_a_catalogue_end_in_what_a_fresh_build_gives(tmp_path_fac
         halves = fresh[:, :2].astype(np.float16)
         generation = store.write(rows, fresh, {"halves": halves}, parent=generation, **more)
         whole = contents[[int(row["digest"]) for row in rows]]
-        anew = IndexStore(folder / "fresh").write(
-            rows, whole, {"halves": whole[:, :2].astype(np.float16)}, **more
-        )
+        anew = IndexStore(folder / "fresh").write(rows, whole, {"halves": whole[:, :2].astype(np.float16)}, **more)
         assert generation.rows == anew.rows
         assert np.array_equal(generation.arrays["halves"], anew.arrays["halves"])
         for k in (1, 2, 12):

@@ -82,9 +82,7 @@ def test_every_family_fills_its_depth_and_dents_the_gel(number: int) -> None:
 
 def test_a_finger_without_force_shows_the_untouched_gel() -> None:
     """The two differ by their sensor noise alone, of deviation 1.5 each."""
-    empty = draw_touch(make_object(1), 0, force_n=0.0)["b"].astype(float) - draw_background(0, "b").astype(
-        float
-    )
+    empty = draw_touch(make_object(1), 0, force_n=0.0)["b"].astype(float) - draw_background(0, "b").astype(float)
     assert abs(empty.mean()) < 0.1
     assert 1.5 < empty.std() < 3
 
@@ -92,9 +90,7 @@ def test_a_finger_without_force_shows_the_untouched_gel() -> None:
 def test_more_force_dents_more() -> None:
     obj = make_object(4)
     rest = draw_background(0).astype(float)
-    change = [
-        np.abs(draw_touch(obj, 0, force_n=f)["a"].astype(float) - rest).mean() for f in (1.0, 5.0, 15.0)
-    ]
+    change = [np.abs(draw_touch(obj, 0, force_n=f)["a"].astype(float) - rest).mean() for f in (1.0, 5.0, 15.0)]
     assert change == sorted(change)
     assert change[2] > 1.3 * change[0]
 
@@ -125,9 +121,7 @@ def test_relief_does_not_set_the_photos_mean_colour_nor_looks_the_touch() -> Non
 
 def test_a_recording_reads_back_and_repeats(tmp_path: Path) -> None:
     objects = make_objects(2)
-    folders = [
-        synthetic.write_recording(tmp_path / name, objects, grasps=2, misses=1, seed=4) for name in "xy"
-    ]
+    folders = [synthetic.write_recording(tmp_path / name, objects, grasps=2, misses=1, seed=4) for name in "xy"]
     recording = read_recording(folders[0])
     assert [grasp.grasped for grasp in recording.grasps] == [True, True, False] * 2
     assert {grasp.object_id for grasp in recording.grasps} == {obj.object_id for obj in objects}

@@ -1,0 +1,35 @@
+"""Towers: one encoder per modality. A new backbone is one file, one row of `TOWERS` and one test parameter."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.towers.base import Tower
+
+TOWERS = {
+    "mobilenet_v2": "retrieval.towers.mobilenet:mobilenet_v2",
+    "resnet18": "retrieval.towers.resnet:resnet18",
+    "resnet34": "retrieval.towers.resnet:resnet34",
+    "resnet50": "retrieval.towers.resnet:resnet50",
+    "small": "retrieval.towers.small:small",
+}
+
+OUTPUTS = ("classes", "pooled")
+
+
+def build_tower(name: str, output: str = "pooled") -> "Tower":
+    """Build the tower `name` with random weights.
+
+    output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way
+    linear layer that ImageNet checkpoints carry, whose outputs the paper concatenates.
+    Raises ConfigError for an unknown name or output.
+    """
+    if name not in TOWERS:
+        raise ConfigError(f"tower must be one of {', '.join(sorted(TOWERS))}; got {name!r}")
+    if output not in OUTPUTS:
+        raise ConfigError(f"tower output must be one of {', '.join(OUTPUTS)}; got {output!r}")
+    module, function = TOWERS[name].split(":")
+    tower: Tower = getattr(import_module(module), function)(classes=1000 if output == "classes" else None)
+    return tower

@@ -1,0 +1,39 @@
+# Two commands for a fresh machine: `make demo` and `make test`. Each makes its own .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test test-lowest benchmark clean
+
+demo: $(VENV)/installed
+	$(BIN)/python -m tests.demo demo
+
+test: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+# The oldest versions that pyproject.toml admits.
+test-lowest:
+	$(MAKE) VENV=.venv-lowest CONSTRAINTS=.ci/lowest.txt .venv-lowest/installed
+	.venv-lowest/bin/python -m pytest
+
+benchmark: $(VENV)/installed
+	$(BIN)/python -m tests.benchmarks
+
+clean:
+	rm -rf .venv .venv-lowest demo .pytest_cache .mypy_cache .ruff_cache
+
+CONSTRAINTS ?= .ci/constraints.txt
+
+$(VENV)/installed: pyproject.toml $(CONSTRAINTS)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed; $(PYTHON) is $$($(PYTHON) --version 2>&1). Try: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+		{ echo "Python's venv module is needed. On Debian or Ubuntu: apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+# PyTorch first and pinned: an unpinned one may bring gigabytes of CUDA libraries that the tests do not use.
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test]'
+	@touch $@

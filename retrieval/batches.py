@@ -1,0 +1,151 @@
+"""From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import torch
+from torch import Tensor
+
+from retrieval import distributed
+from retrieval.config import Config
+from retrieval.dataset import Grasp, ImageCache, PairBatch
+from retrieval.encode import Image, autocast, photo_features, to_batch, touch_batch, touch_features
+from retrieval.errors import DatasetError
+from retrieval.fusion import Matcher
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A batch with what its features are made from: images, or the features themselves."""
+
+    batch: PairBatch
+    touches: Tensor
+    photos: Tensor
+
+
+class FeatureSource(Protocol):
+    """Where a training run gets the features of a batch from; a context manager that owns threads."""
+
+    def __init__(self, config: Config, device: torch.device) -> None: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+        """Start loading a batch on another thread."""
+
+    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+        """Features of all distinct touches (T, F) and photos (N, F), with gradients where towers train."""
+
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """The same in evaluation mode, in batches, for any number of pairs."""
+
+
+class BatchImages:
+    """Loads the images of batches on threads of its own while the step before them is computed."""
+
+    def __init__(self, config: Config, device: torch.device, threads: int = 2) -> None:
+        self.config, self.device = config, device
+        self.uses_background = config.preprocessing.background != "none"
+        self._touch = ImageCache(config.preprocessing.load_touch)
+        self._photo = ImageCache(config.preprocessing.load_photo)
+        self._ahead = ThreadPoolExecutor(1)
+        self._threads = ThreadPoolExecutor(threads)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ahead.shutdown(cancel_futures=True)
+        self._threads.shutdown(cancel_futures=True)
+
+    def touch(self, grasp: Grasp) -> list[Image]:
+        """The finger images of a grasp, preprocessed. Raises DatasetError where a no-contact frame is missing."""
+        if not self.uses_background:
+            return [self._touch(path) for path in grasp.touches]
+        if len(grasp.backgrounds) != len(grasp.touches):
+            raise DatasetError(
+                f"the background policy needs a no-contact frame for each finger; {grasp.grasp_id} has "
+                f'{len(grasp.backgrounds)} for {len(grasp.touches)}; set background = "none" or record them'
+            )
+        return [self._touch(*pair) for pair in zip(grasp.touches, grasp.backgrounds, strict=True)]
+
+    def photo(self, path: Path) -> Image:
+        """A photo, preprocessed."""
+        return self._photo(path)
+
+
+class TrainedFeatures(BatchImages):
+    """Features of towers in training: this rank encodes its share of the images, and gathers the others'."""
+
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+        """Start loading this rank's share of the batch's images."""
+        return self._ahead.submit(self._load, batch)
+
+    def _load(self, batch: PairBatch) -> Loaded:
+        grasps = [batch.grasps[row] for row in distributed.share(len(batch.grasps))]
+        photos = [batch.photos[row] for row in distributed.share(len(batch.photos))]
+        touches = touch_batch(list(self._threads.map(self.touch, grasps)), self.device)
+        return Loaded(batch, touches, to_batch(list(self._threads.map(self.photo, photos)), self.device))
+
+    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+        """Pass each distinct image through its tower once."""
+        with autocast(self.device, self.config.training.precision):
+            touch = matcher.touch_features(loaded.touches)
+            photo = matcher.photo_features(loaded.photos)
+        batch = loaded.batch
+        return distributed.gather_rows(touch, len(batch.grasps)), distributed.gather_rows(photo, len(batch.photos))
+
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """Encode the images of the pairs, each once."""
+        touch = touch_features(matcher, (self.touch(grasp) for grasp in pairs.grasps))
+        return touch, photo_features(matcher, (self.photo(path) for path in pairs.photos))
+
+
+class FrozenFeatures(BatchImages):
+    """Features of towers that stand still: each image is encoded the first time it is met, and never again."""
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        super().__init__(config, device)
+        self._kept: dict[str | Path, Tensor] = {}
+
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+        """Look up the features of a batch, encoding what is new."""
+        return self._ahead.submit(self._look_up, matcher, batch)
+
+    @torch.inference_mode()
+    def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
+        new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._kept}
+        self._encode(
+            list(new.values()),
+            lambda part: touch_features(matcher, map(self.touch, part)),
+            lambda g: g.grasp_id,
+        )
+        photos = [path for path in batch.photos if path not in self._kept]
+        self._encode(photos, lambda part: photo_features(matcher, map(self.photo, part)), lambda path: path)
+        touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
+        return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
+
+    def _encode(
+        self, items: list[Any], encode: Callable[[list[Any]], Tensor], key: Callable[[Any], str | Path]
+    ) -> None:
+        if items:
+            self._kept.update(zip(map(key, items), encode(items), strict=True))
+
+    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+        """The features, as constants of the step."""
+        return loaded.touches.clone(), loaded.photos.clone()
+
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """The features of all pairs at once."""
+        loaded = self.prepare(matcher, pairs).result()
+        return loaded.touches, loaded.photos

@@ -1,0 +1,165 @@
+"""Checkpoints: one `.safetensors` file with the weights, and everything needed to use them in its header.
+
+Nothing is unpickled. A file is written beside its place, flushed to disk, then renamed: it is whole or absent.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from retrieval.calibration import Calibration
+from retrieval.config import Config
+from retrieval.dataset import Split
+from retrieval.errors import BadInput, CheckpointError
+from retrieval.fusion import Matcher
+from retrieval.version import __version__
+
+FORMAT = 1
+_HEADER = "touch_retrieval"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A matcher ready for use (in evaluation mode) and what its file says of it.
+
+    digest: SHA-256 of the file. provenance: step, seed, data digest, metrics and so on, as written by training.
+    """
+
+    path: Path
+    digest: str
+    matcher: Matcher
+    config: Config
+    split: Split | None
+    calibration: Calibration | None
+    provenance: dict[str, Any]
+
+
+def save_checkpoint(
+    path: Path,
+    matcher: Matcher,
+    config: Config,
+    *,
+    split: Split | None,
+    calibration: Calibration | None,
+    provenance: Mapping[str, Any],
+) -> None:
+    """Write `path` and its model card (`path` with suffix .md) atomically."""
+    header = {
+        "config": config.to_dict(),
+        "split": split.to_dict() if split else None,
+        "calibration": calibration.to_dict() if calibration else None,
+        "provenance": dict(provenance),
+    }
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
+    write_tensors(path, state, header)
+    _write_atomically(path.with_suffix(".md"), _model_card(path.name, header).encode())
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint. Raises CheckpointError with what is wrong and what to do."""
+    state, header = read_tensors(path)
+    try:
+        config = Config.from_dict(header["config"])
+        split = Split.from_dict(header["split"]) if header["split"] else None
+        calibration = Calibration.from_dict(header["calibration"]) if header["calibration"] else None
+        matcher = Matcher(config.matcher)
+        matcher.load_state_dict(state)
+    except (BadInput, KeyError, RuntimeError) as error:
+        raise CheckpointError(f"{path} is not a checkpoint that this version can use: {error}") from error
+    return Checkpoint(path, file_digest(path), matcher.eval(), config, split, calibration, header["provenance"])
+
+
+def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write tensors and a JSON header as one safetensors file, atomically."""
+    text = json.dumps({"format": FORMAT, "software": __version__, **header}, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_atomically(path, save(state, {_HEADER: text}))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `write_tensors` wrote. Raises CheckpointError."""
+    if not path.is_file():
+        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get(_HEADER)
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is not a readable .safetensors file ({error}); it may be truncated") from error
+    if text is None:
+        raise CheckpointError(
+            f"{path} holds weights but not our header; only checkpoints of `retrieve train` work here "
+            "(give other weights to `retrieve train --init`)"
+        )
+    header = _parsed(path, text)
+    if any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
+        raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
+    return state, header
+
+
+def _parsed(path: Path, text: str) -> dict[str, Any]:
+    try:
+        header = json.loads(text)
+        version = header["format"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"the header of {path} is damaged ({error}); train again or restore the file") from error
+    if version != FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {version}, this version reads {FORMAT}; install the touch-retrieval "
+            f"that wrote it ({header.get('software')}) or train again"
+        )
+    return dict(header)
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write_atomically(path: Path, data: bytes) -> None:
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _model_card(name: str, header: Mapping[str, Any]) -> str:
+    matcher, provenance = header["config"]["matcher"], header["provenance"]
+    calibration, split = header["calibration"], header["split"]
+    lines = [
+        f"# {name}",
+        "",
+        f"Matches touches of {matcher['fingers']} gel image(s) with photos. Tower `{matcher['tower']}`, "
+        f"output `{matcher['tower_output']}`.",
+        "",
+        f"* Trained on: {provenance['source']} (data digest `{provenance['data_digest'][:16]}`)",
+        f"* Kept step: {provenance['step']} of {header['config']['training']['iterations']}, "
+        f"seed {header['config']['training']['seed']}",
+    ]
+    if split:
+        lines.append(
+            "* Objects: " + ", ".join(f"{len(split[part])} {part}" for part in ("train", "validation", "test"))
+        )
+    for key, value in provenance["metrics"].items():
+        lines.append(f"* {key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"* {key}: {value}")
+    if calibration:
+        lines.append(
+            f"* Probabilities: calibrated on {calibration['positives']} true and {calibration['negatives']} false "
+            f"validation pairs, expected calibration error {calibration['ece_after']:.3f} on the same pairs"
+        )
+    return "\n".join(lines) + "\n"

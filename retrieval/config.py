@@ -1,0 +1,165 @@
+"""Settings of a matcher and of its training: frozen dataclasses, read from TOML, unknown keys refused."""
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from retrieval.errors import ConfigError
+from retrieval.images import Preprocessing
+
+# How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
+
+
+@dataclass(frozen=True)
+class MatcherConfig:
+    """Architecture of a matcher.
+
+    tower: backbone of both towers (`retrieval.towers.TOWERS`). tower_output: "classes" (the paper: the 1000-way
+    outputs are fused) or "pooled". fingers: gel images in one touch (training takes it from the recording).
+    hidden: width of the fusion head. standardise: centre and scale the features by their statistics over the
+    training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
+    embedding_dim: length of the unit embeddings for candidate search.
+    """
+
+    tower: str = "resnet50"
+    tower_output: str = "classes"
+    fingers: int = 2
+    hidden: int = 1024
+    dropout: float = 0.5
+    standardise: bool = False
+    embedding_dim: int = 128
+
+    def __post_init__(self) -> None:
+        for name in ("fingers", "hidden", "embedding_dim"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
+        _require(0 <= self.dropout < 1, f"dropout must be in [0, 1); got {self.dropout}")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a matcher is trained.
+
+    init: "random", "imagenet" or the path of a state dict. iterations: optimiser steps. touches_per_batch times
+    (positives_per_touch + negatives_per_touch) pairs make a batch. contrastive_weight: weight of the contrastive
+    term; 0 is exactly the paper's loss, and leaves the embeddings untrained. freeze_batch_norm: keep the batch
+    statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
+    encoded once for the whole training. validation_fraction, test_fraction: shares of the objects.
+    """
+
+    init: str = "imagenet"
+    iterations: int = 26_000
+    touches_per_batch: int = 6
+    positives_per_touch: int = 4
+    negatives_per_touch: int = 4
+    learning_rate: float = 1e-4
+    schedule: str = "constant"
+    contrastive_weight: float = 0.0
+    freeze_batch_norm: bool = False
+    freeze_towers: bool = False
+    validation_fraction: float = 0.1
+    test_fraction: float = 0.184
+    validate_every: int = 500
+    precision: str = "auto"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "iterations",
+            "touches_per_batch",
+            "positives_per_touch",
+            "negatives_per_touch",
+            "validate_every",
+        ):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
+        _require(self.learning_rate > 0, f"learning_rate must be positive; got {self.learning_rate}")
+        _require(
+            self.contrastive_weight >= 0,
+            f"contrastive_weight must not be negative; got {self.contrastive_weight}",
+        )
+        for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
+            value = getattr(self, name)
+            _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
+        held_out = (self.validation_fraction, self.test_fraction)
+        _require(
+            min(held_out) >= 0 and sum(held_out) < 1,
+            f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
+        )
+
+
+SCHEDULES = ("constant", "cosine")
+PRECISIONS = ("auto", "float32", "bfloat16")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides what a training run makes, but the recording."""
+
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    preprocessing: Preprocessing = field(default_factory=Preprocessing)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionary, as in a TOML file."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
+        """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
+        parts = {"matcher": MatcherConfig, "training": TrainingConfig, "preprocessing": Preprocessing}
+        _refuse_unknown("configuration", tables, parts)
+        return cls(**{name: _build(name, parts[name], table) for name, table in tables.items()})
+
+
+def load_config(name_or_path: str) -> Config:
+    """Read a named preset (`paper`, `small`, ...) or a TOML file. Raises ConfigError."""
+    preset = resources.files("retrieval") / "configs" / f"{name_or_path}.toml"
+    path = Path(name_or_path)
+    if preset.is_file():
+        text = preset.read_text("utf-8")
+    elif path.is_file():
+        text = path.read_text("utf-8")
+    else:
+        raise ConfigError(
+            f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
+        )
+    try:
+        return Config.from_dict(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    files = (resources.files("retrieval") / "configs").iterdir()
+    return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
+
+
+def _build(table_name: str, cls: type[Any], table: Any) -> Any:
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
+    fields = {item.name: item for item in dataclasses.fields(cls)}
+    _refuse_unknown(f"[{table_name}]", table, fields)
+    return cls(**{key: _typed(f"{table_name}.{key}", fields[key].type, value) for key, value in table.items()})
+
+
+def _typed(name: str, wanted: Any, value: Any) -> Any:
+    if wanted is float and type(value) is int:
+        return float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")
+    return value
+
+
+def _refuse_unknown(where: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    for key in given:
+        if key not in known:
+            raise ConfigError(f"unknown setting {key!r} in {where}; known: {', '.join(known)}")
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise ConfigError(message)

@@ -1,0 +1,289 @@
+"""Grasps of a recording, object-disjoint splits, and the paper's pair sampler."""
+
+import hashlib
+import json
+import logging
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import DatasetError
+from robot.errors import RobotError
+from robot.recording import read_recording
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """One interaction, ready to be loaded: a photo, the touch (one file per finger, in order a, b), and the
+    no-contact frames of the same fingers where the recording has them (else empty)."""
+
+    grasp_id: str
+    object_id: str
+    sequence_id: str | None
+    photo: Path
+    touches: tuple[Path, ...]
+    backgrounds: tuple[Path, ...]
+
+
+def load_grasps(folder: Path) -> list[Grasp]:
+    """Read the successful grasps of a recording that have a photo and a touch, in the order of collection.
+
+    Raises DatasetError for an unreadable recording, one without such grasps, or one that mixes numbers of fingers.
+    """
+    try:
+        recording = read_recording(folder)
+    except RobotError as error:
+        raise DatasetError(str(error)) from error
+    for note in recording.notes:
+        log.warning("%s", note)
+    grasps = [
+        Grasp(
+            grasp_id=grasp.grasp_id,
+            object_id=grasp.object_id,
+            sequence_id=grasp.sequence_id,
+            photo=folder / grasp.photo,
+            touches=_in_finger_order(folder, grasp.touches),
+            backgrounds=_in_finger_order(folder, grasp.touches_before),
+        )
+        for grasp in recording.grasps
+        if grasp.photo is not None and grasp.touches and grasp.grasped is not False
+    ]
+    if not grasps:
+        raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
+    finger_count(grasps)
+    return grasps
+
+
+def recording_source(folder: Path) -> str:
+    """What a recording says of where it comes from."""
+    return str(read_recording(folder).info["source"])
+
+
+def finger_count(grasps: Sequence[Grasp]) -> int:
+    """Number of gel images of each touch. Raises DatasetError where grasps differ."""
+    first = grasps[0]
+    for grasp in grasps:
+        if len(grasp.touches) != len(first.touches):
+            raise DatasetError(
+                f"every touch must have the same number of gel images; {first.grasp_id} has {len(first.touches)}, "
+                f"{grasp.grasp_id} has {len(grasp.touches)}; keep the sensors in recordings of their own"
+            )
+    return len(first.touches)
+
+
+def _in_finger_order(folder: Path, files: Any) -> tuple[Path, ...]:
+    return tuple(folder / files[finger] for finger in sorted(files or {}))
+
+
+def data_digest(grasps: Iterable[Grasp]) -> str:
+    """SHA-256 over ids and image bytes: two recordings with equal digests train alike."""
+    digest = hashlib.sha256()
+    for grasp in grasps:
+        digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
+        for path in (grasp.photo, *grasp.touches, *grasp.backgrounds):
+            try:
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+            except OSError as error:
+                raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which objects train, which choose and calibrate, which are never seen before the end."""
+
+    seed: int
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    test: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary, as stored in checkpoints and split files."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Split":
+        """Inverse of `to_dict`. Raises DatasetError for anything else."""
+        try:
+            parts = {name: tuple(str(item) for item in data[name]) for name in ("train", "validation", "test")}
+            return cls(seed=int(data.get("seed", 0)), **parts)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DatasetError(
+                'a split must be {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}'
+            ) from error
+
+    def select(self, grasps: Iterable[Grasp], part: str) -> list[Grasp]:
+        """Grasps whose object lies in `part` ("train", "validation" or "test")."""
+        objects = set(getattr(self, part))
+        return [grasp for grasp in grasps if grasp.object_id in objects]
+
+
+def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed: int) -> Split:
+    """Draw an object-disjoint split; objects that share a sequence stay together.
+
+    validation, test: shares of the objects, each met as closely as whole groups allow; a part that is wanted holds
+    at least the two objects that pairs need. Raises DatasetError where the recording has too few for that.
+    """
+    groups = _linked_objects(grasps)
+    queue = [groups[index] for index in np.random.default_rng(seed).permutation(len(groups))]
+    total = sum(len(group) for group in groups)
+    chosen = {
+        name: _take(queue, share * total) if share > 0 else ()
+        for name, share in (("test", test), ("validation", validation))
+    }
+    train = tuple(sorted(name for group in queue for name in group))
+    wanted = [train] + [chosen[name] for name, share in (("test", test), ("validation", validation)) if share > 0]
+    if min(map(len, wanted)) < 2:
+        raise DatasetError(
+            f"a split into {len(wanted)} parts needs two objects in each, and objects that share a sequence stay "
+            f"together; the recording has {total} objects in {len(groups)} such groups"
+        )
+    return Split(seed=seed, train=train, **chosen)
+
+
+def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
+    """Take groups off the queue until there are two objects and the target is met as closely as whole groups allow."""
+    taken: list[str] = []
+    while queue and (len(taken) < 2 or abs(len(taken) + len(queue[0]) - target) < abs(len(taken) - target)):
+        taken = taken + queue.pop(0)
+    return tuple(sorted(taken))
+
+
+def _linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
+    """Objects joined wherever they share a sequence; groups and members sorted."""
+    group_of: dict[str, set[str]] = {}
+    first_of_sequence: dict[str, str] = {}
+    for grasp in grasps:
+        group = group_of.setdefault(grasp.object_id, {grasp.object_id})
+        if grasp.sequence_id is None:
+            continue
+        other = group_of[first_of_sequence.setdefault(grasp.sequence_id, grasp.object_id)]
+        if other is not group:
+            group |= other
+            group_of.update(dict.fromkeys(group, group))
+    unique = {id(group): sorted(group) for group in group_of.values()}
+    return sorted(unique.values())
+
+
+@dataclass(frozen=True)
+class PairBatch:
+    """Pairs over distinct images: every touch and photo is listed once, however many pairs use it.
+
+    grasps: the grasps whose touches are used; photos: distinct photo files. touch_index, photo_index (P,) point into
+    them; labels (P,) are 1 for the same object. touch_objects (T,), photo_objects (N,) are integer object labels.
+    """
+
+    grasps: list[Grasp]
+    photos: list[Path]
+    touch_index: NDArray[np.int64]
+    photo_index: NDArray[np.int64]
+    labels: NDArray[np.float32]
+    touch_objects: NDArray[np.int64]
+    photo_objects: NDArray[np.int64]
+
+
+class PairSampler:
+    """The paper's pairs: each touch with so many photos of its own object and as many of other objects.
+
+    Stateless: the batch of a step depends on the seed and the step alone, so training resumes anywhere. Touches go
+    round the objects, each object once a round in a fresh order, so at any moment every object has been used equally
+    often (to within one); within an object, grasps come in shuffled decks. Negatives draw the object first, then one
+    of its photos, both uniformly, from the SAME set of grasps.
+    """
+
+    def __init__(self, grasps: Sequence[Grasp], *, seed: int, positives: int = 4, negatives: int = 4) -> None:
+        """Raises DatasetError for fewer than two objects, and where one photo file stands for two objects."""
+        self.seed, self.positives, self.negatives = seed, positives, negatives
+        by_object: dict[str, list[Grasp]] = defaultdict(list)
+        for grasp in grasps:
+            by_object[grasp.object_id].append(grasp)
+        if len(by_object) < 2:
+            raise DatasetError(f"pairs need at least 2 objects in each part of the split; got {len(by_object)}")
+        self.objects = sorted(by_object)
+        self.grasps = [by_object[name] for name in self.objects]
+        self.photos = [sorted({grasp.photo for grasp in part}) for part in self.grasps]
+        if len({photo for part in self.photos for photo in part}) != sum(map(len, self.photos)):
+            raise DatasetError("a photo file must belong to one object; two objects share one; run `retrieve check`")
+
+    def batch(self, step: int, touches: int) -> PairBatch:
+        """The pairs of training step `step` (from 0) with `touches` touches."""
+        return self._pairs([self._touch(step * touches + turn) for turn in range(touches)], stream=(1, step))
+
+    def every_touch(self) -> PairBatch:
+        """Every touch of the set with its positive and negative photos: the fixed pairs for evaluation."""
+        touches = [(index, grasp) for index, part in enumerate(self.grasps) for grasp in part]
+        return self._pairs(touches, stream=(2,))
+
+    def _touch(self, turn: int) -> tuple[int, Grasp]:
+        round_number, place = divmod(turn, len(self.objects))
+        index = int(self._rng(3, round_number).permutation(len(self.objects))[place])
+        deck_number, card = divmod(round_number, len(self.grasps[index]))
+        deck = self._rng(4, index, deck_number).permutation(len(self.grasps[index]))
+        return index, self.grasps[index][int(deck[card])]
+
+    def _pairs(self, touches: list[tuple[int, Grasp]], stream: tuple[int, ...]) -> PairBatch:
+        rng = self._rng(*stream)
+        photos: dict[Path, int] = {}
+        photo_objects: list[int] = []
+        touch_index, photo_index, labels = [], [], []
+        for row, (index, _) in enumerate(touches):
+            drawn = [(index, photo, 1.0) for photo in self._positives(index, rng)]
+            drawn += [(*self._negative(index, rng), 0.0) for _ in range(self.negatives)]
+            for owner, photo, label in drawn:
+                if photo not in photos:
+                    photos[photo] = len(photos)
+                    photo_objects.append(owner)
+                touch_index.append(row)
+                photo_index.append(photos[photo])
+                labels.append(label)
+        return PairBatch(
+            grasps=[grasp for _, grasp in touches],
+            photos=list(photos),
+            touch_index=np.array(touch_index, dtype=np.int64),
+            photo_index=np.array(photo_index, dtype=np.int64),
+            labels=np.array(labels, dtype=np.float32),
+            touch_objects=np.array([index for index, _ in touches], dtype=np.int64),
+            photo_objects=np.array(photo_objects, dtype=np.int64),
+        )
+
+    def _positives(self, index: int, rng: np.random.Generator) -> list[Path]:
+        """Without replacement where the object has enough photos."""
+        photos = self.photos[index]
+        chosen = rng.choice(len(photos), self.positives, replace=len(photos) < self.positives)
+        return [photos[int(row)] for row in chosen]
+
+    def _negative(self, index: int, rng: np.random.Generator) -> tuple[int, Path]:
+        other = int(rng.integers(len(self.objects) - 1))
+        other += other >= index
+        return other, self.photos[other][int(rng.integers(len(self.photos[other])))]
+
+    def _rng(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *stream])
+
+
+class ImageCache:
+    """Loads preprocessed images once and keeps them while they fit in `limit_bytes`.
+
+    Safe to call from several threads; an image that no longer fits is loaded again each time.
+    """
+
+    def __init__(self, load: Callable[..., NDArray[np.float32]], limit_bytes: int = 4 << 30) -> None:
+        self._load, self._limit = load, limit_bytes
+        self._kept: dict[tuple[Path | None, ...], NDArray[np.float32]] = {}
+        self._used = 0
+
+    def __call__(self, *paths: Path | None) -> NDArray[np.float32]:
+        """The image that `load(*paths)` gives, (H, W, 3) float32."""
+        if (image := self._kept.get(paths)) is None:
+            image = self._load(*paths)
+            if self._used + image.nbytes <= self._limit:
+                self._kept[paths] = image
+                self._used += image.nbytes
+        return image

@@ -1,0 +1,75 @@
+"""Results for people: the table on a terminal and the self-contained HTML page of a query."""
+
+import base64
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+
+from retrieval.errors import ImageError
+from retrieval.images import read_rgb, resize
+from retrieval.search import QueryResult
+
+_THUMBNAIL_PX = 320
+
+
+def print_table(result: QueryResult) -> None:
+    """Print the ranking on stdout, as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="Which object is in the hand?")
+    for title, justify in (
+        ("rank", "right"),
+        ("object", "left"),
+        ("probability", "right"),
+        ("logit", "right"),
+    ):
+        table.add_column(title, justify=justify)  # type: ignore[arg-type]
+    table.add_column("photo", overflow="fold")
+    for match in result.results:
+        probability = "-" if match.probability is None else f"{match.probability:.3f}"
+        table.add_row(str(match.rank), match.object_id, probability, f"{match.logit:+.2f}", match.photo)
+    Console().print(table)
+
+
+def query_html(result: QueryResult, catalogue: Path) -> str:
+    """One HTML page with the gel images, the photos and the probabilities; images are inside the file.
+
+    A photo that has vanished since the index was built is left blank.
+    """
+    touches = [
+        [
+            {
+                "uri": _data_uri(Path(path)),
+                "name": Path(path).name,
+                "finger": "ab"[finger : finger + 1],
+                "grasp": grasp,
+            }
+            for finger, path in enumerate(paths)
+        ]
+        for grasp, paths in enumerate(result.touches, start=1)
+    ]
+    matches: list[dict[str, Any]] = [
+        {**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results
+    ]
+    source = (resources.files("retrieval") / "templates" / "query.html").read_text("utf-8")
+    page = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+    return page.render(result=result, touches=touches, matches=matches)
+
+
+def _data_uri(path: Path) -> str:
+    """The image, no larger than a thumbnail, as a data URI; empty where it cannot be read."""
+    try:
+        image = read_rgb(path)
+    except ImageError:
+        return ""
+    height, width = image.shape[:2]
+    scale = min(1.0, _THUMBNAIL_PX / max(height, width))
+    image = resize(image, (max(1, round(height * scale)), max(1, round(width * scale))))
+    bgr = np.rint(image[..., ::-1] * 255).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")

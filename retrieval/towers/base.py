@@ -1,0 +1,60 @@
+"""What every tower owes its callers; a backbone only writes `_encode`."""
+
+import torch
+from torch import Tensor, nn
+
+from retrieval.errors import BadInput, NumericalError
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Tower(nn.Module):
+    """Encoder of one modality: RGB images to feature vectors.
+
+    `feature_count` is the length of a vector. `classifier_prefix` names the 1000-way layer in the state dict (None
+    where
+    the tower has none).
+    """
+
+    feature_count: int
+    classifier_prefix: str | None = None
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Not persistent: the state dict holds exactly the keys that ImageNet checkpoints hold.
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Encode images (B, 3, H, W), float32 RGB within -1..1 (0..1 unless differences), to (B, feature_count).
+
+        Raises BadInput for another shape, type or range, NumericalError for a NaN or infinite pixel.
+        """
+        _check_images(images)
+        return self._encode((images - self.mean) / self.std)
+
+    def _encode(self, images: Tensor) -> Tensor:
+        """Encode normalised images (B, 3, H, W) to (B, feature_count)."""
+        raise NotImplementedError
+
+    @staticmethod
+    def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Map the keys of a known older layout to today's; the identity unless a backbone has one."""
+        return state
+
+
+def _check_images(images: Tensor) -> None:
+    if images.ndim != 4 or images.shape[1] != 3:
+        raise BadInput(f"a tower takes RGB images shaped (B, 3, H, W); got {tuple(images.shape)}")
+    if images.dtype != torch.float32:
+        raise BadInput(f"a tower takes float32 images in 0..1; got {images.dtype}; divide 8-bit images by 255")
+    if images.shape[0] == 0:
+        raise BadInput("a tower takes at least one image; got an empty batch")
+    low, high = (float(bound) for bound in torch.aminmax(images))
+    if not (abs(low) < float("inf") and abs(high) < float("inf")):
+        raise NumericalError("a tower takes finite pixels; got a NaN or infinite one")
+    if max(-low, high) > 1.0 + 1e-4:  # averages of pixels may round past 1
+        raise BadInput(f"a tower takes pixels within -1..1; got {low:.3g}..{high:.3g}; divide 8-bit images by 255")

@@ -1,0 +1,347 @@
+"""Training a matcher: the step, validation, checkpoints, interruption and resumption.
+
+Every step depends on the seed, the step number and the state alone, so a run that was stopped and resumed on the same
+machine ends bit for bit where an unbroken run ends.
+"""
+
+import dataclasses
+import math
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retrieval import distributed
+from retrieval.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
+from retrieval.calibration import Calibration, fit_calibration, pair_accuracy, pair_auc
+from retrieval.checkpoint import Checkpoint, load_checkpoint, read_tensors, save_checkpoint, write_tensors
+from retrieval.config import Config, TrainingConfig
+from retrieval.dataset import (
+    Grasp,
+    PairBatch,
+    PairSampler,
+    Split,
+    data_digest,
+    finger_count,
+    load_grasps,
+    make_split,
+    recording_source,
+)
+from retrieval.encode import default_device
+from retrieval.errors import CheckpointError, Interrupted, NumericalError
+from retrieval.fusion import Matcher
+from retrieval.losses import contrastive_loss, match_loss
+from retrieval.progress import Bar
+from retrieval.towers.weights import initialise_tower
+
+
+def state_path(out: Path) -> Path:
+    """Where an unfinished training of `out` keeps what it needs to go on."""
+    return out.with_suffix(".state.safetensors")
+
+
+def train(
+    recording: Path,
+    out: Path,
+    config: Config,
+    *,
+    split: Split | None = None,
+    resume: bool = False,
+    quiet: bool = False,
+) -> Checkpoint:
+    """Train on a recording and write the best checkpoint by validation objects to `out`.
+
+    split: drawn from the configuration where None. resume: go on from the state beside `out`. The number of fingers
+    is the recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
+    one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+    """
+    distributed.start()
+    grasps = load_grasps(recording)
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
+    settings = config.training
+    if split is None:
+        split = make_split(
+            grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed
+        )
+    trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
+    if not resume and state_path(out).exists():
+        raise CheckpointError(
+            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
+        )
+    if resume:
+        trainer.resume()
+    trainer.run(quiet)
+    return load_checkpoint(out)
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one training step reports: loss, and the share of its pairs on the right side."""
+
+    loss: float
+    accuracy: float
+
+
+class Trainer:
+    """The state of one training run."""
+
+    def __init__(self, config: Config, split: Split, grasps: list[Grasp], out: Path, source: str) -> None:
+        settings = config.training
+        self.config, self.split, self.out, self.source = config, split, out, source
+        self.data_digest = data_digest(grasps)
+        self.device = default_device()
+        torch.manual_seed(settings.seed)
+        self.matcher = build_matcher(config).to(self.device)
+        self.optimizer = torch.optim.Adam(self.matcher.parameters(), lr=settings.learning_rate)
+        self.sampler = self._sampler("train", grasps)
+        self.validation = self._sampler("validation", grasps).every_touch() if split.validation else None
+        features = FrozenFeatures if settings.freeze_towers else TrainedFeatures
+        self.features: FeatureSource = features(config, self.device)
+        self.step, self.best = 0, -math.inf
+
+    def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
+        settings = self.config.training
+        chosen = self.split.select(grasps, part)
+        return PairSampler(
+            chosen,
+            seed=settings.seed,
+            positives=settings.positives_per_touch,
+            negatives=settings.negatives_per_touch,
+        )
+
+    def run(self, quiet: bool = False) -> None:
+        """Train from the current step to the last."""
+        total = self.config.training.iterations
+        quiet = quiet or distributed.rank() > 0
+        with (
+            interruption() as stop,
+            self.features,
+            Bar("train", total, "steps", done=self.step, quiet=quiet) as bar,
+        ):
+            upcoming = self._prepare(self.step) if self.step < total else None
+            while upcoming is not None:
+                loaded = upcoming.result()
+                upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
+                result = self.train_step(loaded)
+                bar.advance(note=f"loss {result.loss:.3f}  accuracy {result.accuracy:.2f}{self._best_note()}")
+                if stop.is_set() or self.step % self.config.training.validate_every == 0 or self.step == total:
+                    self._validate_and_save(finished=self.step == total)
+                if stop.is_set() and self.step < total:
+                    raise Interrupted(
+                        f"stopped at step {self.step} of {total}; {self.out} is usable, --resume goes on from here"
+                    )
+
+    def _best_note(self) -> str:
+        return "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
+
+    def _prepare(self, step: int) -> "Future[Loaded]":
+        batch = self.sampler.batch(step, self.config.training.touches_per_batch)
+        return self.features.prepare(self.matcher, batch)
+
+    def train_step(self, loaded: Loaded) -> StepResult:
+        """One optimiser step on a prepared batch."""
+        settings, batch = self.config.training, loaded.batch
+        set_training_mode(self.matcher, settings)
+        torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
+        self._set_learning_rate()
+        self.optimizer.zero_grad(set_to_none=True)
+        features = self.features.train_features(self.matcher, loaded)
+        loss, logits = batch_loss(self.matcher, settings, batch, *features)
+        if not math.isfinite(loss.item()):
+            raise NumericalError(f"the loss must stay finite; step {self.step} gave {loss.item()}; lower learning_rate")
+        loss.backward()  # type: ignore[no-untyped-call]
+        distributed.average_gradients(self.matcher)
+        self.optimizer.step()
+        self.matcher.clamp_scale()
+        self.step += 1
+        return StepResult(loss.item(), pair_accuracy(logits.detach().cpu().numpy(), batch.labels))
+
+    def _set_learning_rate(self) -> None:
+        settings = self.config.training
+        factor = 1.0
+        if settings.schedule == "cosine":
+            factor = 0.5 * (1 + math.cos(math.pi * self.step / settings.iterations))
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.learning_rate * factor
+
+    def _validate_and_save(self, finished: bool) -> None:
+        distributed.average_buffers(self.matcher)
+        metrics, calibration = self.validate()
+        better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
+        self.best = max(self.best, metrics.get("validation_auc", -math.inf))
+        if distributed.rank():
+            return
+        if better:
+            self._save_best(metrics, calibration)
+        if finished:
+            state_path(self.out).unlink(missing_ok=True)
+        else:
+            self._save_state()
+
+    def validate(self) -> tuple[dict[str, float], Calibration | None]:
+        """Judge the fixed validation pairs; nothing where the split has no validation objects."""
+        if self.validation is None:
+            return {}, None
+        logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
+        calibration = fit_calibration(logits, labels)
+        metrics = {
+            "validation_auc": pair_auc(logits, labels),
+            "validation_pair_accuracy": pair_accuracy(logits, labels),
+            "validation_nll": calibration.nll_before,
+        }
+        return metrics, calibration
+
+    def _save_best(self, metrics: dict[str, float], calibration: Calibration | None) -> None:
+        provenance = {
+            "step": self.step,
+            "source": self.source,
+            "data_digest": self.data_digest,
+            "metrics": metrics,
+        }
+        save_checkpoint(
+            self.out,
+            self.matcher,
+            self.config,
+            split=self.split,
+            calibration=calibration,
+            provenance=provenance,
+        )
+
+    def _identity(self) -> dict[str, Any]:
+        """What must be the same for a run to be resumed."""
+        return {
+            "config": self.config.to_dict(),
+            "split": self.split.to_dict(),
+            "data_digest": self.data_digest,
+        }
+
+    def _save_state(self) -> None:
+        tensors = {f"model.{name}": tensor.cpu().contiguous() for name, tensor in self.matcher.state_dict().items()}
+        for name, parameter in self.matcher.named_parameters():
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"optimizer.{name}.{key}"] = value.cpu().contiguous()
+        best = self.best if self.validation is not None else None
+        write_tensors(state_path(self.out), tensors, {"step": self.step, "best": best, **self._identity()})
+
+    def resume(self) -> None:
+        """Take over the state beside `out`. Raises CheckpointError where it belongs to another run."""
+        path = state_path(self.out)
+        tensors, header = read_tensors(path)
+        for name, value in self._identity().items():
+            if header.get(name) != value:
+                raise CheckpointError(
+                    f"{path} was made with another {name.replace('_', ' ')}; resume with the same recording and "
+                    "configuration, or delete the file to start afresh"
+                )
+        self._require_own_checkpoint()
+        self.matcher.load_state_dict({name: tensors[f"model.{name}"] for name in self.matcher.state_dict()})
+        for name, parameter in self.matcher.named_parameters():
+            prefix = f"optimizer.{name}."
+            kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+            if kept:
+                self.optimizer.state[parameter] = {
+                    key: value if key == "step" else value.to(self.device) for key, value in kept.items()
+                }
+        self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
+
+    def _require_own_checkpoint(self) -> None:
+        """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
+        two writes): the steps since then are repeated to the same end."""
+        kept = load_checkpoint(self.out)
+        identity = {
+            "config": kept.config.to_dict(),
+            "split": kept.split.to_dict() if kept.split else None,
+            "data_digest": kept.provenance.get("data_digest"),
+        }
+        if identity != self._identity():
+            raise CheckpointError(
+                f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
+            )
+
+
+def build_matcher(config: Config) -> Matcher:
+    """A matcher with the configured first weights in both towers."""
+    matcher = Matcher(config.matcher)
+    for tower in (matcher.touch_tower, matcher.photo_tower):
+        initialise_tower(tower, config.matcher.tower, config.training.init)
+        tower.requires_grad_(not config.training.freeze_towers)
+    return matcher
+
+
+def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
+    """Training mode; what is frozen keeps evaluation mode, so that its running statistics stand still."""
+    matcher.train()
+    for module in matcher.modules():
+        if settings.freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
+            module.eval()
+    if settings.freeze_towers:
+        matcher.touch_tower.eval()
+        matcher.photo_tower.eval()
+
+
+def batch_loss(
+    matcher: Matcher,
+    settings: TrainingConfig,
+    batch: PairBatch,
+    touch_features: Tensor,
+    photo_features: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Loss (scalar) and match logits (P,) of a batch from the features of its distinct touches and photos."""
+    device = touch_features.device
+    touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
+    touch_index, photo_index = _on(device, batch.touch_index), _on(device, batch.photo_index)
+    logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
+    loss = match_loss(logits, _on(device, batch.labels))
+    if settings.contrastive_weight > 0:
+        loss = loss + settings.contrastive_weight * contrastive_loss(
+            touch.embedding,
+            photo.embedding,
+            _on(device, batch.touch_objects),
+            _on(device, batch.photo_objects),
+            matcher.log_scale,
+        )
+    return loss, logits
+
+
+def _on(device: torch.device, array: Any) -> Tensor:
+    return torch.from_numpy(array).to(device)
+
+
+@torch.inference_mode()
+def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> NDArray[np.float32]:
+    """Match logits (P,) of pairs, in evaluation mode, each image encoded once."""
+    matcher.eval()
+    touch_features, photo_features = source.eval_features(matcher, pairs)
+    touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
+    logits: NDArray[np.float32] = (
+        matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index]).cpu().numpy()
+    )
+    return logits
+
+
+@contextmanager
+def interruption() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second one raises KeyboardInterrupt as usual."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def on_interrupt(number: int, frame: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)

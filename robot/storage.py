@@ -1,0 +1,88 @@
+"""Files that survive a crash: written beside, synced, renamed; and pictures as PNG or JPEG content."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import RecordingError, StorageError
+
+PART = ".part"
+ImageSource = npt.NDArray[Any] | bytes | str | Path
+"""Pixels, or the content or path of a PNG or JPEG file. Pixels: (H, W, 3) uint8 RGB; depth: (H, W) uint16."""
+
+_SUFFIXES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
+
+
+@contextlib.contextmanager
+def storage_errors(folder: Path) -> Iterator[None]:
+    """Turn what the disk refuses into a StorageError that names the folder."""
+    try:
+        yield
+    except BlockingIOError as error:
+        raise StorageError(f"{folder} is being written by another process; wait for it or stop it") from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StorageError(f"{folder} could not be written: {reason}; what was appended before is whole") from error
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write `path` so that it holds all of `data` or is untouched; `sync_folder` then makes its name last."""
+    part = path.with_name(path.name + PART)
+    try:
+        with open(part, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` last."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
+    """Return (file content, suffix): pixels as PNG, a file's own bytes as they are. Raises RecordingError."""
+    if isinstance(source, np.ndarray):
+        return _png(column, source), ".png"
+    data = source if isinstance(source, bytes) else _read(column, Path(source))
+    for magic, suffix in _SUFFIXES.items():
+        if data.startswith(magic):
+            return data, suffix
+    raise RecordingError(f"{column} must be a PNG or JPEG file; its first bytes are {data[:4]!r}")
+
+
+def _read(column: str, path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{column}: {path} cannot be read: {error.strerror}") from error
+
+
+def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:
+    import cv2
+
+    colour = column != "depth"
+    good = pixels.dtype == (np.uint8 if colour else np.uint16) and pixels.size > 0
+    if not good or (pixels.ndim != 3 or pixels.shape[2] != 3 if colour else pixels.ndim != 2):
+        shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetre"
+        raise RecordingError(f"{column} must be {shape}, got {pixels.shape} {pixels.dtype}")
+    try:
+        done, data = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1] if colour else pixels))
+    except cv2.error:
+        done = False
+    if not done:
+        raise RecordingError(f"{column} cannot be written as PNG; its shape is {pixels.shape}")
+    return data.tobytes()

@@ -1,0 +1,259 @@
+"""Listing a catalogue folder, its metadata, and reading its photos one at a time."""
+
+import hashlib
+import io
+import json
+import os
+from itertools import islice
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from retrieval import catalogue as module
+from retrieval.catalogue import CataloguePhoto, SkippedPhoto, decode_photo, list_catalogue, read_photos
+from retrieval.errors import DatasetError
+
+
+def photo(colour=(255, 0, 0)):
+    buffer = io.BytesIO()
+    Image.new("RGB", (2, 1), colour).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def fill(folder, *paths, content=None):
+    """Write a small picture at every path below `folder`."""
+    for path in paths:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(photo() if content is None else content)
+    return folder
+
+
+def say(folder, *rows):
+    lines = [row if isinstance(row, str) else json.dumps(row) for row in rows]
+    (folder / "metadata.jsonl").write_text("\n".join(lines) + "\n", "utf-8")
+    return folder
+
+
+def found(folder):
+    return {item.path: item.object_id for item in list_catalogue(folder).photos}
+
+
+# Listing ---------------------------------------------------------------------------------------------------
+
+
+def test_the_first_folder_or_the_file_names_the_object(tmp_path):
+    fill(tmp_path, "mug/2.jpg", "mug/1.png", "cup.webp", "red ball/side/deep/x.PNG", "v1.2.tif")
+    assert found(tmp_path) == {
+        "cup.webp": "cup",
+        "mug/1.png": "mug",
+        "mug/2.jpg": "mug",
+        "red ball/side/deep/x.PNG": "red ball",
+        "v1.2.tif": "v1.2",
+    }
+
+
+def test_photos_are_sorted_by_their_id_which_is_their_path(tmp_path):
+    fill(tmp_path, "b/1.png", "a/2.png", "a/10.png", "a.png")
+    photos = list_catalogue(tmp_path).photos
+    assert [item.photo_id for item in photos] == ["a.png", "a/10.png", "a/2.png", "b/1.png"]
+    assert all(item.photo_id == item.path for item in photos)
+
+
+def test_the_ids_do_not_depend_on_where_the_catalogue_lies(tmp_path, monkeypatch):
+    fill(tmp_path / "one", "mug/1.png")
+    (tmp_path / "one").rename(tmp_path / "two")
+    monkeypatch.chdir(tmp_path)
+    assert found("two") == found(tmp_path / "two") == {"mug/1.png": "mug"}
+
+
+def test_one_object_may_have_a_folder_and_a_file(tmp_path):
+    fill(tmp_path, "mug/1.png", "mug.jpg", "cup.png")
+    assert list_catalogue(tmp_path).object_ids == ("cup", "mug")
+
+
+@pytest.mark.parametrize("name", ["A.PNG", "A.JpEg", "a.jpg", "a.bmp", "a.TIF", "a.tiff", "a.webp"])
+def test_the_case_of_an_extension_does_not_matter(tmp_path, name):
+    assert found(fill(tmp_path, name)) == {name: name.rsplit(".", 1)[0]}
+
+
+def test_other_files_are_listed_as_ignored_and_dotfiles_not_at_all(tmp_path):
+    fill(tmp_path, "mug/1.png", "mug/notes.txt", "readme", ".DS_Store", "mug/.hidden.png", ".git/x.png")
+    catalogue = list_catalogue(say(tmp_path, {"object_id": "mug"}))
+    assert [item.path for item in catalogue.photos] == ["mug/1.png"]
+    assert catalogue.ignored == ("mug/notes.txt", "readme")
+
+
+def test_no_folder_a_file_and_an_empty_folder_are_told_apart(tmp_path):
+    fill(tmp_path, "file.png")
+    with pytest.raises(DatasetError, match=r"does not exist: put photos in <object_id>/<photo>"):
+        list_catalogue(tmp_path / "none")
+    with pytest.raises(DatasetError, match="is a file"):
+        list_catalogue(tmp_path / "file.png")
+    (tmp_path / "empty" / "mug").mkdir(parents=True)
+    with pytest.raises(DatasetError, match=r"no photo \(\.bmp, .*only 0 other files"):
+        list_catalogue(tmp_path / "empty")
+    with pytest.raises(DatasetError, match=r"only 2 other files such as a\.gif"):
+        list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
+
+
+def test_a_folder_that_may_not_be_listed_is_an_error_for_its_objects_would_be_missing(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(module.os, "scandir", refuse)
+    with pytest.raises(DatasetError, match=r"cannot list .*Permission denied"):
+        list_catalogue(fill(tmp_path, "mug/1.png"))
+
+
+def test_a_link_to_a_folder_outside_is_followed_once(tmp_path):
+    fill(tmp_path / "outside", "1.png")
+    fill(tmp_path / "catalogue", "cup/1.png")
+    (tmp_path / "catalogue" / "mug").symlink_to(tmp_path / "outside")
+    (tmp_path / "catalogue" / "same").symlink_to(tmp_path / "outside")
+    assert found(tmp_path / "catalogue") == {"cup/1.png": "cup", "mug/1.png": "mug"}
+    (skipped,) = list_catalogue(tmp_path / "catalogue").skipped
+    assert skipped.path == "same"
+    assert "another link has listed" in skipped.reason
+
+
+def test_links_that_loop_do_not_hang(tmp_path):
+    root, outside = fill(tmp_path / "c", "mug/1.png", "cup/1.png"), fill(tmp_path / "o", "1.png")
+    (root / "mug" / "up").symlink_to(root)
+    (root / "mug" / "across").symlink_to(root / "cup")
+    (root / "self").symlink_to(root / "self")
+    (root / "top").symlink_to("/")
+    (root / "out").symlink_to(outside)
+    (outside / "again").symlink_to(outside)
+    (outside / "back").symlink_to(root)
+    catalogue = list_catalogue(root)
+    assert [item.path for item in catalogue.photos] == ["cup/1.png", "mug/1.png", "out/1.png"]
+    skipped = {item.path for item in catalogue.skipped}
+    assert skipped == {"mug/across", "mug/up", "out/again", "out/back", "top"}
+    assert catalogue.ignored == ("self",)
+
+
+def test_a_catalogue_may_itself_be_a_link(tmp_path):
+    fill(tmp_path / "real", "mug/1.png")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert found(tmp_path / "link") == {"mug/1.png": "mug"}
+
+
+def test_a_name_that_is_not_utf8_is_left_out_and_told(tmp_path):
+    fill(tmp_path, "mug/1.png", "mug/größe.png")
+    try:
+        (tmp_path / "mug" / os.fsdecode(b"\xff.png")).write_bytes(photo())
+    except OSError:
+        pytest.skip("this file system takes no such name")
+    catalogue = list_catalogue(tmp_path)
+    assert [item.path for item in catalogue.photos] == ["mug/1.png", "mug/größe.png"]
+    assert catalogue.skipped == (SkippedPhoto("mug/\\xff.png", "the name is not valid UTF-8; rename it"),)
+    json.dumps([item.path for item in catalogue.skipped], ensure_ascii=False).encode()
+
+
+def test_listing_opens_no_photo(tmp_path, monkeypatch):
+    fill(tmp_path, "mug/1.png")
+    monkeypatch.setattr(module, "read_bytes", None)
+    assert len(list_catalogue(tmp_path).photos) == 1
+
+
+# Metadata --------------------------------------------------------------------------------------------------
+
+
+def test_a_photo_has_the_metadata_of_its_object_and_its_own_wins(tmp_path):
+    fill(tmp_path, "mug/1.png", "mug/2.png", "cup.png")
+    say(
+        tmp_path,
+        {"object_id": "mug", "price": 5, "colour": "red"},
+        "",
+        {"file_name": "mug/2.png", "colour": "blue", "tags": ["a", {"b": None}]},
+        {"file_name": "./cup.png", "object_id": "cup", "name": "Straße"},
+    )
+    catalogue = list_catalogue(tmp_path)
+    assert {item.path: item.metadata for item in catalogue.photos} == {
+        "cup.png": {"name": "Straße"},
+        "mug/1.png": {"price": 5, "colour": "red"},
+        "mug/2.png": {"price": 5, "colour": "blue", "tags": ["a", {"b": None}]},
+    }
+    assert catalogue.notes == ()
+
+
+def test_without_metadata_a_photo_has_none(tmp_path):
+    assert list_catalogue(fill(tmp_path, "mug/1.png")).photos == (CataloguePhoto("mug/1.png", "mug", "mug/1.png"),)
+
+
+def test_metadata_of_what_is_not_there_is_a_note_and_no_error(tmp_path):
+    say(fill(tmp_path, "mug/1.png"), {"file_name": "mug/9.png"}, {"object_id": "cup"})
+    notes = list_catalogue(tmp_path).notes
+    assert notes == (
+        "metadata.jsonl speaks of mug/9.png, which is not in the catalogue",
+        "metadata.jsonl speaks of cup, which is not in the catalogue",
+    )
+
+
+BAD_LINES = {
+    '{"object_id": "mug"': "Expecting",
+    "[1]": "one JSON object",
+    "{}": "must name a photo",
+    '{"price": 5}': "must name a photo",
+    '{"object_id": 5}': "object_id must be a non-empty string, got 5",
+    '{"file_name": ""}': "file_name must be a non-empty string",
+    '{"object_id": "mug", "x": NaN}': "NaN is not a finite number",
+    '{"object_id": "mug", "x": -Infinity}': "-Infinity is not a finite number",
+    '{"object_id": "mug", "x": 1e999}': "1e999 is not a finite number",
+    '{"file_name": "mug/1.png", "object_id": "cup"}': "lies in object mug, but the line says cup",
+    '{"object_id": "first"}': "first has a line already; join the two",
+    '{"object_id": ' + "[" * 100_000: "recursion",
+}
+
+
+@pytest.mark.parametrize("line", BAD_LINES, ids=BAD_LINES.values())
+def test_a_bad_metadata_line_is_named_by_its_number(tmp_path, line):
+    say(fill(tmp_path, "mug/1.png"), {"object_id": "first"}, line)
+    with pytest.raises(DatasetError, match=r"metadata\.jsonl, line 2: .*" + BAD_LINES[line]) as caught:
+        list_catalogue(tmp_path)
+    assert caught.value.exit_code == 2
+
+
+def test_metadata_that_is_not_utf8_or_not_a_file_is_an_error(tmp_path):
+    (fill(tmp_path / "a", "mug/1.png") / "metadata.jsonl").write_bytes(b'{"object_id": "\xff"}\n')
+    with pytest.raises(DatasetError, match=r"line 1: .*decode"):
+        list_catalogue(tmp_path / "a")
+    (fill(tmp_path / "b", "mug/1.png") / "metadata.jsonl").mkdir()
+    with pytest.raises(DatasetError, match="cannot be read"):
+        list_catalogue(tmp_path / "b")
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+def test_bytes_are_read_once_hashed_and_decoded_from_the_same_bytes(tmp_path):
+    fill(tmp_path, "mug/1.png", content=photo((0, 255, 0)))
+    (item,) = read_photos(list_catalogue(tmp_path))
+    assert item.digest == hashlib.sha256(photo((0, 255, 0))).hexdigest()
+    (tmp_path / "mug/1.png").unlink()
+    np.testing.assert_array_equal(item.decode(), [[[0, 1, 0], [0, 1, 0]]])
+    np.testing.assert_array_equal(decode_photo(item), item.decode())
+
+
+def test_broken_files_are_left_out_with_the_reason_and_the_rest_is_read(tmp_path):
+    fill(tmp_path, "a.png", "b.png", "z.png")
+    (tmp_path / "b.png").write_bytes(photo()[:40])
+    (tmp_path / "c.png").write_bytes(b"")
+    (tmp_path / "d.png").symlink_to(tmp_path / "nowhere.png")
+    os.mkfifo(tmp_path / "e.png")
+    results = [decode_photo(item) for item in read_photos(list_catalogue(tmp_path))]
+    skipped = {item.path: item.reason for item in results if isinstance(item, SkippedPhoto)}
+    assert list(skipped) == ["b.png", "c.png", "d.png", "e.png"]
+    assert skipped["c.png"] == "the file is empty"
+    assert skipped["d.png"] == "no such file"
+    assert skipped["e.png"] == "is not a regular file"
+    assert len(results) == 6
+
+
+def test_reading_is_lazy(tmp_path, monkeypatch):
+    catalogue = list_catalogue(fill(tmp_path, *(f"{number:04}.png" for number in range(50))))
+    calls, read_bytes = [], module.read_bytes
+    monkeypatch.setattr(module, "read_bytes", lambda path: calls.append(path) or read_bytes(path))
+    assert len(list(islice(read_photos(catalogue), 2))) == 2
+    assert len(calls) == 2

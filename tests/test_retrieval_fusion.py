@@ -1,0 +1,129 @@
+"""The fusion head and its halves, on every backbone, and scoring many photos at once."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from retrieval.config import MatcherConfig
+from retrieval.errors import BadInput, NumericalError
+from retrieval.fusion import FusionHead, Matcher, score_halves
+from retrieval.towers import TOWERS
+
+
+def concatenated_forward(matcher, touches, photos):
+    """The paper's network as it is drawn: one first layer over the concatenated features of all images."""
+    fingers = [matcher.touch_tower(touches[:, finger]) for finger in range(touches.shape[1])]
+    features = torch.cat([*fingers, matcher.photo_tower(photos)], dim=1)
+    head = matcher.head
+    weight = torch.cat([head.touch_half.weight, head.photo_half.weight], dim=1)
+    hidden = functional.relu(functional.linear(features, weight, head.touch_half.bias))
+    hidden = functional.relu(head.second(head.dropout(hidden)))
+    return head.out(hidden)[:, 0]
+
+
+@pytest.mark.parametrize("output", ["classes", "pooled"])
+@pytest.mark.parametrize("name", sorted(TOWERS))
+def test_the_logit_from_halves_equals_the_concatenated_forward(name, output):
+    torch.manual_seed(0)
+    matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
+    touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
+    with torch.inference_mode():
+        touch = matcher.touch_code(matcher.touch_features(touches))
+        photo = matcher.photo_code(matcher.photo_features(photos))
+        ours, naive = matcher.head(touch.half, photo.half), concatenated_forward(matcher, touches, photos)
+    # 1e-5 relative to the size of what is summed in the last layer, float32.
+    torch.testing.assert_close(ours, naive, rtol=1e-5, atol=1e-5 * float(naive.abs().max()))
+    torch.testing.assert_close(matcher(touches, photos), ours, rtol=1e-4, atol=1e-4 * float(naive.abs().max()))
+
+
+def test_the_paper_configuration_has_the_papers_layers():
+    matcher = Matcher(MatcherConfig())
+    assert matcher.head.touch_half.weight.shape == (1024, 2000)
+    assert matcher.head.photo_half.weight.shape == (1024, 1000)
+    assert matcher.head.photo_half.bias is None
+    assert matcher.head.second.weight.shape == (1024, 1024)
+    assert matcher.head.out.weight.shape == (1, 1024)
+    towers = [
+        sum(value.numel() for value in tower.parameters()) for tower in (matcher.touch_tower, matcher.photo_tower)
+    ]
+    assert towers == [25_557_032, 25_557_032]
+
+
+def test_the_halves_start_as_one_layer_over_the_concatenation_would():
+    torch.manual_seed(0)
+    head = FusionHead(2000, 1000, 1024, 0.5)
+    bound = 1 / math.sqrt(3000)
+    for weight in (head.touch_half.weight, head.photo_half.weight):
+        assert bound * 0.99 < float(weight.detach().abs().max()) <= bound
+
+
+def test_the_tactile_tower_has_one_set_of_weights_for_all_fingers():
+    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8)).eval()
+    touch = torch.rand(1, 1, 3, 64, 64).expand(1, 2, 3, 64, 64)
+    features = matcher.touch_features(touch)
+    assert torch.equal(features[:, :256], features[:, 256:])
+
+
+def test_another_number_of_gel_images_is_a_clear_error():
+    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8))
+    with pytest.raises(BadInput, match=r"takes 2 gel image\(s\) for one touch; got 1 image"):
+        matcher.touch_features(torch.rand(4, 1, 3, 64, 64))
+    with pytest.raises(BadInput, match="array of shape"):
+        matcher.touch_features(torch.rand(4, 3, 64, 64))
+
+
+def test_embeddings_have_norm_one_even_for_a_black_image():
+    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8)).eval()
+    code = matcher.photo_code(matcher.photo_features(torch.zeros(2, 3, 64, 64)))
+    torch.testing.assert_close(code.embedding.norm(dim=1), torch.ones(2), rtol=0, atol=1e-6)
+
+
+def small_head(hidden=32, seed=0):
+    torch.manual_seed(seed)
+    return FusionHead(10, 10, hidden, 0.5)
+
+
+def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_the_block():
+    head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)
+    touches = torch.randn(3, 32)
+    with torch.inference_mode():
+        expected = [
+            sum(float(head(touch[None], torch.from_numpy(photo[None]))) for touch in touches) for photo in photos
+        ]
+    for block in (1, 5, 37, 1000):
+        np.testing.assert_allclose(score_halves(head, touches, photos, block=block), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_scoring_ignores_dropout_and_picks_the_asked_rows():
+    head, photos = small_head(), np.random.default_rng(0).normal(size=(9, 32)).astype(np.float32)
+    touch, rows = torch.randn(1, 32), np.array([7, 0, 3])
+    everything = score_halves(head.train(), touch, photos)
+    np.testing.assert_allclose(score_halves(head.eval(), touch, photos, rows), everything[rows], rtol=1e-6)
+
+
+def test_float16_halves_change_a_logit_by_less_than_the_rounding_they_carry():
+    head = small_head(hidden=256).eval()
+    photos = np.random.default_rng(1).normal(size=(200, 256)).astype(np.float32)
+    touch = torch.randn(1, 256)
+    exact, stored = score_halves(head, touch, photos), score_halves(head, touch, photos.astype(np.float16))
+    # Float16 keeps 11 bits: a relative error of 2^-11 in each half, averaged down by the sum over 256 of them.
+    assert np.abs(exact - stored).max() < 2**-11 * np.abs(photos).max()
+    assert not np.array_equal(exact, stored)
+
+
+def test_a_logit_that_is_not_finite_is_an_error_where_sorting_would_rank_it_first():
+    naive = np.argsort(np.array([0.2, np.nan, 0.9]))[::-1]
+    assert naive[0] == 1  # the naive ranking puts the NaN on top
+    photos = np.zeros((3, 32), dtype=np.float32)
+    photos[1] = np.inf
+    with pytest.raises(NumericalError, match="photo row 1"):
+        score_halves(small_head(), torch.randn(1, 32), photos)
+
+
+def test_ranking_float32_probabilities_ties_where_logits_do_not():
+    logits = torch.tensor([17.5, 18.0, 25.0])
+    assert len(torch.sigmoid(logits).unique()) == 1  # naive: all are exactly 1
+    assert torch.argsort(logits, descending=True).tolist() == [2, 1, 0]

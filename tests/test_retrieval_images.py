@@ -1,0 +1,470 @@
+"""Reading pictures, and refusing what is none. Resizing is in test_retrieval_images_resize.py."""
+
+import io
+import os
+import struct
+import threading
+import warnings
+import zlib
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageFile
+
+from retrieval import images
+from retrieval.errors import BadInput, ImageError
+from retrieval.images import (
+    decode_rgb,
+    read_rgb,
+    to_float,
+)
+
+# Files made by hand ----------------------------------------------------------------------------------------
+
+
+def chunk(kind, content):
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def png(colour_type, depth, samples, *extra, size=None):
+    """A PNG file of `samples` (H, W) or (H, W, channels), with extra chunks before the pixels."""
+    samples = np.asarray(samples)
+    height, width = size or samples.shape[:2]
+    kind = ">u2" if depth == 16 else "u1"
+    rows = b"".join(b"\0" + row.astype(kind).tobytes() for row in samples)
+    header = struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0)
+    body = [chunk(b"IHDR", header), *extra, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+
+
+def tiff(samples, orientation=1, extra_samples=None, photometric=None, bits=None):
+    """An uncompressed little-endian TIFF file of uint8 or uint16 `samples` (H, W, channels)."""
+    height, width, channels = samples.shape
+    raw = samples.astype(samples.dtype.newbyteorder("<")).tobytes()
+    bits = bits or samples.dtype.itemsize * 8
+    count = 13 if extra_samples is not None else 12
+    offset = 8 + 2 + 12 * count + 4
+    tags = [
+        (256, 3, 1, width),
+        (257, 3, 1, height),
+        (258, 3, channels, offset if channels > 2 else bits),
+        (259, 3, 1, 1),
+        (262, 3, 1, photometric if photometric is not None else 2 if channels > 2 else 1),
+        (273, 4, 1, offset + 2 * channels),
+        (274, 3, 1, orientation),
+        (277, 3, 1, channels),
+        (278, 3, 1, height),
+        (279, 4, 1, len(raw)),
+        (284, 3, 1, 1),
+        (296, 3, 1, 1),
+    ]
+    if extra_samples is not None:
+        tags.append((338, 3, 1, extra_samples))
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    return (
+        b"II*\0\x08\0\0\0"
+        + struct.pack("<H", len(tags))
+        + entries
+        + b"\0\0\0\0"
+        + struct.pack(f"<{channels}H", *[bits] * channels)
+        + raw
+    )
+
+
+def saved(image, kind, **options):
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def exif(orientation):
+    content = Image.Exif()
+    content[274] = orientation
+    return content.tobytes()
+
+
+def noise(height, width, channels=3, dtype=np.uint8, seed=0):
+    top = np.iinfo(dtype).max
+    return np.random.default_rng(seed).integers(0, top, (height, width, channels), dtype, endpoint=True)
+
+
+@cache
+def sample_files():
+    """One small file of every format and depth."""
+    colour = Image.fromarray(noise(24, 17))
+    smooth = Image.fromarray(cv2.resize(noise(3, 3), (48, 40), interpolation=cv2.INTER_CUBIC))
+    return {
+        "png": saved(colour, "PNG"),
+        "png palette": saved(colour.quantize(16), "PNG", transparency=3),
+        "png 16-bit": cv2.imencode(".png", noise(9, 7, 3, np.uint16))[1].tobytes(),
+        "jpeg": saved(smooth, "JPEG"),
+        "jpeg progressive": saved(smooth, "JPEG", progressive=True),
+        "bmp": saved(colour, "BMP"),
+        "tiff": saved(colour, "TIFF"),
+        "tiff lzw": saved(colour, "TIFF", compression="tiff_lzw"),
+        "tiff 16-bit": tiff(noise(9, 7, 3, np.uint16)),
+        "webp": saved(smooth, "WEBP"),
+        "webp lossless": saved(colour, "WEBP", lossless=True),
+    }
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("PNG", {}),
+        ("BMP", {}),
+        ("TIFF", {}),
+        ("TIFF", {"compression": "tiff_lzw"}),
+        ("WEBP", {"lossless": True}),
+    ],
+)
+def test_a_lossless_file_gives_back_its_pixels(tmp_path, kind, options):
+    pixels = noise(5, 4)
+    path = tmp_path / "picture"
+    path.write_bytes(saved(Image.fromarray(pixels), kind, **options))
+    rgb = read_rgb(path)
+    assert rgb.dtype == np.float32
+    assert rgb.flags["C_CONTIGUOUS"]
+    np.testing.assert_array_equal(rgb, pixels.astype(np.float32) / 255)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "WEBP"])
+def test_a_lossy_file_is_close_to_its_pixels(kind):
+    colour = Image.new("RGB", (16, 8), (200, 100, 50))
+    rgb = decode_rgb(saved(colour, kind, quality=95), "x")
+    assert rgb.shape == (8, 16, 3)
+    np.testing.assert_allclose(rgb * 255, np.broadcast_to([200, 100, 50], (8, 16, 3)), atol=4)  # colour rounding
+
+
+EIGHT_BIT = {
+    "grey": (Image.new("L", (1, 1), 51), "PNG", {}, (0.2, 0.2, 0.2)),
+    "1-bit white": (Image.new("1", (1, 1), 1), "PNG", {}, (1, 1, 1)),
+    "1-bit black": (Image.new("1", (1, 1), 0), "TIFF", {}, (0, 0, 0)),
+    "palette": (Image.new("RGB", (1, 1), (255, 51, 0)).quantize(2), "PNG", {}, (1, 0.2, 0)),
+    "cmyk": (Image.new("CMYK", (1, 1), (0, 255, 255, 0)), "TIFF", {}, (1, 0, 0)),
+    "cmyk black": (Image.new("CMYK", (1, 1), (0, 0, 0, 255)), "JPEG", {"quality": 100}, (0, 0, 0)),
+    "alpha half": (Image.new("RGBA", (1, 1), (255, 0, 0, 51)), "PNG", {}, (1, 0.8, 0.8)),
+    "alpha none": (Image.new("RGBA", (1, 1), (0, 0, 0, 0)), "WEBP", {"lossless": True}, (1, 1, 1)),
+    "grey alpha": (Image.new("LA", (1, 1), (0, 51)), "PNG", {}, (0.8, 0.8, 0.8)),
+    "grey key": (Image.new("L", (1, 1), 9), "PNG", {"transparency": 9}, (1, 1, 1)),
+    "colour key": (Image.new("RGB", (1, 1), (9, 8, 7)), "PNG", {"transparency": (9, 8, 7)}, (1, 1, 1)),
+    "not the key": (Image.new("RGB", (1, 1), (0, 0, 255)), "PNG", {"transparency": (9, 8, 7)}, (0, 0, 1)),
+}
+
+
+@pytest.mark.parametrize("name", EIGHT_BIT)
+def test_every_eight_bit_kind_becomes_rgb_on_white(name):
+    image, kind, options, expected = EIGHT_BIT[name]
+    rgb = decode_rgb(saved(image, kind, **options), name)
+    np.testing.assert_allclose(rgb, np.reshape(expected, (1, 1, 3)), atol=1e-7)
+
+
+def test_a_transparent_palette_entry_is_white_and_the_others_keep_their_colour():
+    image = Image.new("P", (2, 1))
+    image.putpalette([255, 0, 0, 0, 0, 255])
+    image.putpixel((1, 0), 1)
+    rgb = decode_rgb(saved(image, "PNG", transparency=0), "x")
+    np.testing.assert_array_equal(rgb[0], [[1, 1, 1], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("kind", [".png", ".tiff"])
+def test_sixteen_bit_colour_keeps_its_low_byte_which_pillow_alone_drops(kind):
+    pixels = np.array([[[256, 257, 65535], [1, 0, 511]]], np.uint16)
+    data = cv2.imencode(kind, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
+    np.testing.assert_array_equal(decode_rgb(data, "x"), pixels.astype(np.float32) / 65535)
+    naive = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+    np.testing.assert_array_equal(naive[0, 0, :2], [1, 1])
+
+
+def test_sixteen_bit_grey_is_scaled_and_not_clipped_as_pillow_alone_does():
+    pixels = np.array([[0, 256, 32768, 65535]], np.uint16)
+    for data in (png(0, 16, pixels), tiff(pixels[..., None])):
+        np.testing.assert_array_equal(decode_rgb(data, "x")[0, :, 1], pixels[0].astype(np.float32) / 65535)
+
+
+def test_sixteen_bit_alpha_is_laid_on_white():
+    expected = [[1, 1, 1], [0.8, 0.8, 0.8]]
+    grey = png(4, 16, [[[0, 0], [0, 13107]]])
+    colour = png(6, 16, [[[0, 0, 0, 0], [0, 0, 0, 13107]]])
+    straight = tiff(np.array([[[9, 9, 9, 0], [0, 0, 0, 13107]]], np.uint16), extra_samples=2)
+    for data in (grey, colour, straight):
+        np.testing.assert_allclose(decode_rgb(data, "x")[0], expected, atol=1e-7)
+
+
+def test_sixteen_bit_colour_that_is_premultiplied_is_not_multiplied_again():
+    data = tiff(np.array([[[13107, 0, 0, 13107]]], np.uint16), extra_samples=1)
+    np.testing.assert_allclose(decode_rgb(data, "x")[0], [[1, 0.8, 0.8]], atol=1e-7)
+
+
+def test_a_fourth_sample_that_is_no_alpha_is_left_out():
+    data = tiff(np.array([[[65535, 0, 0, 0]]], np.uint16), extra_samples=0)
+    np.testing.assert_array_equal(decode_rgb(data, "x")[0], [[1, 0, 0]])
+
+
+def test_a_sixteen_bit_colour_key_is_see_through_only_where_all_its_bits_agree():
+    grey = png(0, 16, [[2000, 2001]], chunk(b"tRNS", struct.pack(">H", 2000)))
+    colour = png(2, 16, [[[7, 8, 9], [7, 8, 10]]], chunk(b"tRNS", struct.pack(">HHH", 7, 8, 9)))
+    np.testing.assert_allclose(decode_rgb(grey, "x")[0, :, 0], [1, 2001 / 65535], atol=1e-7)
+    np.testing.assert_allclose(decode_rgb(colour, "x")[0, :, 2], [1, 10 / 65535], atol=1e-7)
+
+
+UPRIGHT = {
+    1: [[1, 2, 3], [4, 5, 6]],
+    2: [[3, 2, 1], [6, 5, 4]],
+    3: [[6, 5, 4], [3, 2, 1]],
+    4: [[4, 5, 6], [1, 2, 3]],
+    5: [[1, 4], [2, 5], [3, 6]],
+    6: [[4, 1], [5, 2], [6, 3]],
+    7: [[6, 3], [5, 2], [4, 1]],
+    8: [[3, 6], [2, 5], [1, 4]],
+}
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("kind", ["png", "png 16-bit", "webp", "tiff", "tiff 16-bit"])
+def test_the_exif_orientation_is_applied_once(orientation, kind):
+    stored = np.array([[1, 2, 3], [4, 5, 6]])
+    eight, sixteen = (stored * 20).astype(np.uint8), (stored * 5000).astype(np.uint16)
+    chunk_exif = chunk(b"eXIf", exif(orientation).removeprefix(b"Exif\0\0"))
+    data, scale = {
+        "png": (saved(Image.fromarray(eight), "PNG", exif=exif(orientation)), 20 / 255),
+        "png 16-bit": (png(0, 16, sixteen, chunk_exif), 5000 / 65535),
+        "webp": (
+            saved(Image.fromarray(eight).convert("RGB"), "WEBP", lossless=True, exif=exif(orientation)),
+            20 / 255,
+        ),
+        "tiff": (tiff(eight[..., None], orientation), 20 / 255),
+        "tiff 16-bit": (tiff(sixteen[..., None], orientation), 5000 / 65535),
+    }[kind]
+    np.testing.assert_allclose(decode_rgb(data, "x")[..., 0], np.array(UPRIGHT[orientation]) * scale, atol=1e-6)
+
+
+def test_a_jpeg_that_says_it_lies_on_its_side_stands_up():
+    left_white = Image.new("L", (32, 16))
+    left_white.paste(255, (0, 0, 16, 16))
+    rgb = decode_rgb(saved(left_white, "JPEG", exif=exif(6)), "x")
+    assert rgb.shape == (32, 16, 3)
+    np.testing.assert_allclose(rgb[:, 8, 0], [1] * 16 + [0] * 16, atol=0.02)  # JPEG loss
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 60000])
+def test_an_orientation_that_does_not_exist_is_none(orientation):
+    data = saved(Image.fromarray(noise(2, 3)), "PNG", exif=exif(orientation))
+    assert decode_rgb(data, "x").shape == (2, 3, 3)
+
+
+def test_damaged_exif_does_not_cost_the_picture():
+    data = png(0, 8, [[255]], chunk(b"eXIf", b"II*\0\xff\xff\xff\xff broken"))
+    np.testing.assert_array_equal(decode_rgb(data, "x"), np.ones((1, 1, 3)))
+
+
+# Refusing --------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_file_a_folder_and_a_pipe_are_named_with_the_reason(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    for name, reason in (("none.png", "no such file"), (".", "folder"), ("pipe.png", "not a regular file")):
+        with pytest.raises(ImageError, match=reason) as caught:
+            read_rgb(tmp_path / name)
+        assert caught.value.path == str(tmp_path / name)
+        assert caught.value.exit_code == 2
+
+
+def test_a_file_that_may_not_be_read_is_named_with_the_reason(tmp_path, monkeypatch):
+    (tmp_path / "a.png").write_bytes(sample_files()["png"])
+
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ImageError, match=r"a\.png: cannot be read: Permission denied"):
+        read_rgb(tmp_path / "a.png")
+
+
+def test_a_name_with_a_nul_and_a_file_that_is_too_long_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ImageError, match="cannot be read"):
+        read_rgb("a\0.png")
+    (tmp_path / "a.png").write_bytes(b"12345")
+    monkeypatch.setattr(images, "MAX_BYTES", 4)
+    with pytest.raises(ImageError, match="has 5 bytes; at most 4"):
+        read_rgb(tmp_path / "a.png")
+
+
+REFUSED = {
+    "empty": (b"", "is empty"),
+    "text": (b"hello, this is no picture at all", "not a PNG, JPEG"),
+    "gif": (saved(Image.new("L", (2, 2)), "GIF"), "not a PNG, JPEG"),
+    "zero width": (png(2, 8, np.zeros((0, 0, 3)), size=(3, 0)), "no pixels|header is damaged"),
+    "float": (saved(Image.new("F", (2, 2)), "TIFF"), "pixel type .*F.*not supported"),
+    "32-bit": (saved(Image.new("I", (2, 2)), "TIFF"), "pixel type .*I.*not supported"),
+    "12-bit": (tiff(np.zeros((2, 2, 1), np.uint16), bits=12), "not supported|truncated"),
+    "inverted 16-bit": (tiff(np.zeros((2, 2, 1), np.uint16), photometric=0), "not supported"),
+    "lab": (saved(Image.new("LAB", (2, 2)), "TIFF"), "pixel type LAB is not supported"),
+    "bomb": (png(2, 8, np.zeros((1, 1, 3)), size=(6000, 10000)), "10000 x 6000 = pixels; at most 50000000"),
+    "bomb that warns": (png(2, 8, np.zeros((1, 1, 3)), size=(10000, 10000)), "10000 x 10000 = pixels"),
+    "bomb that raises": (png(2, 8, np.zeros((1, 1, 3)), size=(30000, 30000)), "far more pixels; at most"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_usable_picture_is_refused_with_the_reason(name):
+    data, reason = REFUSED[name]
+    with pytest.raises(ImageError, match=reason) as caught:
+        decode_rgb(data, "shot.png")
+    assert str(caught.value).startswith("shot.png: ")
+
+
+def test_a_bomb_is_refused_by_its_header_before_it_is_decoded(monkeypatch):
+    def decoded(self):
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", decoded)
+    with pytest.raises(ImageError, match="at most 50000000"):
+        decode_rgb(REFUSED["bomb"][0], "x")
+
+
+def webp_headers(width, height):
+    canvas = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+    yield b"VP8X" + struct.pack("<I", 10) + bytes(4) + canvas
+    yield (b"VP8L" + struct.pack("<I", 9) + b"\x2f" + struct.pack("<I", width - 1 | (height - 1) << 14) + bytes(5))
+    yield b"VP8 " + struct.pack("<I", 10) + bytes(3) + b"\x9d\x01\x2a" + struct.pack("<HH", width, height)
+
+
+def test_a_webp_bomb_is_refused_before_pillow_opens_it_for_opening_allocates(monkeypatch):
+    def opened(*_, **__):
+        raise AssertionError("opened")
+
+    monkeypatch.setattr(images.Image, "open", opened)
+    for header in webp_headers(12000, 5000):
+        data = b"RIFF" + struct.pack("<I", 4 + len(header)) + b"WEBP" + header
+        with pytest.raises(ImageError, match="12000 x 5000"):
+            decode_rgb(data, "x")
+
+
+@pytest.mark.parametrize("options", [{}, {"lossless": True}, {"lossless": True, "exif": exif(1)}])
+def test_the_size_of_real_webp_files_is_read_from_their_header(options):
+    data = saved(Image.fromarray(noise(7, 5)), "WEBP", **options)
+    assert images._webp_size(data) == (5, 7)
+
+
+def test_a_picture_of_the_largest_size_is_read(monkeypatch):
+    monkeypatch.setattr(images, "MAX_PIXELS", 6)
+    assert decode_rgb(saved(Image.new("L", (3, 2)), "PNG"), "x").shape == (2, 3, 3)
+    with pytest.raises(ImageError, match="7 x 1 = pixels; at most 6"):
+        decode_rgb(saved(Image.new("L", (7, 1)), "PNG"), "x")
+
+
+def test_a_png_chunk_that_claims_gigabytes_does_not_reach_opencv_which_would_allocate_them(monkeypatch):
+    data = sample_files()["png 16-bit"]
+    place = data.index(b"IDAT") - 4
+    bomb = data[:place] + b"\x7f" + data[place + 1 :]
+    Image.open(io.BytesIO(bomb)).load()  # Pillow takes it
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(ImageError, match="a PNG chunk is longer than the file"):
+        decode_rgb(bomb, "x")
+
+
+def test_running_out_of_memory_is_an_image_error(monkeypatch):
+    def exhausted(self):
+        raise MemoryError
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", exhausted)
+    with pytest.raises(ImageError, match="MemoryError"):
+        decode_rgb(sample_files()["png"], "x")
+
+
+def test_a_truncated_jpeg_is_refused_which_the_imread_of_opencv_fills_with_grey(tmp_path):
+    data = saved(Image.fromarray(noise(40, 48)), "JPEG")
+    path = tmp_path / "half.jpg"
+    path.write_bytes(data[: len(data) // 2])
+    naive = cv2.imread(str(path))
+    assert naive.shape == (40, 48, 3)
+    assert (naive[-1, -8:] == 128).all()
+    with pytest.raises(ImageError, match="truncated"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("name", sample_files())
+def test_a_file_cut_at_any_length_is_refused_or_gives_the_whole_picture(name):
+    data = sample_files()[name]
+    whole = decode_rgb(data, name)
+    for length in {*range(0, len(data), max(len(data) // 60, 1)), *range(max(len(data) - 30, 0), len(data))}:
+        try:
+            part = decode_rgb(data[:length], name)
+        except ImageError:
+            continue
+        np.testing.assert_array_equal(part, whole)
+
+
+def check_only_image_errors(data):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(images, "MAX_PIXELS", 1_000_000)  # 50 times faster where a header asks for the most
+        try:
+            rgb = decode_rgb(data, "fuzz")
+        except ImageError:
+            return
+    assert rgb.ndim == 3
+    assert rgb.shape[2] == 3
+    assert rgb.dtype == np.float32
+    assert rgb.min() >= 0
+    assert rgb.max() <= 1
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    prefix=st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF....WEBP"]),
+    rest=st.binary(max_size=200),
+)
+def test_random_bytes_are_an_image_error_or_a_picture(prefix, rest):
+    check_only_image_errors(prefix + rest)
+
+
+@settings(max_examples=600, deadline=None)
+@given(
+    name=st.sampled_from(sorted(sample_files())),
+    flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7)), min_size=1, max_size=6),
+)
+def test_flipped_bits_are_an_image_error_or_a_picture(name, flips):
+    data = bytearray(sample_files()[name])
+    for place, bit in flips:
+        data[int(place * len(data))] ^= 1 << bit
+    check_only_image_errors(bytes(data))
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    name=st.sampled_from(sorted(sample_files())),
+    place=st.integers(0, 63),
+    value=st.sampled_from([b"\0\0", b"\xff\xff", b"\x7f\xff", b"\0\x20"]),
+)
+def test_extreme_values_in_the_header_are_an_image_error_or_a_picture(name, place, value):
+    data = sample_files()[name]
+    check_only_image_errors(data[:place] + value + data[place + 2 :])
+
+
+def test_threads_that_decode_together_agree_and_leave_the_warning_filters_alone():
+    before, data, found = list(warnings.filters), sample_files()["tiff lzw"], []
+    threads = [threading.Thread(target=lambda: found.append(decode_rgb(data, "x"))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert warnings.filters == before
+    assert len(found) == 8
+    assert all(np.array_equal(first, second) for first, second in pairwise(found))
+
+
+def test_to_float_scales_by_the_type_and_refuses_others():
+    np.testing.assert_array_equal(to_float(np.array([0, 255], np.uint8)), [0, 1])
+    np.testing.assert_array_equal(to_float(np.array([0, 65535], np.uint16)), [0, 1])
+    with pytest.raises(BadInput, match="must be uint8 or uint16, got float64"):
+        to_float(np.zeros(2))

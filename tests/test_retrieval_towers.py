@@ -1,0 +1,223 @@
+"""Towers: parity with an independent implementation, ImageNet keys, and the contract of the base class."""
+
+import math
+import re
+from urllib.error import URLError
+
+import pytest
+import torch
+from torch import nn
+
+from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
+from retrieval.towers import TOWERS, build_tower
+from retrieval.towers.weights import initialise_tower, load_tower_state, read_state
+from tests.data import touch_data
+
+
+def transformers_resnet(name):
+    from transformers import ResNetConfig, ResNetForImageClassification
+
+    kinds = {
+        "resnet18": ("basic", [2, 2, 2, 2], [64, 128, 256, 512]),
+        "resnet34": ("basic", [3, 4, 6, 3], [64, 128, 256, 512]),
+        "resnet50": ("bottleneck", [3, 4, 6, 3], [256, 512, 1024, 2048]),
+    }
+    kind, depths, widths = kinds[name]
+    config = ResNetConfig(layer_type=kind, depths=depths, hidden_sizes=widths, num_labels=1000)
+    return ResNetForImageClassification(config)
+
+
+def transformers_mobilenet():
+    from transformers import MobileNetV2Config, MobileNetV2ForImageClassification
+
+    config = MobileNetV2Config(tf_padding=False, layer_norm_eps=1e-5, num_labels=1000)
+    return MobileNetV2ForImageClassification(config)
+
+
+def weights_in_order_of_use(model, images):
+    """State of the convolutions, normalisations and linear layers in the order in which a forward pass meets them."""
+    met, hooks = [], []
+    for module in model.modules():
+        if isinstance(module, nn.Conv2d | nn.BatchNorm2d | nn.Linear):
+            hooks.append(module.register_forward_hook(lambda layer, _, __: met.append(layer)))
+    with torch.inference_mode():
+        model(images)
+    for hook in hooks:
+        hook.remove()
+    return met
+
+
+@pytest.mark.parametrize("name", ["resnet18", "resnet34", "resnet50", "mobilenet_v2"])
+def test_a_tower_computes_what_an_independent_implementation_computes_with_the_same_weights(name):
+    torch.manual_seed(3)
+    other = (transformers_mobilenet() if name == "mobilenet_v2" else transformers_resnet(name)).eval()
+    tower = build_tower(name, "classes").eval()
+    images = torch.rand(2, 3, 96, 64)
+    normalised = (images - tower.mean) / tower.std
+    ours, theirs = weights_in_order_of_use(tower, images), weights_in_order_of_use(other, normalised)
+    # Shortcuts may be met before or after the main branch, so layers pair up by kind and shape, in order.
+    waiting = list(theirs)
+    for layer in ours:
+        shapes = {key: value.shape for key, value in layer.state_dict().items()}
+        partner = next(
+            other_layer
+            for other_layer in waiting
+            if type(other_layer) is type(layer)
+            and {key: value.shape for key, value in other_layer.state_dict().items()} == shapes
+        )
+        waiting.remove(partner)
+        for value in partner.parameters():  # no weight is left where a wrong pairing would hide
+            nn.init.normal_(value, std=0.05) if value.ndim > 1 else nn.init.uniform_(value, 0.5, 1.5)
+        layer.load_state_dict(partner.state_dict())
+    assert not waiting
+    with torch.inference_mode():
+        torch.testing.assert_close(tower(images), other(normalised).logits, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "pooled"),
+    [
+        ("resnet18", 11_689_512, 512),
+        ("resnet34", 21_797_672, 512),
+        ("resnet50", 25_557_032, 2048),
+        ("mobilenet_v2", 3_504_872, 1280),
+    ],
+)
+def test_a_tower_has_the_published_number_of_parameters(name, parameters, pooled):
+    assert sum(value.numel() for value in build_tower(name, "classes").parameters()) == parameters
+    assert build_tower(name, "classes").feature_count == 1000
+    assert build_tower(name).feature_count == pooled
+
+
+def test_resnet_has_the_key_names_of_published_checkpoints():
+    keys = build_tower("resnet50", "classes").state_dict()
+    for key in (
+        "conv1.weight",
+        "layer1.0.downsample.1.running_var",
+        "layer4.2.bn3.num_batches_tracked",
+        "fc.bias",
+    ):
+        assert key in keys
+    assert "layer1.0.downsample.0.weight" not in build_tower("resnet18").state_dict()
+    assert len(keys) == 320
+
+
+def test_mobilenet_has_the_key_names_of_published_checkpoints():
+    keys = build_tower("mobilenet_v2", "classes").state_dict()
+    for key in (
+        "features.0.0.weight",
+        "features.1.conv.0.0.weight",
+        "features.2.conv.3.bias",
+        "classifier.1.weight",
+    ):
+        assert key in keys
+    assert len(keys) == 314
+
+
+@pytest.mark.parametrize("name", sorted(TOWERS))
+def test_an_image_is_encoded_alike_in_any_batch(name):
+    torch.manual_seed(0)
+    tower = build_tower(name).eval()
+    images = torch.rand(5, 3, 64, 64)
+    with torch.inference_mode():
+        together, alone = tower(images), torch.cat([tower(image[None]) for image in images])
+    # Another batch size may sum in another order: float32 rounding of the largest outputs.
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-5 * float(together.abs().max()))
+
+
+@pytest.mark.parametrize(
+    ("images", "error", "words"),
+    [
+        (torch.rand(3, 64, 64), BadInput, "shaped"),
+        (torch.rand(1, 1, 64, 64), BadInput, "RGB"),
+        (torch.rand(0, 3, 64, 64), BadInput, "empty"),
+        (torch.randint(0, 255, (1, 3, 64, 64), dtype=torch.uint8), BadInput, "float32"),
+        (torch.rand(1, 3, 64, 64) * 255, BadInput, "divide"),
+        (torch.full((1, 3, 64, 64), math.nan), NumericalError, "NaN"),
+        (torch.full((1, 3, 64, 64), math.inf), NumericalError, "infinite"),
+    ],
+)
+def test_a_tower_refuses_what_is_not_an_image(images, error, words):
+    with pytest.raises(error, match=words):
+        build_tower("small")(images)
+
+
+def test_unknown_towers_and_outputs_are_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="resnet50, small; got 'vgg'"):
+        build_tower("vgg")
+    with pytest.raises(ConfigError, match="classes, pooled; got 'logits'"):
+        build_tower("small", "logits")
+
+
+def test_weights_come_back_from_a_file(tmp_path):
+    torch.manual_seed(1)
+    source = build_tower("resnet18", "classes")
+    torch.save(source.state_dict(), tmp_path / "weights.pth")
+    target = build_tower("resnet18")
+    initialise_tower(target, "resnet18", str(tmp_path / "weights.pth"))
+    assert torch.equal(target.conv1.weight, source.conv1.weight)
+
+
+def test_weights_of_another_architecture_are_refused_by_name():
+    with pytest.raises(
+        CheckpointError, match=r"layer1.0.conv1.weight is \(64, 64, 1, 1\), must be \(64, 64, 3, 3\)|unknown"
+    ):
+        load_tower_state(build_tower("resnet18"), dict(build_tower("resnet50").state_dict()), "resnet50.pth")
+    with pytest.raises(CheckpointError, match="lacks"):
+        load_tower_state(build_tower("resnet18"), {}, "empty.pth")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04broken zip"])
+def test_damaged_weight_files_are_one_clear_error(tmp_path, content):
+    path = tmp_path / "weights.pth"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="not a readable state dict"):
+        read_state(path)
+
+
+class Payload:
+    def __reduce__(self):
+        return (print, ("arbitrary code",))
+
+
+def test_a_pickle_with_code_is_refused_and_not_run(tmp_path, capsys):
+    torch.save({"weight": Payload()}, tmp_path / "evil.pth")
+    with pytest.raises(CheckpointError):
+        read_state(tmp_path / "evil.pth")
+    assert "arbitrary" not in capsys.readouterr().out
+
+
+def test_without_network_the_error_says_which_file_to_put_where(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
+    with pytest.raises(CheckpointError, match=re.escape(str(tmp_path / "checkpoints" / "resnet18-f37072fd.pth"))):
+        initialise_tower(build_tower("resnet18"), "resnet18", "imagenet")
+
+
+def _no_network(*arguments, **settings):
+    raise URLError("no route to host")
+
+
+def test_imagenet_weights_are_taken_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
+    source = build_tower("resnet18", "classes")
+    (tmp_path / "checkpoints").mkdir()
+    torch.save(source.state_dict(), tmp_path / "checkpoints" / "resnet18-f37072fd.pth")
+    target = build_tower("resnet18")
+    initialise_tower(target, "resnet18", "imagenet")
+    assert torch.equal(target.conv1.weight, source.conv1.weight)
+
+
+def test_real_imagenet_weights_load_in_their_older_key_layout():
+    path = touch_data("weights/mobilenet_v2_imagenet_features.pt")
+    tower = build_tower("mobilenet_v2")
+    initialise_tower(tower, "mobilenet_v2", str(path))
+    state = read_state(path)
+    assert torch.equal(tower.features[0][0].weight, state["features.0.0.weight"])
+    assert torch.equal(tower.features[1].conv[1].weight, state["features.1.conv.3.weight"])
+    assert torch.equal(tower.features[17].conv[3].running_var, state["features.17.conv.7.running_var"])
+    features = tower.eval()(torch.rand(1, 3, 224, 224))
+    # ReLU6 after the last convolution, averaged.
+    assert features.min() >= 0
+    assert features.max() <= 6

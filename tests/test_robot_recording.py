@@ -1,0 +1,397 @@
+"""The recording on disk: what a reader accepts, and what a writer writes."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot import recording as module
+from robot.errors import RecordingError, StorageError
+from robot.recording import RecordedGrasp, RecordingWriter, read_recording
+
+INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
+ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
+
+
+def pixels(seed=0, height=4, width=5):
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def pictures(seed=0):
+    return {"photo": pixels(seed), "touch_a": pixels(seed + 1), "touch_b": pixels(seed + 2)}
+
+
+def write(folder, *lines, info=None):
+    """A recording with these lines, each a dict or the raw text."""
+    folder.mkdir(exist_ok=True)
+    (folder / "recording.json").write_text(json.dumps({"schema_version": 1, **INFO} if info is None else info))
+    text = "".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines)
+    (folder / "metadata.jsonl").write_bytes(text.encode("utf-8", "surrogateescape"))
+    return folder
+
+
+def two_grasps(folder):
+    with RecordingWriter(folder, INFO) as writer:
+        writer.append("1", "mug", pictures(1), force_n=5)
+        writer.append("2", "cup", pictures(2))
+    return folder
+
+
+def ids(folder):
+    return [grasp.grasp_id for grasp in read_recording(folder).grasps]
+
+
+# Round trip ------------------------------------------------------------------------------------------------
+
+
+def test_what_was_appended_is_read_back(tmp_path):
+    with RecordingWriter(tmp_path / "r", INFO) as writer:
+        images = {**pictures(), "touch_a_before": pixels(7), "touch_b_after": pixels(8)}
+        images["depth"] = np.array([[0, 1, 65535]], np.uint16)
+        written = writer.append(
+            "000001",
+            "red mug",
+            images,
+            force_n=np.float32(7.5),
+            opening_mm=31,
+            pose=np.array([1.0, 2.0, 3.0, 0.5]),
+            grasped=np.True_,
+            sequence_id="tuesday",
+            time_s=0.25,
+        )
+    recording = read_recording(tmp_path / "r")
+    assert recording.grasps == (written,)
+    assert recording.notes == ()
+    assert written == RecordedGrasp(
+        grasp_id="000001",
+        object_id="red mug",
+        photo="images/000001_photo.png",
+        touches={"a": "images/000001_touch_a.png", "b": "images/000001_touch_b.png"},
+        touches_before={"a": "images/000001_touch_a_before.png"},
+        touches_after={"b": "images/000001_touch_b_after.png"},
+        depth="images/000001_depth.png",
+        force_n=7.5,
+        opening_mm=31.0,
+        pose=(1.0, 2.0, 3.0, 0.5),
+        grasped=True,
+        sequence_id="tuesday",
+        time_s=0.25,
+    )
+    assert hash(written) == hash(recording.grasps[0])
+
+
+def test_the_columns_have_the_documented_names_and_what_is_missing_is_left_out(tmp_path):
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("1", "mug", {"photo": pixels(), "touch_a": pixels(), "touch_a_before": pixels()}, force_n=2)
+    (line,) = (tmp_path / "metadata.jsonl").read_text().splitlines()
+    assert json.loads(line) == {
+        "grasp_id": "1",
+        "object_id": "mug",
+        "force_n": 2.0,
+        "photo_file_name": "images/1_photo.png",
+        "touch_a_file_name": "images/1_touch_a.png",
+        "touch_a_before_file_name": "images/1_touch_a_before.png",
+    }
+
+
+def test_pixels_come_back_with_red_first_and_depth_with_sixteen_bits(tmp_path):
+    depth = np.array([[0, 256, 65535]], np.uint16)
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("1", "mug", {"photo": pixels(1), "touch_a": pixels(2)[:, ::-1], "depth": depth})
+    photo = cv2.cvtColor(cv2.imread(str(tmp_path / "images/1_photo.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(photo, pixels(1))
+    touch = cv2.cvtColor(cv2.imread(str(tmp_path / "images/1_touch_a.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(touch, pixels(2)[:, ::-1])
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "images/1_depth.png"), cv2.IMREAD_UNCHANGED), depth)
+
+
+def test_files_and_their_bytes_are_copied_as_they_are(tmp_path):
+    jpeg, png = (cv2.imencode(kind, pixels())[1].tobytes() for kind in (".jpg", ".png"))
+    (tmp_path / "x.data").write_bytes(jpeg)
+    with RecordingWriter(tmp_path / "r", INFO) as writer:
+        grasp = writer.append("1", "mug", {"photo": tmp_path / "x.data", "touch_a": png})
+    assert grasp.images() == {"photo": "images/1_photo.jpg", "touch_a": "images/1_touch_a.png"}
+    assert (tmp_path / "r" / grasp.photo).read_bytes() == jpeg
+    assert (tmp_path / "r" / grasp.touches["a"]).read_bytes() == png
+
+
+def test_recording_json_has_defaults_and_keeps_other_keys(tmp_path):
+    RecordingWriter(tmp_path, {**INFO, "licence": "MIT"}).close()
+    info = json.loads((tmp_path / "recording.json").read_text())
+    assert info["schema_version"] == 1
+    assert info["seed"] == 3
+    assert info["background"] == "none"
+    assert info["licence"] == "MIT"
+    assert info["units"]["force_n"] == "newton"
+    assert {"source", "sensor", "rig", "software_version"} <= set(info)
+    assert read_recording(tmp_path).grasps == ()
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.text(st.characters(categories=["L", "N", "P"]), min_size=1),
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.none() | st.booleans(),
+    st.none() | st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=7),
+)
+def test_any_grasp_survives_its_line(object_id, number, grasped, pose):
+    grasp = RecordedGrasp(
+        "1", object_id, "p.png", {"b": "b.png"}, force_n=number, grasped=grasped, pose=pose and tuple(pose)
+    )
+    assert RecordedGrasp.from_row(json.loads(json.dumps(grasp.to_row()))) == grasp
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+def test_a_line_of_another_program_may_leave_keys_null_and_end_without_a_newline(tmp_path):
+    write(tmp_path, {**ROW, "force_n": None, "touch_b_file_name": None}, "", "  ")
+    with open(tmp_path / "metadata.jsonl", "a") as file:
+        file.write(json.dumps({**ROW, "grasp_id": "2"}))
+    recording = read_recording(tmp_path)
+    assert [grasp.grasp_id for grasp in recording.grasps] == ["1", "2"]
+    assert recording.grasps[0].touches == {"a": "a.png"}
+    assert recording.notes == ()
+
+
+BAD_LINES = {
+    "{": "must be JSON",
+    "[]": "one JSON object",
+    '"x"': "one JSON object",
+    "\udcff": "must be JSON in UTF-8",
+    "[" * 100_000: "must be JSON",
+    json.dumps({**ROW, "grasp_id": "0"}): "'0' has a line already",
+    json.dumps({**ROW, "object_id": None}): "object_id is missing",
+    json.dumps({key: ROW[key] for key in ROW if key != "grasp_id"}): "grasp_id is missing",
+    json.dumps({key: ROW[key] for key in ROW if key != "photo_file_name"}): "photo_file_name is missing",
+    json.dumps({key: ROW[key] for key in ROW if key != "touch_a_file_name"}): "at least one touch",
+    json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a non-empty printable string, got 5",
+    json.dumps({**ROW, "object_id": " "}): "object_id must be a non-empty",
+    json.dumps({**ROW, "object_id": "\ud800"}): "object_id must be a non-empty printable",
+    json.dumps({**ROW, "sequence_id": ["a"]}): "sequence_id must be",
+    json.dumps({**ROW, "force_n": "5"}): "force_n must be a finite number, got '5'",
+    json.dumps({**ROW, "force_n": True}): "force_n must be a finite number, got True",
+    json.dumps({**ROW, "force_n": float("nan")}): "finite, got NaN",
+    json.dumps({**ROW, "force_n": float("inf")}): "finite, got Infinity",
+    json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "time_s must be a finite number, got inf",
+    json.dumps({**ROW, "time_s": 10**400}): "time_s must be a finite number",
+    json.dumps({**ROW, "grasped": 1}): "grasped must be true or false, got 1",
+    json.dumps({**ROW, "pose": 5}): "pose must be a list of numbers",
+    json.dumps({**ROW, "pose": "123"}): "pose must be a list of numbers",
+    json.dumps({**ROW, "pose": [1, "2"]}): "pose must be a finite number, got '2'",
+    json.dumps({**ROW, "photo_file_name": 5}): "photo_file_name must be a path inside",
+    json.dumps({**ROW, "photo_file_name": ""}): "must be a path inside the recording, got ''",
+    json.dumps({**ROW, "photo_file_name": "."}): "must be a path inside",
+    json.dumps({**ROW, "photo_file_name": "/etc/passwd"}): "must be a path inside",
+    json.dumps({**ROW, "photo_file_name": "a/../../b.png"}): "must be a path inside",
+    json.dumps({**ROW, "photo_file_name": "C:/x.png"}): "must be a path inside",
+    json.dumps({**ROW, "photo_file_name": "..\\x.png"}): "must be a path inside",
+    json.dumps({**ROW, "photo_file_name": "a\0.png"}): "must be a path inside",
+    json.dumps({**ROW, "touch_a_file_name": {"a": 1}}): "touch_a_file_name must be a path inside",
+}
+
+
+@pytest.mark.parametrize("line", BAD_LINES, ids=range(len(BAD_LINES)))
+def test_a_bad_line_is_named_by_its_number(tmp_path, line):
+    write(tmp_path, {**ROW, "grasp_id": "0"}, line, {**ROW, "grasp_id": "2"})
+    with pytest.raises(RecordingError) as caught:
+        read_recording(tmp_path)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path}/metadata.jsonl, line 2: ")
+    assert BAD_LINES[line] in message
+    assert caught.value.exit_code == 2
+
+
+def test_half_a_last_line_is_dropped_with_a_note_however_long_it_is(tmp_path):
+    write(tmp_path, ROW)
+    whole, line = (tmp_path / "metadata.jsonl").read_bytes(), json.dumps({**ROW, "grasp_id": "é"}).encode()
+    for length in range(1, len(line)):
+        (tmp_path / "metadata.jsonl").write_bytes(whole + line[:length])
+        recording = read_recording(tmp_path)
+        assert [grasp.grasp_id for grasp in recording.grasps] == ["1"]
+        assert f"half-written last line ({length} bytes)" in recording.notes[0]
+    (tmp_path / "metadata.jsonl").write_bytes(whole + b"\0" * 512)  # what some file systems leave
+    assert ids(tmp_path) == ["1"]
+
+
+def test_half_a_line_that_is_not_the_last_is_an_error(tmp_path):
+    write(tmp_path, json.dumps(ROW)[:30], {**ROW, "grasp_id": "2"})
+    with pytest.raises(RecordingError, match="line 1: must be JSON"):
+        read_recording(tmp_path)
+
+
+@pytest.mark.parametrize("version", [0, 2, "1", True, None, 1.0])
+def test_another_schema_version_names_the_known_ones(tmp_path, version):
+    write(tmp_path, ROW, info={**INFO, "schema_version": version})
+    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be one .*\(1\), got"):
+        read_recording(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", '{"schema_version": 1}', '{"schema_version": 1, "source": 3}'])
+def test_a_bad_recording_json_is_an_error_that_names_it(tmp_path, text):
+    (write(tmp_path, ROW) / "recording.json").write_text(text)
+    with pytest.raises(RecordingError, match=r"recording\.json: "):
+        read_recording(tmp_path)
+
+
+def test_a_folder_that_is_no_recording_is_told_and_what_makes_one(tmp_path):
+    for folder in (tmp_path, tmp_path / "none"):
+        with pytest.raises(RecordingError, match="`retrieve import` writes recordings"):
+            read_recording(folder)
+    (write(tmp_path / "r", ROW) / "metadata.jsonl").unlink()
+    with pytest.raises(RecordingError, match=r"metadata\.jsonl cannot be read: No such file"):
+        read_recording(tmp_path / "r")
+
+
+def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
+    write(tmp_path, ROW)  # its images do not exist
+    code = f"import sys; from robot.recording import read_recording; read_recording({str(tmp_path)!r}); "
+    code += "assert not {'cv2', 'torch', 'scipy', 'retrieval'} & set(sys.modules)"
+    root = Path(module.__file__).parents[1]
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
+
+
+# Writing ---------------------------------------------------------------------------------------------------
+
+
+def test_a_writer_goes_on_where_the_last_one_stopped(tmp_path):
+    two_grasps(tmp_path)
+    with RecordingWriter(tmp_path, {**INFO, "seed": 9}) as writer:
+        assert set(writer.grasp_ids) == {"1", "2"}
+        assert writer.info["seed"] == 3
+        writer.append("3", "cup", pictures())
+    assert ids(tmp_path) == ["1", "2", "3"]
+
+
+def test_a_torn_last_line_is_cut_off_when_the_recording_is_opened_again(tmp_path):
+    two_grasps(tmp_path)
+    with open(tmp_path / "metadata.jsonl", "ab") as file:
+        file.write(b'{"grasp_id": "3", "obj')
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("3", "cup", pictures())
+    assert ids(tmp_path) == ["1", "2", "3"]
+    assert read_recording(tmp_path).notes == ()
+    assert (tmp_path / "metadata.jsonl").read_bytes().count(b"\n") == 3
+
+
+def test_a_last_line_that_only_lacks_its_newline_is_kept(tmp_path):
+    path = two_grasps(tmp_path) / "metadata.jsonl"
+    path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("3", "cup", pictures())
+    assert ids(tmp_path) == ["1", "2", "3"]
+
+
+@pytest.mark.parametrize("key", ["source", "sensor", "units", "background"])
+def test_a_recording_of_another_kind_is_not_gone_on_with(tmp_path, key):
+    two_grasps(tmp_path)
+    other = {"x": "y"} if key == "units" else "other"
+    with pytest.raises(RecordingError, match=f"was recorded with {key} .* give another folder"):
+        RecordingWriter(tmp_path, {**INFO, key: other})
+    assert ids(tmp_path) == ["1", "2"]
+
+
+def test_two_writers_do_not_write_one_recording(tmp_path):
+    with (
+        RecordingWriter(tmp_path, INFO) as first,
+        pytest.raises(StorageError, match="being written by another process") as caught,
+    ):
+        RecordingWriter(tmp_path, INFO)
+    assert caught.value.exit_code == 1
+    first.close()
+    RecordingWriter(tmp_path, INFO).close()
+
+
+def test_a_folder_of_other_files_is_not_written_to(tmp_path):
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(RecordingError, match=r"holds other files, such as thesis\.tex"):
+        RecordingWriter(tmp_path, INFO)
+    with pytest.raises(RecordingError, match="is a file"):
+        RecordingWriter(tmp_path / "thesis.tex", INFO)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_grasps_without_their_recording_json_are_not_overwritten(tmp_path):
+    (two_grasps(tmp_path) / "recording.json").unlink()
+    with pytest.raises(RecordingError, match=r"has a metadata\.jsonl but no recording\.json"):
+        RecordingWriter(tmp_path, INFO)
+
+
+@pytest.mark.parametrize(
+    ("info", "reason"),
+    [
+        ({"source": "x"}, "sensor must be"),
+        ({"sensor": "x"}, "source must be"),
+        ({**INFO, "rig": object()}, "must hold plain JSON"),
+        ({**INFO, "rig": float("nan")}, "must hold plain JSON"),
+        ({**INFO, "schema_version": 2}, "schema_version"),
+    ],
+)
+def test_bad_info_is_refused_before_anything_is_made(tmp_path, info, reason):
+    with pytest.raises(RecordingError, match=reason):
+        RecordingWriter(tmp_path / "r", info)
+    assert not (tmp_path / "r").exists()
+
+
+BAD_IMAGES = {
+    "missing photo": ({"touch_a": pixels()}, "photo_file_name is missing"),
+    "missing touch": ({"photo": pixels()}, "at least one touch"),
+    "float": ({"photo": pixels() / 255, "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
+    "grey": ({"photo": pixels()[..., 0], "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
+    "alpha": ({"photo": np.zeros((2, 2, 4), np.uint8), "touch_a": pixels()}, "photo must be H x W x 3"),
+    "no pixels": ({"photo": pixels(), "touch_a": np.zeros((0, 2, 3), np.uint8)}, "touch_a must be H x W"),
+    "too wide": (
+        {"photo": np.zeros((1, 2_000_000, 3), np.uint8), "touch_a": pixels()},
+        "cannot be written as PNG",
+    ),
+    "colour depth": ({**pictures(), "depth": pixels()}, "depth must be H x W uint16"),
+    "gif": (
+        {"photo": b"GIF89a", "touch_a": pixels()},
+        "photo must be a PNG or JPEG file; its first bytes are b'GIF8'",
+    ),
+    "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "photo: /nowhere/x.png cannot be read"),
+    "unknown column": ({**pictures(), "foto": pixels()}, "unknown key 'foto_file_name'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_IMAGES)
+def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
+    images, reason = BAD_IMAGES[name]
+    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError) as caught:
+        writer.append("1", "mug", images)
+    assert reason in str(caught.value)
+    assert list((tmp_path / "images").iterdir()) == []
+    assert ids(tmp_path) == []
+
+
+@pytest.mark.parametrize("grasp_id", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])
+def test_a_grasp_id_must_be_safe_in_a_file_name(tmp_path, grasp_id):
+    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError, match="grasp_id must be"):
+        writer.append(grasp_id, "mug", pictures())
+
+
+def test_a_grasp_is_not_appended_twice_nor_to_a_closed_writer(tmp_path):
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("1", "mug", pictures())
+        with pytest.raises(RecordingError, match="has grasp 1 already"):
+            writer.append("1", "mug", pictures())
+        with pytest.raises(RecordingError, match="force_n must be a finite number, got nan"):
+            writer.append("2", "mug", pictures(), force_n=float("nan"))
+    writer.close()
+    with pytest.raises(RecordingError, match="is closed"):
+        writer.append("2", "mug", pictures())
+    assert ids(tmp_path) == ["1"]
+
+
+def test_keys_that_other_tools_keep_in_a_line_are_passed_over_with_a_note(tmp_path: Path) -> None:
+    (tmp_path / "recording.json").write_text(json.dumps({"schema_version": 1, "source": "x", "sensor": "y"}))
+    (tmp_path / "metadata.jsonl").write_text(json.dumps({**ROW, "text": "a red mug"}) + "\n")
+    recording = read_recording(tmp_path)
+    assert len(recording.grasps) == 1
+    assert "passed over keys that are not of the format: text" in recording.notes[0]
