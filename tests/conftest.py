@@ -1,0 +1,70 @@
+"""Pictures and a hastily trained model that several test files share; each is made once a session."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from retrieval.config import Config, MatcherConfig, TrainingConfig
+from retrieval.images import Preprocessing
+from tests import synthetic
+
+torch.set_num_threads(2)
+
+TINY = Config(
+    MatcherConfig(tower="small", tower_output="pooled", hidden=32, standardise=True, embedding_dim=16),
+    TrainingConfig(
+        init="random",
+        iterations=6,
+        touches_per_batch=4,
+        positives_per_touch=2,
+        negatives_per_touch=2,
+        contrastive_weight=1.0,
+        validation_fraction=0.25,
+        test_fraction=0.2,
+        validate_every=3,
+        learning_rate=1e-3,
+    ),
+    Preprocessing(touch_px=32, photo_px=48),
+)
+
+
+@pytest.fixture(autouse=True)
+def _own_state_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test reads or writes what the user's commands remember."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of drawn pictures: 12 objects, 3 grasps each, two fingers, with untouched frames."""
+    return synthetic.write_recording(tmp_path_factory.mktemp("recording") / "recording", synthetic.make_objects(12), 3)
+
+
+@pytest.fixture(scope="session")
+def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalogue of 8 objects that the recording does not hold, 3 photos each. Copy it before changing it."""
+    return synthetic.write_catalogue(tmp_path_factory.mktemp("catalogue") / "catalog", synthetic.make_objects(8, seed=9))
+
+
+@pytest.fixture(scope="session")
+def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """The gel images (a, b) of one grasp of the catalogue's first object."""
+    objects = synthetic.make_objects(1, seed=9)
+    return synthetic.write_queries(tmp_path_factory.mktemp("touch"), objects)[objects[0].object_id][0]
+
+
+@pytest.fixture(scope="session")
+def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint after six steps: it works like any other and knows nothing."""
+    from retrieval.train import train
+
+    out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
+    train(recording, out, TINY, quiet=True)
+    return out
+
+
+def pytest_configure() -> None:
+    """Tools that download nothing say so at once, rather than look for a network."""
+    os.environ["HF_HUB_OFFLINE"] = "1"
