@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 import torch  # before faiss, which the index imports: both bring OpenMP
 from numpy.typing import NDArray
 
+from indexes import load_kind
 from indexes.choice import Choice, choose_kind
 from indexes.errors import CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
 from indexes.generation import Generation
@@ -19,19 +20,23 @@ from indexes.store import IndexStore
 from retrieval.catalogue import Catalogue, PhotoBytes, SkippedPhoto, list_catalogue, read_photos
 from retrieval.checkpoint import Checkpoint
 from retrieval.encode import Image, batches, encode_photos
-from retrieval.errors import DatasetError, ImageError, NumericalError
+from retrieval.errors import BadInput, DatasetError, ImageError, NumericalError
 from retrieval.progress import Bar
 from retrieval.version import __version__
 
 T = TypeVar("T")
 R = TypeVar("R")
 BATCH = 16
-SHOWN_SKIPS = 20
+SHOWN = 20
 
 
 @dataclass(frozen=True)
 class BuildReport:
-    """What a build did. half_error: largest rounding of a stored half; seconds: decoding and encoding alone."""
+    """What a build did.
+
+    skipped: photos that could not be read; ignored: files that are no photos by name; notes: remarks on metadata.
+    half_error: largest rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
+    """
 
     index: str
     generation: str
@@ -43,6 +48,7 @@ class BuildReport:
     removed: int
     skipped: list[SkippedPhoto]
     ignored: list[str]
+    notes: list[str]
     kind: str
     reason: str
     recall: Any
@@ -61,13 +67,19 @@ class BuildReport:
             f"{self.embedded} embedded, {self.reused} unchanged, {self.removed} removed{rate}"
         )
         yield f"candidate search: {self.kind}. {self.reason}"
+        yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
         if self.ignored:
             yield f"{len(self.ignored)} file(s) ignored, not images by name: {', '.join(self.ignored[:5])}"
-        if self.skipped:
-            yield f"{len(self.skipped)} photo(s) skipped:"
-            yield from (f"  {item.path}: {item.reason}" for item in self.skipped[:SHOWN_SKIPS])
-        if len(self.skipped) > SHOWN_SKIPS:
-            yield f"  and {len(self.skipped) - SHOWN_SKIPS} more (--json lists them all)"
+        yield from _some("remark(s)", self.notes)
+        yield from _some("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
+
+
+def _some(what: str, items: Sequence[str]) -> Iterator[str]:
+    if items:
+        yield f"{len(items)} {what}:"
+        yield from (f"  {item}" for item in items[:SHOWN])
+    if len(items) > SHOWN:
+        yield f"  and {len(items) - SHOWN} more (--json lists them all)"
 
 
 def fingerprint(checkpoint: Checkpoint) -> dict[str, str]:
@@ -90,6 +102,7 @@ def build_index(
     cannot be read are skipped and reported. Raises DatasetError where none can be, and the errors of
     `indexes.store.IndexStore.write`, which leave the index as it was.
     """
+    _check_kind(kind, max_ms)
     catalogue = list_catalogue(folder)
     store = IndexStore(out)
     with store.lock():
@@ -97,14 +110,18 @@ def build_index(
         start = time.perf_counter()
         made = _embed(catalogue, checkpoint, parent, quiet)
         seconds = time.perf_counter() - start
-        choice = _choice(made, parent, kind, max_ms)
+        choice = _choice(made, kind, max_ms)
         generation = store.write(
             made.rows,
             made.embeddings,
             {"halves": made.halves},
             {"calibration": checkpoint.calibration.to_dict()} if checkpoint.calibration else {},
             fingerprint=fingerprint(checkpoint),
-            about={"checkpoint": str(checkpoint.path.resolve()), "catalogue": str(folder.resolve())},
+            about={
+                "checkpoint": str(checkpoint.path.resolve()),
+                "catalogue": str(folder.resolve()),
+                "half_error": made.half_error,
+            },
             kind=choice.kind,
             parameters=choice.parameters,
             parent=parent,
@@ -117,11 +134,12 @@ def build_index(
         model=str(checkpoint.path),
         photos=generation.count,
         objects=len({row["object_id"] for row in made.rows}),
-        embedded=len(made.halves),
-        reused=len(made.rows) - len(made.halves),
+        embedded=made.count,
+        reused=len(made.rows) - made.count,
         removed=sum(row["id"] not in kept for row in parent.rows) if parent else 0,
         skipped=made.skipped,
         ignored=list(catalogue.ignored),
+        notes=list(catalogue.notes),
         kind=choice.kind,
         reason=" ".join(filter(None, (why, choice.reason))),
         recall=generation.manifest.recall,
@@ -143,64 +161,79 @@ def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | Non
 
 
 @dataclass(frozen=True)
+class _Prepared:
+    """A row of the new generation, and its preprocessed image where the parent does not have the photo."""
+
+    row: dict[str, Any]
+    image: Image | None
+
+
 class _Embedded:
     """Rows in catalogue order, and embeddings and halves (float16) of those that the parent does not have."""
 
-    rows: list[dict[str, Any]]
-    embeddings: NDArray[np.float32] | None
-    halves: NDArray[np.float16]
-    skipped: list[SkippedPhoto]
-    half_error: float
+    def __init__(self, checkpoint: Checkpoint, parent: Generation | None) -> None:
+        self.checkpoint, self.parent = checkpoint, parent
+        self.rows: list[dict[str, Any]] = []
+        self.skipped: list[SkippedPhoto] = []
+        self.half_error = 0.0
+        self._embeddings = [np.empty((0, checkpoint.config.matcher.embedding_dim), np.float32)]
+        self._halves = [np.empty((0, checkpoint.config.matcher.hidden), np.float16)]
+
+    @property
+    def embeddings(self) -> NDArray[np.float32]:
+        """(embedded photos, embedding_dim)."""
+        return np.concatenate(self._embeddings)
+
+    @property
+    def halves(self) -> NDArray[np.float16]:
+        """(embedded photos, hidden)."""
+        return np.concatenate(self._halves)
+
+    @property
+    def count(self) -> int:
+        """How many photos were embedded."""
+        return sum(map(len, self._halves))
+
+    def prepare(self, item: PhotoBytes | SkippedPhoto) -> _Prepared | SkippedPhoto:
+        """What is to be done with a photo. Called on threads, ahead of `add`; keeps none of the file's bytes."""
+        if isinstance(item, SkippedPhoto):
+            return item
+        row = _row(item)
+        if self.parent is not None and self.parent.reusable({row["id"]: item.digest}):
+            return _Prepared(row, None)
+        try:
+            return _Prepared(row, self.checkpoint.config.preprocessing.photo(item.decode()))
+        except ImageError as error:
+            return SkippedPhoto(item.photo.path, error.reason)
+
+    def add(self, part: Sequence[_Prepared | SkippedPhoto]) -> None:
+        """Take the next photos, one batch for the tower."""
+        usable = [item for item in part if isinstance(item, _Prepared)]
+        self.rows += [item.row for item in usable]
+        self.skipped += [item for item in part if isinstance(item, SkippedPhoto)]
+        fresh = {item.row["id"]: item.image for item in usable if item.image is not None}
+        if fresh:
+            code = encode_photos(self.checkpoint.matcher, fresh.values(), BATCH)
+            halves = code.half.numpy()
+            stored = _as_float16(halves, list(fresh))
+            self.half_error = max(self.half_error, float(np.abs(stored - halves).max()))
+            self._halves.append(stored)
+            self._embeddings.append(code.embedding.numpy())
 
 
 def _embed(catalogue: Catalogue, checkpoint: Checkpoint, parent: Generation | None, quiet: bool) -> _Embedded:
-    rows: list[dict[str, Any]] = []
-    skipped = list(catalogue.skipped)
-    embeddings, halves = [], []
-    half_error = 0.0
-
-    def prepare(item: PhotoBytes | SkippedPhoto) -> tuple[PhotoBytes | SkippedPhoto, Image | None]:
-        return _prepare(item, checkpoint, parent)
-
+    made = _Embedded(checkpoint, parent)
+    made.skipped += catalogue.skipped
     with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar:
-        for part in batches(ahead(prepare, read_photos(catalogue)), BATCH):
-            skipped += [item for item, _ in part if isinstance(item, SkippedPhoto)]
-            rows += [_row(item) for item, _ in part if isinstance(item, PhotoBytes)]
-            fresh = [(item, image) for item, image in part if image is not None]
-            if fresh:
-                code = encode_photos(checkpoint.matcher, [image for _, image in fresh], BATCH)
-                names = [item.photo.photo_id for item, _ in fresh if isinstance(item, PhotoBytes)]
-                stored = _as_float16(code.half.numpy(), names)
-                half_error = max(half_error, float(np.abs(stored - code.half.numpy()).max()))
-                halves.append(stored)
-                embeddings.append(code.embedding.numpy())
+        for part in batches(ahead(made.prepare, read_photos(catalogue)), BATCH):
+            made.add(part)
             bar.advance(len(part))
-    if not rows:
-        raise DatasetError(
-            f"no photo in {catalogue.folder} can be read; the first: {skipped[0].path}: {skipped[0].reason}"
-        )
-    hidden = checkpoint.config.matcher.hidden
-    return _Embedded(
-        rows=rows,
-        embeddings=np.concatenate(embeddings) if embeddings else None,
-        halves=np.concatenate(halves) if halves else np.empty((0, hidden), np.float16),
-        skipped=skipped,
-        half_error=half_error,
-    )
-
-
-def _prepare(
-    item: PhotoBytes | SkippedPhoto, checkpoint: Checkpoint, parent: Generation | None
-) -> tuple[PhotoBytes | SkippedPhoto, Image | None]:
-    """The item with its preprocessed image, None where the parent has it already or it cannot be read."""
-    if isinstance(item, SkippedPhoto):
-        return item, None
-    if parent is not None and parent.reusable({item.photo.photo_id: item.digest}):
-        return item, None
-    try:
-        return item, checkpoint.config.preprocessing.photo(item.decode())
-    except ImageError as error:
-        return SkippedPhoto(item.photo.path, error.reason), None
+    if not made.rows:
+        first = made.skipped[0]
+        raise DatasetError(f"no photo in {catalogue.folder} can be read; the first: {first.path}: {first.reason}")
+    if parent is not None and made.count < len(made.rows):  # what was taken over was rounded when it was made
+        made.half_error = max(made.half_error, parent.manifest.about.get("half_error", 0.0))
+    return made
 
 
 def _row(item: PhotoBytes) -> dict[str, Any]:
@@ -225,16 +258,22 @@ def _as_float16(halves: NDArray[np.float32], names: list[str]) -> NDArray[np.flo
     return halves.astype(np.float16)
 
 
-def _choice(made: _Embedded, parent: Generation | None, kind: str | None, max_ms: float | None) -> Choice:
+def _check_kind(kind: str | None, max_ms: float | None) -> None:
+    """Refuse what could not be built, before the photos are embedded."""
     if kind is not None:
-        from indexes import load_kind
+        load_kind(kind)
+    if max_ms is not None and not max_ms > 0:
+        raise BadInput(f"the longest candidate search must be above 0 ms; got {max_ms}")
 
+
+def _choice(made: _Embedded, kind: str | None, max_ms: float | None) -> Choice:
+    if kind is not None:
         return Choice(kind, load_kind(kind).parameters_type(), None, None, 1.0, "It was asked for.")
-    parts = [] if made.embeddings is None else [made.embeddings]
-    if parent is not None and len(made.rows) > len(made.halves):
-        reused = parent.reusable({row["id"]: row["digest"] for row in made.rows})
-        parts.append(parent.embeddings[parent.slots[list(reused.values())]])
-    return choose_kind(np.concatenate(parts), max_ms, threads=torch.get_num_threads())
+    vectors = made.embeddings  # without a budget nothing is measured, on these or others
+    if max_ms is not None and made.parent is not None:
+        reused = made.parent.reusable({row["id"]: row["digest"] for row in made.rows})
+        vectors = np.concatenate([vectors, made.parent.embeddings[made.parent.slots[list(reused.values())]]])
+    return choose_kind(vectors, max_ms, threads=torch.get_num_threads())
 
 
 def ahead(function: Callable[[T], R], items: Iterable[T], threads: int = 2, window: int = 4 * BATCH) -> Iterator[R]:

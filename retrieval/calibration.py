@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
+from scipy.optimize import brentq
 from scipy.special import expit, log_expit
 from scipy.stats import rankdata
 
 from retrieval.errors import BadInput, NumericalError
 
 SLOPE_BOUNDS = (0.01, 100.0)
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -53,49 +54,71 @@ class Calibration:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Calibration":
         """Inverse of `to_dict`. Raises BadInput for anything else."""
-        try:
-            return cls(**data)
-        except TypeError as error:
-            raise BadInput(f"calibration must hold {[f.name for f in dataclasses.fields(cls)]}; {error}") from error
+        names = [field.name for field in dataclasses.fields(cls)]
+        if not isinstance(data, Mapping) or set(data) != set(names):
+            raise BadInput(f"calibration must hold exactly {', '.join(names)}; got {data!r}")
+        for name, value in data.items():
+            if type(value) not in (int, float) or not np.isfinite(value):
+                raise BadInput(f"calibration must hold finite numbers; {name} is {value!r}")
+        if data["slope"] <= 0:
+            raise BadInput(f"the slope of a calibration must be positive; got {data['slope']}")
+        return cls(**data)
 
 
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
     """Fit slope and intercept by maximum likelihood with Platt's smoothed targets (Platt 1999, section 2.2).
 
     logits (P,), labels (P,) of 0 and 1. Smoothing gives separable data a finite optimum, and the slope is kept within
-    `SLOPE_BOUNDS`. Raises BadInput unless both classes are there, NumericalError for a logit that is not finite.
+    `SLOPE_BOUNDS`: at the lower one where logits say nothing, or the opposite. Raises BadInput unless both classes
+    are there, NumericalError for a logit that is not a finite float32.
     """
     z, y = _checked(logits, labels)
-    positives, negatives = int(y.sum()), int((1 - y).sum())
-    targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
-    # Both classes weigh the same, whatever their counts: the odds are even by definition.
-    weights = np.where(y == 1, 0.5 / positives, 0.5 / negatives)
-
-    def loss(parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        slope = np.exp(parameters[0])
-        x = slope * z + parameters[1]
-        value = -np.sum(weights * (targets * log_expit(x) + (1 - targets) * log_expit(-x)))
-        slack = weights * (expit(x) - targets)
-        return float(value), np.array([np.sum(slack * slope * z), np.sum(slack)])
-
-    spread = float(np.std(z)) or 1.0
-    first = np.log(np.clip(1 / spread, *SLOPE_BOUNDS))
-    limit = 1e3 + 100 * float(np.abs(z).max())
-    bounds = [tuple(np.log(SLOPE_BOUNDS)), (-limit, limit)]
-    found = minimize(loss, np.array([first, -np.exp(first) * np.median(z)]), jac=True, bounds=bounds, method="L-BFGS-B")
-    slope, intercept = float(np.exp(found.x[0])), float(found.x[1])
+    slope, intercept = _likeliest(z, y)
     x = slope * z + intercept
     return Calibration(
         slope=slope,
         intercept=intercept,
         reject_log_odds=_best_threshold(x, y),
-        positives=positives,
-        negatives=negatives,
+        positives=int(y.sum()),
+        negatives=int((1 - y).sum()),
         nll_before=_nll(z, y),
         nll_after=_nll(x, y),
         ece_before=_ece(z, y),
         ece_after=_ece(x, y),
     )
+
+
+def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Slope within its bounds, and intercept, of the smallest loss; two root searches, one inside the other.
+
+    The loss is convex in both, so its derivative by the intercept grows with the intercept, and at the best intercept
+    its derivative by the slope grows with the slope. Bracketed roots are found at any scale and offset of the logits;
+    a quasi-Newton search of both at once stops early at logits of 1000 +- 1.
+    """
+    positives, negatives = y.sum(), (1 - y).sum()
+    targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
+    # Both classes weigh the same, whatever their counts: the odds are even by definition.
+    weights = np.where(y == 1, 0.5 / positives, 0.5 / negatives)
+    centre = float(np.median(z))
+    z = z - centre
+
+    def slack(slope: float, intercept: float) -> NDArray[np.float64]:
+        return np.asarray(weights * (expit(slope * z + intercept) - targets))
+
+    def best_intercept(slope: float) -> float:
+        reach = slope * float(np.abs(z).max()) + 50  # there every probability is 0 (or 1) and the targets are not
+        return float(brentq(lambda intercept: slack(slope, intercept).sum(), -reach, reach, maxiter=1000))
+
+    def derivative(log_slope: float) -> float:
+        slope = float(np.exp(log_slope))
+        return float(np.sum(slack(slope, best_intercept(slope)) * z))
+
+    low, high = np.log(SLOPE_BOUNDS)
+    if derivative(low) >= 0:
+        slope = SLOPE_BOUNDS[0]
+    else:
+        slope = SLOPE_BOUNDS[1] if derivative(high) <= 0 else float(np.exp(brentq(derivative, low, high)))
+    return slope, best_intercept(slope) - slope * centre
 
 
 def pair_accuracy(logits: ArrayLike, labels: ArrayLike) -> float:
@@ -120,20 +143,24 @@ def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64],
     z, y = np.asarray(logits, dtype=np.float64), np.asarray(labels, dtype=np.float64)
     if z.shape != y.shape or z.ndim != 1:
         raise BadInput(f"logits and labels must be vectors of one length; got {z.shape} and {y.shape}")
-    if not np.isfinite(z).all():
-        raise NumericalError(f"every logit must be finite; pair {int(np.flatnonzero(~np.isfinite(z))[0])} is not")
-    if not (np.any(y == 1) and np.any(y == 0) and np.isin(y, (0, 1)).all()):
-        raise BadInput("pairs of both classes are needed, labelled 0 and 1; got only one class or other labels")
+    bad = np.flatnonzero(~(np.abs(z) <= _LARGEST))
+    if len(bad):
+        raise NumericalError(f"every logit must be a finite float32; pair {bad[0]} has {z[bad[0]]}")
+    true, false = int(np.sum(y == 1)), int(np.sum(y == 0))
+    if not (true and false and true + false == len(y)):
+        raise BadInput(f"pairs of both classes are needed, labelled 0 and 1; of {len(y)}, {true} are 1 and {false} 0")
     return z, y
 
 
 def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Midpoint of the gap between neighbouring values that gives the largest balanced accuracy."""
-    values, first = np.unique(x, return_inverse=True)
-    true_below = np.cumsum(np.bincount(first, weights=y)) / y.sum()
-    false_below = np.cumsum(np.bincount(first, weights=1 - y)) / (1 - y).sum()
-    best = int(np.argmax(false_below - true_below))
-    return float((values[best] + values[min(best + 1, len(values) - 1)]) / 2)
+    """The smallest value to accept for the largest balanced accuracy: midway down to the next one, if there is one."""
+    values, place = np.unique(x, return_inverse=True)
+    true_below = np.cumsum(np.bincount(place, weights=y)) / y.sum()
+    false_below = np.cumsum(np.bincount(place, weights=1 - y)) / (1 - y).sum()
+    # Accepting from values[i] on gains what lies below it; from values[0] on is to accept everything, which gains 0.
+    best = int(np.argmax(np.append(0.0, (false_below - true_below)[:-1])))
+    middle = (values[best] + values[max(best - 1, 0)]) / 2
+    return float(middle if best == 0 or middle > values[best - 1] else values[best])
 
 
 def _nll(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

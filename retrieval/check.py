@@ -47,7 +47,8 @@ def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = F
         for path, image in zip(files, pool.map(_look, files), strict=True):
             seen[path] = image
             bar.advance()
-    findings = [*_broken(folder, seen), *_single(grasps), *_duplicates(folder, grasps, seen), *_swapped(grasps, seen)]
+    findings = [*_broken(folder, seen), *_single(grasps), *_duplicates(folder, grasps, seen)]
+    findings += [*_same_images(grasps, seen), *_swapped(grasps, seen)]
     return findings + (list(check_split(grasps, split)) if split else [])
 
 
@@ -105,19 +106,32 @@ def _single(grasps: Sequence[Grasp]) -> Iterable[Finding]:
 
 
 def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:
-    """The same bytes under two objects, and the same bytes for two fingers of one grasp."""
+    """The same bytes under two objects."""
     holders: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
         for path in (grasp.photo, *grasp.touches):
             if seen[path].digest:
                 holders[seen[path].digest].setdefault(grasp.object_id, path)
-        digests = [seen[path].digest for path in grasp.touches]
-        if len(set(filter(None, digests))) < len(list(filter(None, digests))):
-            yield Finding("warning", "same-fingers", f"{grasp.grasp_id}: two fingers have the same image")
     for objects in holders.values():
         if len(objects) > 1:
             where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
             yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {_some(where)}")
+
+
+def _same_images(grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:
+    """The same bytes for the photo and a touch, or for two fingers, of one grasp."""
+    kinds = {"same-modality": ("error", "photo and touch are"), "same-fingers": ("warning", "two fingers have")}
+    names: dict[str, list[str]] = {kind: [] for kind in kinds}
+    for grasp in grasps:
+        touches = [seen[path].digest for path in grasp.touches if seen[path].digest]
+        if seen[grasp.photo].digest in touches:
+            names["same-modality"].append(grasp.grasp_id)
+        if len(set(touches)) < len(touches):
+            names["same-fingers"].append(grasp.grasp_id)
+    for kind, (severity, what) in kinds.items():
+        if names[kind]:
+            where = f"in {len(names[kind])} of {len(grasps)} grasps: {_some(names[kind])}"
+            yield Finding(severity, kind, f"{what} the same image {where}")
 
 
 def _swapped(grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:

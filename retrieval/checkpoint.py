@@ -52,7 +52,9 @@ def save_checkpoint(
     calibration: Calibration | None,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write `path` and its model card (`path` with suffix .md) atomically."""
+    """Write `path` and its model card (`path` with suffix .md) atomically. Raises CheckpointError for a name in .md."""
+    if path.suffix == ".md":
+        raise CheckpointError(f"{path} is where the model card goes; name the checkpoint {path.stem}.safetensors")
     header = {
         "config": config.to_dict(),
         "split": split.to_dict() if split else None,
@@ -67,26 +69,47 @@ def save_checkpoint(
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError with what is wrong and what to do."""
     state, header = read_tensors(path)
+    lacking = [name for name in ("config", "split", "calibration", "provenance") if name not in header]
+    if lacking:
+        raise CheckpointError(
+            f"{path} is not a checkpoint: its header has no {lacking[0]}; a file in .state.safetensors is the state of "
+            "an unfinished training, the checkpoint lies beside it"
+        )
     try:
         config = Config.from_dict(header["config"])
-        split = Split.from_dict(header["split"]) if header["split"] else None
-        calibration = Calibration.from_dict(header["calibration"]) if header["calibration"] else None
+        split = None if header["split"] is None else Split.from_dict(header["split"])
+        calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
         matcher = Matcher(config.matcher)
-        matcher.load_state_dict(state)
-    except (BadInput, KeyError, RuntimeError) as error:
+        _load_weights(matcher, state)
+    except BadInput as error:
         raise CheckpointError(f"{path} is not a checkpoint that this version can use: {error}") from error
     return Checkpoint(path, file_digest(path), matcher.eval(), config, split, calibration, header["provenance"])
 
 
+def _load_weights(matcher: Matcher, state: Mapping[str, Tensor]) -> None:
+    """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
+    got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, matcher.state_dict()))
+    for name in sorted(got.keys() | wanted.keys()):
+        if got.get(name) != wanted.get(name):
+            raise CheckpointError(
+                f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
+                f"must be {wanted.get(name, 'absent')}"
+            )
+    matcher.load_state_dict(state)
+
+
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a JSON header as one safetensors file, atomically."""
-    text = json.dumps({"format": FORMAT, "software": __version__, **header}, allow_nan=False)
+    """Write tensors and a JSON header as one safetensors file with a checksum over both, atomically."""
+    content = {"format": FORMAT, "software": __version__, **header}
+    text = json.dumps({**content, "sha256": _checksum(state, content)}, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     _write_atomically(path, save(state, {_HEADER: text}))
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `write_tensors` wrote. Raises CheckpointError."""
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; give the .safetensors file of a checkpoint")
     if not path.is_file():
         raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one")
     try:
@@ -101,9 +124,21 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             "(give other weights to `retrieve train --init`)"
         )
     header = _parsed(path, text)
+    if header.pop("sha256", None) != _checksum(state, header):
+        raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
     if any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
         raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
     return state, header
+
+
+def _checksum(state: Mapping[str, Tensor], header: Mapping[str, Any]) -> str:
+    """SHA-256 of header and tensors: the format itself takes a flipped bit in a weight or a setting for what it is."""
+    digest = hashlib.sha256(json.dumps(header).encode())
+    for name in sorted(state):
+        tensor = state[name].contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:

@@ -41,7 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if code is not None:
             return _fail(arguments, str(error), code)
         if isinstance(error, OSError):
-            return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 1)
+            named = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
+            return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 2 if named else 1)
         return _fail(arguments, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
 
 

@@ -1,6 +1,7 @@
 """Settings of a matcher and of its training: frozen dataclasses, read from TOML, unknown keys refused."""
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -75,11 +76,12 @@ class TrainingConfig:
             "validate_every",
         ):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
-        _require(self.learning_rate > 0, f"learning_rate must be positive; got {self.learning_rate}")
+        _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
         _require(
-            self.contrastive_weight >= 0,
-            f"contrastive_weight must not be negative; got {self.contrastive_weight}",
+            0 <= self.contrastive_weight < math.inf,
+            f"contrastive_weight must be a number from 0; got {self.contrastive_weight}",
         )
+        _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
             value = getattr(self, name)
             _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
@@ -109,6 +111,8 @@ class Config:
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
         """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
+        if not isinstance(tables, Mapping):
+            raise ConfigError(f"a configuration must be tables of settings; got {tables!r}")
         parts = {"matcher": MatcherConfig, "training": TrainingConfig, "preprocessing": Preprocessing}
         _refuse_unknown("configuration", tables, parts)
         return cls(**{name: _build(name, parts[name], table) for name, table in tables.items()})
@@ -116,19 +120,18 @@ class Config:
 
 def load_config(name_or_path: str) -> Config:
     """Read a named preset (`paper`, `small`, ...) or a TOML file. Raises ConfigError."""
-    preset = resources.files("retrieval") / "configs" / f"{name_or_path}.toml"
-    path = Path(name_or_path)
-    if preset.is_file():
-        text = preset.read_text("utf-8")
-    elif path.is_file():
-        text = path.read_text("utf-8")
-    else:
+    file = Path(name_or_path)
+    if name_or_path in preset_names():
+        file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
+    elif not file.is_file():
         raise ConfigError(
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )
     try:
-        return Config.from_dict(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+        return Config.from_dict(tomllib.loads(file.read_text("utf-8")))
+    except OSError as error:
+        raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
+    except ValueError as error:  # what TOML or UTF-8 forbids
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
 
 

@@ -111,13 +111,14 @@ class Split:
     @classmethod
     def from_dict(cls, data: Any) -> "Split":
         """Inverse of `to_dict`. Raises DatasetError for anything else."""
-        try:
-            parts = {name: tuple(str(item) for item in data[name]) for name in ("train", "validation", "test")}
-            return cls(seed=int(data.get("seed", 0)), **parts)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise DatasetError(
-                'a split must be {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}'
-            ) from error
+        found = data if isinstance(data, dict) else {}
+        parts = {name: found.get(name) for name in ("train", "validation", "test")}
+        if any(not isinstance(part, list) or any(type(item) is not str for item in part) for part in parts.values()):
+            raise DatasetError('a split must be {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}')
+        seed = found.get("seed", 0)
+        if type(seed) is not int:
+            raise DatasetError(f"the seed of a split must be a whole number; got {seed!r}")
+        return cls(seed=seed, **{name: tuple(part or ()) for name, part in parts.items()})
 
     def select(self, grasps: Iterable[Grasp], part: str) -> list[Grasp]:
         """Grasps whose object lies in `part` ("train", "validation" or "test")."""
@@ -143,16 +144,24 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
     if min(map(len, wanted)) < 2:
         raise DatasetError(
             f"a split into {len(wanted)} parts needs two objects in each, and objects that share a sequence stay "
-            f"together; the recording has {total} objects in {len(groups)} such groups"
+            f"together; the recording has {total} objects in {len(groups)} such groups, and the shares part them into "
+            f"{' + '.join(str(len(part)) for part in wanted)}"
         )
     return Split(seed=seed, train=train, **chosen)
 
 
 def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
-    """Take groups off the queue until there are two objects and the target is met as closely as whole groups allow."""
+    """Take off the queue each group that brings the count closer to the target; the smallest where these hold no two
+    objects."""
     taken: list[str] = []
-    while queue and (len(taken) < 2 or abs(len(taken) + len(queue[0]) - target) < abs(len(taken) - target)):
-        taken = taken + queue.pop(0)
+    for group in list(queue):
+        if abs(len(taken) + len(group) - target) < abs(len(taken) - target):
+            taken = taken + group
+            queue.remove(group)
+    for group in sorted(queue, key=len):
+        if len(taken) < 2:
+            taken = taken + group
+            queue.remove(group)
     return tuple(sorted(taken))
 
 

@@ -49,14 +49,14 @@ def remember(kind: str, path: Path) -> None:
         beside = _state_file().with_suffix(f".{os.getpid()}.tmp")
         beside.write_text(json.dumps(note), "utf-8")
         beside.replace(_state_file())
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
 
 
 def _last() -> dict[str, str]:
     try:
         note = json.loads(_state_file().read_text("utf-8"))
-    except (OSError, ValueError):
+    except (OSError, RuntimeError, ValueError):
         return {}
     return {key: value for key, value in note.items() if isinstance(value, str)} if isinstance(note, dict) else {}
 

@@ -3,6 +3,7 @@
 import base64
 from importlib import resources
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import cv2
@@ -20,6 +21,7 @@ def print_table(result: QueryResult) -> None:
     """Print the ranking on stdout, as a table."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title="Which object is in the hand?")
     for title, justify in (
@@ -32,7 +34,9 @@ def print_table(result: QueryResult) -> None:
     table.add_column("photo", overflow="fold")
     for match in result.results:
         probability = "-" if match.probability is None else f"{match.probability:.3f}"
-        table.add_row(str(match.rank), match.object_id, probability, f"{match.logit:+.2f}", match.photo)
+        # As Text: a name may hold what rich takes for markup, such as "[bold]".
+        name, photo = Text(match.object_id), Text(match.photo)
+        table.add_row(str(match.rank), name, probability, f"{match.logit:+.2f}", photo)
     Console().print(table)
 
 
@@ -43,15 +47,10 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
     """
     touches = [
         [
-            {
-                "uri": _data_uri(Path(path)),
-                "name": Path(path).name,
-                "finger": "ab"[finger : finger + 1],
-                "grasp": grasp,
-            }
-            for finger, path in enumerate(paths)
+            {"uri": _data_uri(Path(path)), "name": Path(path).name, "finger": finger}
+            for finger, path in zip(ascii_lowercase, paths, strict=False)
         ]
-        for grasp, paths in enumerate(result.touches, start=1)
+        for paths in result.touches
     ]
     matches: list[dict[str, Any]] = [
         {**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results

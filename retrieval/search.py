@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from indexes.store import IndexStore
 from retrieval import defaults
 from retrieval.build import fingerprint
 from retrieval.calibration import Calibration
-from retrieval.checkpoint import Checkpoint, load_checkpoint
+from retrieval.checkpoint import Checkpoint, file_digest, load_checkpoint
 from retrieval.encode import Image, encode_touches
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.fusion import score_halves
@@ -98,17 +98,19 @@ class Searcher:
     ) -> QueryResult:
         """Rank the catalogue's objects for one object felt in one or more grasps.
 
-        touches: for each grasp its gel images, in finger order. background: the fingers' no-contact frames.
-        top: objects to return. candidates: photos per grasp that the full classifier judges; with no fewer than there
-        are photos, or a model without trained embeddings, all of them, and no candidate stage runs. Several grasps
-        count as independent given the object: their logits add. Raises BadInput, ImageError or NumericalError.
+        touches: for each grasp its gel images, in finger order. background: the fingers' no-contact frames, for a
+        model that subtracts them and for no other. top: objects to return. candidates: photos per grasp that the full
+        classifier judges, `top` at least; with no fewer than there are photos, or a model without trained embeddings,
+        it judges all of them and no candidate stage runs. Several grasps count as independent given the object: their
+        logits add. Raises BadInput, ImageError or NumericalError.
         """
         limit = DEFAULT_CANDIDATES if candidates is None else candidates
         if top < 1 or limit < 1 or not touches:
             raise BadInput(f"give at least one touch, top >= 1 and candidates >= 1; got {len(touches)}, {top}, {limit}")
         clock = _Clock()
         with clock("decode"):
-            images = [self._load(touch, background) for touch in touches]
+            references = self._references(background)
+            images = [self._load(touch, references) for touch in touches]
         with clock("encode"):
             code = encode_touches(self.checkpoint.matcher, images)
         with clock("candidates"):
@@ -126,17 +128,33 @@ class Searcher:
             results=results,
         )
 
-    def _load(self, touch: Sequence[str | Path], background: Sequence[str | Path] | None) -> list[Image]:
-        fingers = self.checkpoint.config.matcher.fingers
-        for what, files in (("touch", touch), ("background", background)):
-            if files is not None and len(files) != fingers:
-                raise BadInput(
-                    f"this model takes {fingers} gel image(s) for one {what}; got {len(files)}: "
-                    + ", ".join(str(path) for path in files)
-                )
-        references: Sequence[str | Path | None] = background or [None] * fingers
+    def _references(self, background: Sequence[str | Path] | None) -> Sequence[str | Path | None]:
+        """The no-contact frame of each finger, None for a model that looks at no such frame."""
+        policy = self.checkpoint.config.preprocessing.background
+        if background is None and policy != "none":
+            raise BadInput(
+                f'this model subtracts the untouched gel (background = "{policy}"): give a no-contact frame for each '
+                "finger with --background"
+            )
+        if background is not None and policy == "none":
+            raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
+        return [None] * self._fingers if background is None else self._one_per_finger("background", background)
+
+    def _load(self, touch: Sequence[str | Path], references: Sequence[str | Path | None]) -> list[Image]:
         load = self.checkpoint.config.preprocessing.load_touch
-        return [load(path, reference) for path, reference in zip(touch, references, strict=True)]
+        return [load(*pair) for pair in zip(self._one_per_finger("touch", touch), references, strict=True)]
+
+    def _one_per_finger(self, what: str, files: Sequence[str | Path]) -> Sequence[str | Path]:
+        if len(files) != self._fingers:
+            raise BadInput(
+                f"this model takes {self._fingers} gel image(s) for one {what}; got {len(files)}: "
+                + ", ".join(str(path) for path in files)
+            )
+        return files
+
+    @property
+    def _fingers(self) -> int:
+        return self.checkpoint.config.matcher.fingers
 
     def _candidates(self, embeddings: NDArray[np.float32], k: int) -> NDArray[np.int64] | None:
         """Rows to judge, the union over grasps; None for all, where the stage would leave nothing out."""
@@ -186,9 +204,10 @@ def _model_of(generation: Generation) -> Path:
     path = Path(generation.manifest.about["checkpoint"])
     if path.is_file():
         return path
-    other, _ = defaults.find_model(None)
-    if fingerprint(load_checkpoint(other))["checkpoint"] == generation.fingerprint["checkpoint"]:
-        return other
+    with suppress(CheckpointError):
+        other, _ = defaults.find_model(None)
+        if file_digest(other) == generation.fingerprint["checkpoint"]:
+            return other
     raise CheckpointError(
         f"the model of this index is no longer at {path}; name it with --model, or build the index again"
     )

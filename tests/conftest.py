@@ -45,7 +45,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A catalogue of 8 objects that the recording does not hold, 3 photos each. Copy it before changing it."""
-    return synthetic.write_catalogue(tmp_path_factory.mktemp("catalogue") / "catalog", synthetic.make_objects(8, seed=9))
+    return synthetic.write_catalogue(
+        tmp_path_factory.mktemp("catalogue") / "catalog", synthetic.make_objects(8, seed=9)
+    )
 
 
 @pytest.fixture(scope="session")

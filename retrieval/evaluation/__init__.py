@@ -1,0 +1,1 @@
+"""How good a ranking is, with intervals and the level of chance."""

@@ -1,0 +1,90 @@
+"""What the README and the notebooks tell people to run does run."""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from retrieval import cli
+from tests import synthetic
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+
+
+def commands(first_word):
+    """Lines of the README's shell blocks that begin with a word, comments taken off."""
+    blocks = re.findall(r"```sh\n(.*?)```", README, flags=re.S)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return [shlex.split(line, comments=True) for line in lines if line.split()[:1] == [first_word]]
+
+
+@pytest.fixture
+def home(tmp_path, recording, catalogue, monkeypatch):
+    """Everything that the README's commands name: catalog/, gel images, recording/, billets/."""
+    shutil.copytree(recording, tmp_path / "recording")
+    shutil.copytree(catalogue, tmp_path / "catalog")
+    objects = synthetic.make_objects(1, seed=9)
+    pairs = synthetic.write_queries(tmp_path / "drawn", objects, touches_per_object=2)[objects[0].object_id]
+    for number, pair in enumerate(pairs):
+        for finger, path in zip("ab", pair, strict=True):
+            shutil.copy(path, tmp_path / f"{finger}{'' if number == 0 else number + 1}.png")
+    for place in ("welded1/01", "welded1/02"):
+        (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
+        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_every_retrieve_command_of_the_readme_runs(home):
+    found = commands("retrieve")
+    assert {line[1] for line in found} == {"import", "check", "train", "build-index", "query"}
+    for line in found:
+        shortened = ["--iterations", "2"] if line[1] == "train" else []
+        assert cli.main([*line[1:], *shortened]) == 0, line
+
+
+def test_the_two_make_commands_exist_and_the_first_lines_name_them():
+    for line in commands("make"):
+        assert subprocess.run(["make", "-n", *line[1:]], cwd=ROOT, capture_output=True, check=False).returncode == 0, line
+    assert [line[1] for line in commands("make")][:2] == ["demo", "test"]
+
+
+def test_every_python_command_of_the_readme_exists():
+    for line in commands("python"):
+        module = line[line.index("-m") + 1]
+        asked = [sys.executable, "-m", module, "--help"]
+        assert subprocess.run(asked, cwd=ROOT, capture_output=True, check=False).returncode == 0, line
+
+
+@pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="the layout of argparse's help differs between Pythons")
+def test_the_help_in_the_readme_is_what_the_program_prints(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert capsys.readouterr().out.strip() in README
+
+
+def test_every_file_that_the_readme_links_to_exists():
+    for link in re.findall(r"\]\(([^)#]+)\)", README):
+        assert link.startswith("http") or (ROOT / link).exists(), link
+
+
+@pytest.mark.parametrize("notebook", sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb")))
+def test_a_notebook_runs_from_top_to_bottom(notebook, tmp_path, catalogue, model, monkeypatch):
+    shutil.copytree(catalogue, tmp_path / "demo" / "catalog")
+    shutil.copy(model, tmp_path / "demo" / "model.safetensors")
+    synthetic.write_queries(tmp_path / "demo" / "touches", synthetic.make_objects(1, seed=9), touches_per_object=2)
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path / "notebooks")
+    names: dict[str, object] = {}
+    for cell in json.loads((ROOT / "notebooks" / notebook).read_text("utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+            assert cell["outputs"] == []  # what a notebook shows comes from running it

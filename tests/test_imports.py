@@ -1,0 +1,132 @@
+"""Who may import whom, and what a command may load: by reading the imports, and by running with modules blocked."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("indexes", "robot", "retrieval")
+# DESIGN: `retrieval` uses `indexes`; only its dataset reader and its command line may touch `robot`.
+MAY_TOUCH_ROBOT = {"retrieval/dataset.py", "retrieval/cli.py"}
+# In `retrieval` the stages run one way; a module may import those of its own line and of lines above.
+STAGES = (
+    ("errors", "version", "progress"),
+    ("images",),
+    ("catalogue", "config", "dataset", "losses"),
+    ("check", "towers"),
+    ("fusion",),
+    ("encode", "distributed", "calibration"),
+    ("checkpoint", "batches"),
+    ("train", "defaults"),
+    ("build",),
+    ("search",),
+    ("report", "evaluation"),
+    ("cli",),
+)
+
+
+def modules(package):
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def imported(path):
+    """Names of the modules that a file imports anywhere, functions included."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def packages_of(path):
+    return {name.split(".")[0] for name in imported(path)}
+
+
+@pytest.mark.parametrize("package", ["indexes", "robot"])
+def test_indexes_and_robot_know_nothing_of_anyone(package):
+    others = set(PACKAGES) - {package} | {"tests", "notebooks"}
+    for path in modules(package):
+        assert not packages_of(path) & others, path
+
+
+def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_images():
+    for path in modules("robot"):
+        assert not packages_of(path) & {"torch", "faiss"}, path
+    for path in modules("indexes"):
+        assert not packages_of(path) & {"torch", "cv2", "PIL"}, path
+
+
+def test_only_the_dataset_reader_and_the_command_line_touch_robot():
+    touching = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
+    assert touching <= MAY_TOUCH_ROBOT
+    assert "retrieval/dataset.py" in touching
+
+
+def test_the_stages_of_retrieval_run_one_way():
+    stage_of = {name: number for number, names in enumerate(STAGES) for name in names}
+    for path in modules("retrieval"):
+        own = path.relative_to(ROOT / "retrieval").parts[0].removesuffix(".py")
+        if own == "__init__":
+            continue
+        assert own in stage_of, f"{path} has no stage: add it to STAGES"
+        for name in imported(path):
+            parts = name.split(".")
+            if parts[0] == "retrieval" and len(parts) > 1 and parts[1] in stage_of:
+                assert stage_of[parts[1]] <= stage_of[own], f"{path} imports {name}"
+
+
+def run_blocked(code, blocked):
+    """Run code in a process where importing a blocked module fails."""
+    guard = (
+        "import sys\n"
+        "class Guard:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.split('.')[0] in {set(blocked)!r}: raise ImportError('blocked: ' + name)\n"
+        "sys.meta_path.insert(0, Guard())\n"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", guard + code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2")
+
+
+def test_robot_imports_without_torch():
+    done = run_blocked("import robot, robot.recording, robot.importers, robot.importers.billets", ("torch", "faiss"))
+    assert done.returncode == 0, done.stderr
+
+
+def test_indexes_import_with_numpy_alone():
+    code = "import indexes, indexes.store, indexes.exact, indexes.choice"
+    done = run_blocked(code, ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn"))
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [[], ["import"], ["check"], ["train"], ["build-index"], ["query"]])
+def test_help_loads_nothing_heavy(command):
+    code = f"from retrieval.cli import main\nmain({[*command, '--help']!r})"
+    done = run_blocked(code, HEAVY)
+    assert done.returncode == 0, done.stderr
+    assert "usage: retrieve" in done.stdout
+
+
+def test_the_guard_does_block():
+    assert "blocked: torch" in run_blocked("import torch", ("torch",)).stderr
+
+
+def test_robot_is_our_package_and_not_another_one_of_that_name():
+    """The PyPI package robotframework installs a top-level `robot` too; the two cannot share an environment."""
+    import robot
+
+    assert Path(robot.__file__).parent == ROOT / "robot"
+
+
+def test_no_file_outgrows_what_a_stranger_can_read():
+    long = [str(path) for package in PACKAGES for path in modules(package) if len(path.read_text().splitlines()) > 400]
+    assert not long

@@ -1,0 +1,40 @@
+"""The project's own files: dependencies, the oldest versions, and what `make` promises."""
+
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def bounds():
+    """Lower bound of every requirement, extras included."""
+    listed = PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["test"]
+    return {re.split("[<>=]", item)[0].lower(): re.search(r">=([\d.]+)", item)[1] for item in listed}
+
+
+def pins(name):
+    lines = (ROOT / ".ci" / name).read_text().splitlines()
+    return dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_the_oldest_versions_that_are_tested_are_the_lower_bounds():
+    lowest = pins("lowest.txt")
+    assert set(lowest) == set(bounds())
+    for name, bound in bounds().items():
+        assert lowest[name].startswith(bound), name
+
+
+def test_everything_is_pinned_for_the_tests():
+    assert set(pins("constraints.txt")) == set(bounds())
+
+
+def test_only_our_packages_are_installed():
+    assert PROJECT["tool"]["setuptools"]["packages"]["find"]["include"] == ["retrieval*", "robot*", "indexes*"]
+    assert {path.name for path in ROOT.iterdir() if path.is_dir() and (path / "__init__.py").exists()} == {
+        "retrieval",
+        "robot",
+        "indexes",
+        "tests",
+    }

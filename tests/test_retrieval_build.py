@@ -1,0 +1,373 @@
+"""Building an index over a folder of photos: what is embedded, what is taken over, what is left out and said."""
+
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from indexes.errors import LockedIndex, ParameterError, VectorError
+from indexes.store import IndexStore
+from retrieval import build
+from retrieval.build import ahead, build_index
+from retrieval.catalogue import list_catalogue
+from retrieval.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.encode import encode_photos
+from retrieval.errors import BadInput, DatasetError, NumericalError
+from retrieval.search import Searcher
+from tests import synthetic
+
+
+@pytest.fixture
+def own(catalogue, tmp_path):
+    """A catalogue to change: 8 objects, 3 photos each."""
+    return shutil.copytree(catalogue, tmp_path / "catalog")
+
+
+@pytest.fixture
+def index(tmp_path):
+    return tmp_path / "index"
+
+
+@pytest.fixture
+def checkpoint(model):
+    return load_checkpoint(model)
+
+
+@pytest.fixture
+def embedded(monkeypatch):
+    """The number of photos in each batch that went through the photo tower."""
+    sizes = []
+
+    def counted(matcher, photos, batch):
+        photos = list(photos)
+        sizes.append(len(photos))
+        return encode_photos(matcher, photos, batch)
+
+    monkeypatch.setattr(build, "encode_photos", counted)
+    return sizes
+
+
+def first_photo(own):
+    return sorted(own.rglob("*.jpg"))[0]
+
+
+def other_picture(path, seed=77):
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(synthetic._jpeg(synthetic.draw_photo(synthetic.make_object(seed), 1)))
+
+
+def rows_of(index):
+    return {row["id"]: row for row in IndexStore(index).open().rows}
+
+
+def changed_model(checkpoint, path):
+    """A checkpoint with other weights."""
+    with torch.no_grad():
+        checkpoint.matcher.head.out.bias += 0.5
+    save_checkpoint(path, checkpoint.matcher, checkpoint.config, split=None, calibration=None, provenance=PROVENANCE)
+    return load_checkpoint(path)
+
+
+PROVENANCE = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
+
+
+# What is embedded --------------------------------------------------------------------------------------------
+
+
+def test_a_first_build_embeds_every_photo_once_in_batches(own, checkpoint, index, embedded):
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert embedded == [16, 8]
+    assert (report.photos, report.objects, report.embedded, report.reused, report.removed) == (24, 8, 24, 0, 0)
+    assert report.skipped == []
+
+
+def test_an_unchanged_catalogue_embeds_none_and_searches_the_same(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    before = IndexStore(index).open()
+    embedded.clear()
+    report = build_index(own, checkpoint, index, quiet=True)
+    after = IndexStore(index).open()
+    assert embedded == []
+    assert (report.embedded, report.reused, report.generation) == (0, 24, "gen-000002")
+    assert after.rows == before.rows
+    np.testing.assert_array_equal(after.arrays["halves"], before.arrays["halves"])
+    np.testing.assert_array_equal(after.embeddings[after.slots], before.embeddings[before.slots])
+
+
+def test_a_rebuild_embeds_only_changed_and_new_photos(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    before = IndexStore(index).open()
+    embedded.clear()
+    changed = first_photo(own)
+    other_picture(changed)
+    other_picture(own / "newcomer" / "1.jpg", seed=78)
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert embedded == [2]
+    assert (report.photos, report.embedded, report.reused, report.removed) == (25, 2, 23, 0)
+    after = IndexStore(index).open()
+    name = changed.relative_to(own).as_posix()
+    for row_id in before._number:
+        old, new = (part.arrays["halves"][part.row_number(row_id)] for part in (before, after))
+        assert np.array_equal(old, new) == (row_id != name)
+
+
+def test_a_rebuild_gives_what_a_build_from_nothing_gives(own, checkpoint, index, tmp_path):
+    build_index(own, checkpoint, index, quiet=True)
+    other_picture(first_photo(own))
+    shutil.rmtree(sorted(own.iterdir())[3])
+    build_index(own, checkpoint, index, quiet=True)
+    build_index(own, checkpoint, tmp_path / "fresh", quiet=True)
+    again, fresh = (IndexStore(path).open() for path in (index, tmp_path / "fresh"))
+    assert again.rows == fresh.rows
+    # Another batch of the tower sums in another order: 1e-5 in float32, then one step of float16.
+    np.testing.assert_allclose(again.arrays["halves"], fresh.arrays["halves"], rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(again.embeddings[again.slots], fresh.embeddings[fresh.slots], atol=1e-5)
+
+
+def test_only_the_content_counts_not_the_time_of_the_file(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    embedded.clear()
+    for path in own.rglob("*.jpg"):
+        path.touch()
+    assert build_index(own, checkpoint, index, quiet=True).embedded == 0
+    assert embedded == []
+
+
+def test_removed_photos_vanish_and_are_counted(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    gone = first_photo(own)
+    gone.unlink()
+    shutil.rmtree(sorted(own.iterdir())[-1])
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.photos, report.objects, report.embedded, report.removed) == (20, 7, 0, 4)
+    assert set(rows_of(index)) == {path.relative_to(own).as_posix() for path in own.rglob("*.jpg")}
+
+
+def test_a_photo_moved_to_another_object_is_a_new_photo(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    photo = first_photo(own)
+    photo.rename(sorted(own.iterdir())[1] / "moved.jpg")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.photos, report.embedded, report.removed) == (24, 1, 1)
+
+
+def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(own, checkpoint, index):
+    (own / "twin").mkdir()
+    shutil.copy(first_photo(own), own / "twin" / "1.jpg")
+    assert build_index(own, checkpoint, index, quiet=True).photos == 25
+    generation = IndexStore(index).open()
+    twin, original = (
+        generation.row_number(name) for name in ("twin/1.jpg", first_photo(own).relative_to(own).as_posix())
+    )
+    assert generation.slots[twin] == generation.slots[original]
+    assert len(generation.embeddings) == 24
+
+
+def test_new_metadata_alone_embeds_nothing_and_stands_in_the_rows(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    embedded.clear()
+    name = first_photo(own).parent.name
+    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "price": 3}) + "\n")
+    assert build_index(own, checkpoint, index, quiet=True).reused == 24
+    assert embedded == []
+    assert {row["object_id"] for row in rows_of(index).values() if row["metadata"] == {"price": 3}} == {name}
+
+
+def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, embedded, tmp_path):
+    build_index(own, checkpoint, index, quiet=True)
+    embedded.clear()
+    other = changed_model(checkpoint, tmp_path / "other.safetensors")
+    report = build_index(own, other, index, quiet=True)
+    assert (sum(embedded), report.embedded, report.reused) == (24, 24, 0)
+    assert report.reason.startswith("The model or its preprocessing changed, so every photo was embedded again.")
+
+
+def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    halves = index / "gen-000001" / "halves.npy"
+    halves.write_bytes(halves.read_bytes()[:-1])
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert report.embedded == 24
+    assert "not usable, so every photo was embedded again" in report.reason
+    assert Searcher.open(index).generation.count == 24
+
+
+def test_rows_are_in_the_catalogues_order_and_name_content_and_place(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    rows = IndexStore(index).open().rows
+    assert [row["id"] for row in rows] == [photo.photo_id for photo in list_catalogue(own).photos]
+    assert set(rows[0]) == {"id", "object_id", "path", "digest", "metadata"}
+
+
+# What cannot be used -----------------------------------------------------------------------------------------
+
+
+def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(own, checkpoint, index):
+    photos = sorted(own.rglob("*.jpg"))
+    photos[0].write_bytes(b"")
+    photos[7].write_bytes(photos[7].read_bytes()[:900])
+    photos[23].write_bytes(b"this is no picture")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.photos, report.embedded) == (21, 21)
+    assert [item.path for item in report.skipped] == [photos[n].relative_to(own).as_posix() for n in (0, 7, 23)]
+    assert all(item.reason for item in report.skipped)
+    text = "\n".join(report.lines())
+    assert "3 photo(s) skipped:" in text
+    assert f"  {report.skipped[1].path}: damaged or truncated" in text
+    assert len(json.loads(json.dumps(report.to_dict()))["skipped"]) == 3
+
+
+def test_a_photo_that_broke_since_the_last_build_leaves_the_index(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    broken = first_photo(own)
+    broken.write_bytes(broken.read_bytes()[:500])
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.photos, report.embedded, report.removed, len(report.skipped)) == (23, 0, 1, 1)
+    assert broken.relative_to(own).as_posix() not in rows_of(index)
+
+
+def test_long_lists_are_cut_for_people_and_whole_in_json(own, checkpoint, index):
+    for number in range(30):
+        (own / f"broken{number:02}.png").write_bytes(b"x")
+        (own / f"note{number:02}.txt").write_text("x")
+    report = build_index(own, checkpoint, index, quiet=True)
+    lines = list(report.lines())
+    assert "  and 10 more (--json lists them all)" in lines
+    assert len(lines) < 40
+    assert len(report.to_dict()["skipped"]) == len(report.to_dict()["ignored"]) == 30
+
+
+def test_metadata_of_a_photo_that_is_not_there_is_remarked_on(own, checkpoint, index):
+    (own / "metadata.jsonl").write_text('{"object_id": "nobody", "price": 3}\n')
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert report.notes == ["metadata.jsonl speaks of nobody, which is not in the catalogue"]
+    assert f"  {report.notes[0]}" in list(report.lines())
+
+
+def test_a_catalogue_of_broken_photos_alone_is_an_error_and_the_old_index_stays(own, checkpoint, index):
+    build_index(own, checkpoint, index, quiet=True)
+    for path in own.rglob("*.jpg"):
+        path.write_bytes(b"broken")
+    with pytest.raises(DatasetError, match=r"no photo in .*catalog can be read; the first: .*1\.jpg: not a PNG"):
+        build_index(own, checkpoint, index, quiet=True)
+    assert len(rows_of(index)) == 24
+
+
+BAD_NUMBERS = [
+    ("photo_tower", float("nan")),
+    ("photo_tower", float("inf")),
+    ("photo_projection", float("nan")),
+    ("photo_projection", float("inf")),
+    ("head.photo_half", float("nan")),
+    ("head.photo_half", 1e6),  # more than float16 holds
+]
+
+
+@pytest.mark.parametrize(("part", "value"), BAD_NUMBERS)
+def test_a_nan_or_overflow_never_reaches_an_index(part, value, own, checkpoint, index):
+    """A module gives a bad number for the fourth photo: that photo is named, and the old index stays."""
+    build_index(own, checkpoint, index, quiet=True)
+    for path in own.rglob("*.jpg"):
+        path.write_bytes(path.read_bytes() + b"other content, the same picture")
+
+    def spoil(module, inputs, output):
+        return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
+
+    checkpoint.matcher.get_submodule(part).register_forward_hook(spoil)
+    with pytest.raises((NumericalError, VectorError), match=list_catalogue(own).photos[3].photo_id):
+        build_index(own, checkpoint, index, quiet=True)
+    assert IndexStore(index).current() == "gen-000001"
+    assert np.isfinite(IndexStore(index).open().arrays["halves"]).all()
+
+
+def test_what_cannot_be_built_is_refused_before_anything_is_embedded(own, checkpoint, index, embedded):
+    with pytest.raises(ParameterError, match="flat"):
+        build_index(own, checkpoint, index, kind="tree", quiet=True)
+    for budget in (0, -1, float("nan")):
+        with pytest.raises(BadInput, match="must be above 0 ms"):
+            build_index(own, checkpoint, index, max_ms=budget, quiet=True)
+    assert embedded == []
+
+
+def test_a_second_writer_is_refused(own, checkpoint, index, embedded):
+    with IndexStore(index).lock(), pytest.raises(LockedIndex):
+        build_index(own, checkpoint, index, quiet=True)
+    assert embedded == []
+
+
+# What is said of the result ------------------------------------------------------------------------------------
+
+
+def test_the_error_of_float16_halves_is_stated_and_small(own, checkpoint, index):
+    report = build_index(own, checkpoint, index, quiet=True)
+    generation = IndexStore(index).open()
+    load = checkpoint.config.preprocessing.load_photo
+    exact = encode_photos(checkpoint.matcher, [load(own / row["path"]) for row in generation.rows]).half.numpy()
+    stored = np.asarray(generation.arrays["halves"])
+    assert stored.dtype == np.float16
+    error = float(np.abs(stored - exact).max())
+    assert report.half_error == pytest.approx(error, abs=1e-5)  # the tower's batches were others
+    assert 0 < report.half_error <= 2**-11 * np.abs(exact).max()  # half a step of 11 bits
+    assert generation.manifest.about["half_error"] == report.half_error
+    assert f"within {report.half_error:.2g} of" in "\n".join(report.lines())
+
+
+def test_the_error_of_halves_that_were_taken_over_is_not_forgotten(own, checkpoint, index):
+    first = build_index(own, checkpoint, index, quiet=True)
+    assert build_index(own, checkpoint, index, quiet=True).half_error == first.half_error
+
+
+def test_exact_search_is_the_default_and_an_impossible_budget_is_answered_aloud(own, checkpoint, index, monkeypatch):
+    assert build_index(own, checkpoint, index, quiet=True).kind == "flat"
+    report = build_index(own, checkpoint, index, max_ms=1e-9, quiet=True)
+    assert "over the budget of 1e-09 ms" in report.reason
+    assert "hnsw" in "\n".join(build_index(own, checkpoint, index, kind="hnsw", quiet=True).lines())
+    assert Searcher.open(index).generation.manifest.kind == "hnsw"
+
+
+def test_without_a_budget_no_vector_is_gathered_or_measured(own, checkpoint, index, monkeypatch):
+    build_index(own, checkpoint, index, quiet=True)
+    asked = []
+
+    def choose(vectors, budget_ms, **more):
+        asked.append((len(vectors), budget_ms))
+        return chosen(vectors, budget_ms, **more)
+
+    chosen = build.choose_kind
+    monkeypatch.setattr(build, "choose_kind", choose)
+    build_index(own, checkpoint, index, quiet=True)
+    build_index(own, checkpoint, index, max_ms=1000.0, quiet=True)
+    assert asked == [(0, None), (24, 1000.0)]
+
+
+# The threads that read and decode ------------------------------------------------------------------------------
+
+
+def test_looking_ahead_keeps_the_order_and_never_runs_further_than_its_window():
+    taken = []
+
+    def items():
+        for number in range(40):
+            taken.append(number)
+            yield number
+
+    def slow(number):
+        time.sleep(0.002 if number % 7 == 0 else 0)
+        return number
+
+    for place, number in enumerate(ahead(slow, items(), threads=3, window=5)):
+        assert number == place
+        assert len(taken) <= place + 5
+
+
+def test_an_error_on_a_thread_comes_out_where_the_item_would():
+    def fail(number):
+        return 1 / (number - 3)
+
+    results = ahead(fail, range(9))
+    assert [next(results) for _ in range(3)] == [-1 / 3, -1 / 2, -1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)

@@ -1,0 +1,399 @@
+"""Checkpoints: what is written is read back, damage of every kind is one clear error, a crash leaves the old file."""
+
+import ast
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+import indexes
+import retrieval
+import robot
+from retrieval.calibration import Calibration
+from retrieval.checkpoint import file_digest, load_checkpoint, read_tensors, save_checkpoint, write_tensors
+from retrieval.dataset import Split
+from retrieval.errors import CheckpointError
+from retrieval.fusion import Matcher
+from retrieval.version import __version__
+from tests.conftest import TINY
+
+SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))
+CALIBRATION = Calibration(1.25, -0.5, 0.1, 40, 60, 0.7, 0.65, 0.125, 0.0625)
+PROVENANCE = {
+    "step": 4,
+    "source": "a rig",
+    "data_digest": "0123456789abcdef" * 4,
+    "metrics": {"validation_auc": 0.987654321, "pairs": 12},
+}
+
+
+def save(path, **changes):
+    torch.manual_seed(0)
+    matcher = Matcher(TINY.matcher)
+    given = {"split": SPLIT, "calibration": CALIBRATION, "provenance": PROVENANCE} | changes
+    save_checkpoint(path, matcher, TINY, **given)
+    return matcher
+
+
+def rewrite(path, *, tensors=None, **header):
+    """Write the checkpoint again, well formed, with other tensors or header entries."""
+    state, kept = read_tensors(path)
+    write_tensors(path, {**state, **(tensors or {})}, kept | header)
+
+
+def header_of(path):
+    with safe_open(path, framework="pt") as file:
+        return file.metadata()
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save(tmp_path / "m.safetensors")
+    return tmp_path / "m.safetensors"
+
+
+# Round trip ------------------------------------------------------------------------------------------------
+
+
+def test_every_tensor_and_everything_said_comes_back(tmp_path):
+    matcher = save(tmp_path / "deep" / "er" / "m.safetensors")
+    loaded = load_checkpoint(tmp_path / "deep" / "er" / "m.safetensors")
+    before, after = matcher.state_dict(), loaded.matcher.state_dict()
+    assert before.keys() == after.keys()
+    for name, tensor in before.items():
+        assert torch.equal(tensor, after[name]), name
+        assert tensor.dtype == after[name].dtype
+    assert loaded.config == TINY
+    assert loaded.split == SPLIT
+    assert loaded.calibration == CALIBRATION
+    assert loaded.provenance == PROVENANCE
+    assert loaded.path == tmp_path / "deep" / "er" / "m.safetensors"
+
+
+def test_a_checkpoint_without_split_and_calibration_says_none(tmp_path):
+    save(tmp_path / "m.safetensors", split=None, calibration=None)
+    loaded = load_checkpoint(tmp_path / "m.safetensors")
+    assert loaded.split is None
+    assert loaded.calibration is None
+
+
+def test_a_loaded_matcher_is_ready_for_use_and_gives_the_same_logits(saved):
+    matcher, loaded = save(saved).eval(), load_checkpoint(saved).matcher
+    assert not loaded.training
+    touches, photos = torch.rand(2, 2, 3, 32, 32), torch.rand(2, 3, 48, 48)
+    with torch.inference_mode():
+        assert torch.equal(loaded(touches, photos), matcher(touches, photos))
+
+
+def test_the_digest_is_the_files_and_equal_content_makes_equal_files(tmp_path):
+    save(tmp_path / "a.safetensors")
+    save(tmp_path / "b.safetensors")
+    expected = hashlib.sha256((tmp_path / "a.safetensors").read_bytes()).hexdigest()
+    assert load_checkpoint(tmp_path / "a.safetensors").digest == expected == file_digest(tmp_path / "b.safetensors")
+    save(tmp_path / "b.safetensors", provenance=PROVENANCE | {"step": 5})
+    assert file_digest(tmp_path / "b.safetensors") != expected
+
+
+def test_the_header_is_readable_json_with_the_version_that_wrote_it(saved):
+    (text,) = header_of(saved).values()
+    header = json.loads(text)
+    assert header["format"] == 1
+    assert header["software"] == __version__
+    assert header["config"]["matcher"]["tower"] == "small"
+
+
+def test_tensors_of_every_kind_come_back(tmp_path):
+    state = {
+        "scalar": torch.tensor(3),
+        "empty": torch.zeros(0, 4),
+        "half": torch.arange(3, dtype=torch.bfloat16),
+        "double": torch.tensor([1e300], dtype=torch.float64),
+        "strided": torch.arange(6.0).view(2, 3).T.contiguous(),
+        "flags": torch.tensor([True, False]),
+    }
+    write_tensors(tmp_path / "t.safetensors", state, {"step": 7, "best": None})
+    tensors, header = read_tensors(tmp_path / "t.safetensors")
+    assert tensors.keys() == state.keys()
+    assert all(
+        torch.equal(tensors[name], value) and tensors[name].dtype == value.dtype for name, value in state.items()
+    )
+    assert header == {"format": 1, "software": __version__, "step": 7, "best": None}
+
+
+def test_a_header_with_a_nan_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_tensors(tmp_path / "t.safetensors", {}, {"best": float("nan")})
+    assert os.listdir(tmp_path) == []
+
+
+# Model card ------------------------------------------------------------------------------------------------
+
+
+def test_the_model_card_says_what_the_model_is(saved):
+    assert saved.with_suffix(".md").read_text().splitlines() == [
+        "# m.safetensors",
+        "",
+        "Matches touches of 2 gel image(s) with photos. Tower `small`, output `pooled`.",
+        "",
+        "* Trained on: a rig (data digest `0123456789abcdef`)",
+        "* Kept step: 4 of 6, seed 0",
+        "* Objects: 2 train, 2 validation, 2 test",
+        "* validation auc: 0.9877",
+        "* pairs: 12",
+        "* Probabilities: calibrated on 40 true and 60 false validation pairs, expected calibration error 0.062 on the "
+        "same pairs",
+    ]
+
+
+def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
+    save(tmp_path / "m.safetensors", split=None, calibration=None, provenance=PROVENANCE | {"metrics": {}})
+    card = (tmp_path / "m.md").read_text()
+    assert "Objects" not in card
+    assert "Probabilities" not in card
+
+
+def test_a_checkpoint_is_not_written_where_its_model_card_goes(tmp_path):
+    with pytest.raises(CheckpointError, match=r"where the model card goes; name the checkpoint m\.safetensors"):
+        save(tmp_path / "m.md")
+    assert os.listdir(tmp_path) == []
+
+
+# Damage ----------------------------------------------------------------------------------------------------
+
+
+def test_no_file_and_a_folder_are_told_apart(tmp_path):
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.safetensors; `retrieve train` makes one"):
+        load_checkpoint(tmp_path / "none.safetensors")
+    with pytest.raises(CheckpointError, match=r"is a folder; give the \.safetensors file"):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-6, 0.001, 0.3, 0.9, 0.999999])
+def test_a_truncated_checkpoint_is_called_so(saved, share):
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CheckpointError, match=r"m\.safetensors is not a readable \.safetensors file .*truncated"):
+        load_checkpoint(saved)
+
+
+def small_file(folder):
+    state = {"weight": torch.tensor([1.5, -2.0, 0.25]), "steps": torch.tensor(7)}
+    write_tensors(folder / "t.safetensors", state, {"split": {"train": ["mug"]}, "best": 0.125, "lr": 1e-05})
+    return folder / "t.safetensors"
+
+
+def test_a_file_cut_at_any_length_is_refused(tmp_path):
+    path = small_file(tmp_path)
+    data = path.read_bytes()
+    for length in range(0, len(data), 3):
+        path.write_bytes(data[:length])
+        with pytest.raises(CheckpointError):
+            read_tensors(path)
+
+
+def test_a_flipped_bit_in_any_byte_is_refused_or_changes_nothing(tmp_path):
+    """Naively, most flips in a weight or in a digit of the header load without a word."""
+    path = small_file(tmp_path)
+    data, (tensors, header) = path.read_bytes(), read_tensors(path)
+    silent = 0
+    for place in range(len(data)):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
+        silent += loads_naively(path)
+        try:
+            got, said = read_tensors(path)
+        except CheckpointError:
+            continue
+        assert said == header  # 1E-05 for 1e-05
+        assert all(torch.equal(got[name], value) for name, value in tensors.items())
+    assert silent > 50
+
+
+def loads_naively(path):
+    try:
+        with safe_open(path, framework="pt") as file:
+            return bool(json.loads(file.metadata()["touch_retrieval"])) and bool(
+                file.get_tensor("weight").isfinite().all()
+            )
+    except Exception:
+        return False
+
+
+def test_a_flipped_bit_in_a_weight_is_called_damage(saved):
+    data = bytearray(saved.read_bytes())
+    data[-1001] ^= 4
+    saved.write_bytes(data)
+    with pytest.raises(CheckpointError, match="is damaged: its checksum does not fit; restore the file or train again"):
+        load_checkpoint(saved)
+
+
+def test_weights_of_others_are_sent_to_init(tmp_path):
+    save_file({"layer.weight": torch.ones(2)}, tmp_path / "foreign.safetensors")
+    with pytest.raises(CheckpointError, match=r"holds weights but not our header; .*`retrieve train --init`"):
+        load_checkpoint(tmp_path / "foreign.safetensors")
+    save_file({"layer.weight": torch.ones(2)}, tmp_path / "foreign.safetensors", {"format": "pt"})
+    with pytest.raises(CheckpointError, match="not our header"):
+        load_checkpoint(tmp_path / "foreign.safetensors")
+
+
+@pytest.mark.parametrize("content", [b"\x80\x04\x95", b"PK\x03\x04", b"\x08" + bytes(7) + b"{}      ", b"text\n" * 99])
+def test_other_files_are_not_taken_for_a_checkpoint(tmp_path, content):
+    (tmp_path / "m.safetensors").write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"m\.safetensors"):
+        load_checkpoint(tmp_path / "m.safetensors")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", '"format"', "{}", "null"])
+def test_a_damaged_header_is_called_so(tmp_path, text):
+    save_file({"weight": torch.ones(2)}, tmp_path / "m.safetensors", {"touch_retrieval": text})
+    with pytest.raises(CheckpointError, match=r"header of .*m\.safetensors is damaged"):
+        load_checkpoint(tmp_path / "m.safetensors")
+
+
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_another_format_names_both_versions_and_the_software(tmp_path, version):
+    text = json.dumps({"format": version, "software": "9.9"})
+    save_file({"weight": torch.ones(2)}, tmp_path / "m.safetensors", {"touch_retrieval": text})
+    message = (
+        rf"has checkpoint format {version}, this version reads 1; install the touch-retrieval that wrote it \(9\.9\)"
+    )
+    with pytest.raises(CheckpointError, match=message):
+        load_checkpoint(tmp_path / "m.safetensors")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_weight_that_is_not_finite_is_refused(saved, value):
+    weight = read_tensors(saved)[0]["head.second.weight"].clone()
+    weight[3, 4] = value
+    rewrite(saved, tensors={"head.second.weight": weight})
+    with pytest.raises(CheckpointError, match="holds a NaN or infinite weight; train again with a lower learning rate"):
+        load_checkpoint(saved)
+
+
+@pytest.mark.parametrize("name", ["config", "split", "calibration", "provenance"])
+def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
+    state, header = read_tensors(saved)
+    write_tensors(saved, state, {key: value for key, value in header.items() if key != name})
+    with pytest.raises(CheckpointError, match=rf"is not a checkpoint: its header has no {name}; .*unfinished training"):
+        load_checkpoint(saved)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"config": {"matcher": {"colour": 1}}}, r"unknown setting 'colour' in \[matcher\]"),
+        ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
+        ({"config": [1]}, "configuration must be tables"),
+        ({"split": {"train": ["a"]}}, "a split must be"),
+        ({"split": []}, "a split must be"),
+        ({"calibration": {"slope": 1.0}}, "calibration must hold exactly"),
+    ],
+)
+def test_a_header_of_another_version_is_refused_by_what_is_in_it(saved, entry, message):
+    rewrite(saved, **entry)
+    with pytest.raises(
+        CheckpointError, match=rf"m\.safetensors is not a checkpoint that this version can use: .*{message}"
+    ):
+        load_checkpoint(saved)
+
+
+def test_weights_that_do_not_fit_the_configuration_are_told_on_one_line(saved):
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64))
+    rewrite(saved, config=config.to_dict())
+    with pytest.raises(CheckpointError, match=r"head\.out\.weight is \(1, 32\), must be \(1, 64\)$"):
+        load_checkpoint(saved)
+
+
+def test_a_missing_and_an_unknown_weight_are_named(saved):
+    rewrite(saved, tensors={"zebra": torch.ones(2)})
+    with pytest.raises(CheckpointError, match=r"zebra is \(2,\), must be absent$"):
+        load_checkpoint(saved)
+    state, header = read_tensors(saved)
+    write_tensors(saved, {name: state[name] for name in state if name not in ("zebra", "log_scale")}, header)
+    with pytest.raises(CheckpointError, match=r"log_scale is absent, must be \(\)$"):
+        load_checkpoint(saved)
+
+
+# Writing ---------------------------------------------------------------------------------------------------
+
+
+def fail(error):
+    def failing(*_, **__):
+        raise error
+
+    return failing
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"])
+@pytest.mark.parametrize("where", ["os.fsync", "pathlib.Path.replace"])
+def test_a_write_that_fails_leaves_the_old_checkpoint_and_nothing_beside_it(saved, monkeypatch, where, error):
+    before, files = saved.read_bytes(), sorted(os.listdir(saved.parent))
+    with monkeypatch.context() as patch:
+        patch.setattr(where, fail(error))
+        with pytest.raises(type(error)):
+            save(saved, provenance=PROVENANCE | {"step": 6})
+    assert saved.read_bytes() == before
+    assert sorted(os.listdir(saved.parent)) == files == ["m.md", "m.safetensors"]
+    assert load_checkpoint(saved).provenance["step"] == 4
+
+
+def test_a_first_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.fsync", fail(OSError(5, "Input/output error")))
+    with pytest.raises(OSError, match="Input/output error"):
+        save(tmp_path / "m.safetensors")
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch):
+    events = []
+    fsync, replace = os.fsync, Path.replace
+    monkeypatch.setattr("os.fsync", lambda fd: (events.append("fsync"), fsync(fd))[1])
+    monkeypatch.setattr(Path, "replace", lambda one, two: (events.append(f"to {two.name}"), replace(one, two))[1])
+    save(tmp_path / "m.safetensors")
+    assert events == ["fsync", "to m.safetensors", "fsync", "to m.md"]
+
+
+# No pickle -------------------------------------------------------------------------------------------------
+
+SOURCES = sorted(
+    path for package in (retrieval, indexes, robot) for path in Path(package.__file__).parent.rglob("*.py")
+)
+# What must be said to a loader that would otherwise run code from the file.
+SAFE = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False), "numpy.load": ("allow_pickle", False)}
+
+
+def unsafe_calls(source):
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            yield from (
+                name for name in names if name.split(".")[0] in {"pickle", "cloudpickle", "dill", "joblib", "shelve"}
+            )
+        if isinstance(node, ast.Call) and (name := ast.unparse(node.func)) in SAFE:
+            keyword, value = SAFE[name]
+            if not any(item.arg == keyword and ast.unparse(item.value) == str(value) for item in node.keywords):
+                yield f"{name} without {keyword}={value}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: "/".join(path.parts[-2:]))
+def test_no_module_unpickles_anything(path):
+    assert list(unsafe_calls(path.read_text("utf-8"))) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from joblib import load",
+        "torch.load(p)",
+        "torch.load(p, weights_only=False)",
+        "x = np.load(p)",
+    ],
+)
+def test_the_search_for_pickles_finds_them(source):
+    assert len(list(unsafe_calls(source))) == 1

@@ -1,0 +1,149 @@
+"""The command line as users meet it: the commands exactly as documented, exit codes, one-line errors, clean stdout."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from retrieval import defaults
+from retrieval.cli import main
+
+
+@pytest.fixture
+def workplace(tmp_path, catalogue, touch, monkeypatch):
+    """A folder with `catalog/`, `a.png` and `b.png`, as in the README, and the current one."""
+    shutil.copytree(catalogue, tmp_path / "catalog")
+    for name, path in zip(("a.png", "b.png"), touch, strict=True):
+        shutil.copy(path, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_two_commands_work_exactly_as_written(workplace, capsys):
+    """With nothing trained before: the shipped model serves, and the output says so."""
+    assert main(["build-index", "catalog/"]) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert f"model: {defaults.shipped_model()} (shipped; trained on drawn pictures" in said.err
+    assert main(["query", "--gelsight", "a.png", "b.png"]) == 0
+    said = capsys.readouterr()
+    assert "Which object is in the hand?" in said.out
+    assert "drawn test pictures" in said.err
+
+
+def test_the_index_and_the_model_are_found_again_from_another_folder(workplace, model, capsys, monkeypatch):
+    assert main(["build-index", "catalog/", "--model", str(model)]) == 0
+    elsewhere = workplace / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert main(["query", "--gelsight", "../a.png", "../b.png"]) == 0
+    assert f"index: {workplace / 'index'} (the last one built)" in capsys.readouterr().err
+
+
+def test_the_last_trained_model_is_the_default(workplace, model, capsys):
+    defaults.remember("model", model)
+    assert main(["build-index", "catalog/"]) == 0
+    assert f"model: {model} (the last one trained)" in capsys.readouterr().err
+
+
+def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model), "--json"])
+    assert json.loads(capsys.readouterr().out)["photos"] == 24
+    assert main(["query", "--gelsight", "a.png", "b.png", "--gelsight", "a.png", "b.png", "--top", "3", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["query"] == {"touches": [["a.png", "b.png"], ["a.png", "b.png"]]}
+    assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
+    assert [match["rank"] for match in document["results"]] == [1, 2, 3]
+    assert set(document["results"][0]) == {"rank", "object_id", "logit", "probability", "photo", "metadata"}
+
+
+def test_html_is_written_beside_the_table(workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html"]) == 0
+    assert "data:image/jpeg;base64," in Path("out.html").read_text()
+
+
+WRONG_USE = {
+    "no index": (["query", "--gelsight", "a.png", "b.png"], "run `retrieve build-index CATALOGUE` first"),
+    "one gel image": (
+        ["query", "--gelsight", "a.png", "--index", "index"],
+        "takes 2 gel image(s) for one touch; got 1",
+    ),
+    "no such image": (["query", "--gelsight", "a.png", "none.png", "--index", "index"], "none.png"),
+    "not an image": (["query", "--gelsight", "a.png", "text.png", "--index", "index"], "text.png"),
+    "no catalogue": (["build-index", "nowhere/"], "nowhere"),
+    "no model": (["build-index", "catalog/", "--model", "none.safetensors"], "there is no checkpoint"),
+    "unknown kind": (["build-index", "catalog/", "--kind", "tree"], "flat"),
+    "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
+    "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
+    "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
+    "nothing to check": (["check", "nowhere"], "nowhere"),
+    "bad split": (["check", "catalog", "--split", "text.png"], "not a JSON file"),
+    "no split file": (["check", "catalog", "--split", "none.json"], "none.json"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(WRONG_USE))
+def test_wrong_use_is_one_line_on_stderr_and_exit_code_2(case, workplace, model, capsys):
+    Path("text.png").write_text("this is no picture")
+    arguments, words = WRONG_USE[case]
+    if "--index" in arguments:
+        main(["build-index", "catalog/", "--model", str(model)])
+        capsys.readouterr()
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    last = said.err.strip().splitlines()[-1]
+    assert last.startswith(f"retrieve {arguments[0]}: ")
+    assert words in last
+    assert "Traceback" not in said.err
+
+
+def test_an_unexpected_error_is_no_traceback_unless_debug_is_asked_for(workplace, monkeypatch, capsys):
+    monkeypatch.setattr(defaults, "find_index", lambda given: 1 / 0)
+    assert main(["query", "--gelsight", "a.png"]) == 1
+    assert "unexpected ZeroDivisionError" in capsys.readouterr().err
+    with pytest.raises(ZeroDivisionError):
+        main(["--debug", "query", "--gelsight", "a.png"])
+
+
+def test_an_unknown_command_is_wrong_use():
+    with pytest.raises(SystemExit) as leaving:
+        main(["fetch"])
+    assert leaving.value.code == 2
+
+
+def test_check_leaves_with_1_when_it_finds_errors(recording, tmp_path, capsys):
+    assert main(["check", str(recording)]) == 0
+    broken = tmp_path / "recording"
+    shutil.copytree(recording, broken)
+    next(iter(sorted((broken / "images").glob("*touch_a.png")))).write_bytes(b"")
+    assert main(["check", str(broken), "--json"]) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["findings"][0]["kind"] == "broken"
+    assert "is not fit for training" in said.err
+
+
+def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
+    config = workplace / "tiny.toml"
+    config.write_text(
+        '[matcher]\ntower = "small"\ntower_output = "pooled"\nhidden = 16\nembedding_dim = 8\n'
+        '[training]\ninit = "random"\niterations = 2\ntouches_per_batch = 2\nvalidation_fraction = 0.25\n'
+    )
+    assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml", "--seed", "3"]) == 0
+    assert "kept step 2" in capsys.readouterr().err
+    assert main(["build-index", "catalog"]) == 0
+    assert f"model: {workplace / 'm.safetensors'} (the last one trained)" in capsys.readouterr().err
+    assert main(["query", "--gelsight", "a.png", "b.png", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["results"]) == 8
+
+
+def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
+    main(["build-index", "catalog/", "--model", str(model)])
+    query = [sys.executable, "-m", "retrieval.cli", "query", "--gelsight", "a.png", "b.png", "--index", "index"]
+    done = subprocess.run(f"{' '.join(query)} | true", shell=True, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    assert "Broken pipe" not in done.stderr

@@ -1,0 +1,431 @@
+"""Grasps of a recording, splits that share no object, and the pair sampler."""
+
+import dataclasses
+import json
+import logging
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from retrieval.dataset import (
+    Grasp,
+    ImageCache,
+    PairSampler,
+    Split,
+    data_digest,
+    finger_count,
+    load_grasps,
+    make_split,
+    recording_source,
+)
+from retrieval.errors import DatasetError
+from tests import synthetic
+
+
+def grasp(object_id, number=0, sequence=None, fingers="ab", photo=None):
+    """A grasp whose files need not exist."""
+    name = f"{object_id}-{number}"
+    touches = tuple(Path(f"{name}-{finger}.png") for finger in fingers)
+    return Grasp(name, object_id, sequence, Path(photo or f"{name}.jpg"), touches, ())
+
+
+def grasps_of(*counts):
+    """`counts[i]` grasps of object number i."""
+    return [grasp(f"object-{i:02d}", number) for i, count in enumerate(counts) for number in range(count)]
+
+
+def pairs(batch):
+    """(row of the touch, its object, the photo, the photo's object, label), one for each pair."""
+    return [
+        (int(t), batch.grasps[t].object_id, batch.photos[p], str(batch.photos[p]).rsplit("-", 1)[0], float(label))
+        for t, p, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True)
+    ]
+
+
+def contents(batch):
+    """Everything in a batch as plain values, to compare two of them."""
+    return {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in dataclasses.asdict(batch).items()
+    }
+
+
+counts = st.lists(st.integers(1, 7), min_size=2, max_size=9)
+seeds = st.integers(0, 2**32 - 1)
+
+
+# Reading a recording ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small_recording(tmp_path_factory):
+    """Two objects with two grasps and a miss each."""
+    folder = tmp_path_factory.mktemp("small") / "recording"
+    return synthetic.write_recording(folder, synthetic.make_objects(2), 2, misses=1)
+
+
+def test_grasps_come_in_the_order_of_collection_with_their_files_in_the_order_of_the_fingers(small_recording):
+    rows = [json.loads(line) for line in (small_recording / "metadata.jsonl").read_text().splitlines()]
+    rows = [row for row in rows if row["grasped"]]
+    grasps = load_grasps(small_recording)
+    assert [item.grasp_id for item in grasps] == [row["grasp_id"] for row in rows]
+    for item, row in zip(grasps, rows, strict=True):
+        assert item.object_id == row["object_id"]
+        assert item.sequence_id == row["sequence_id"]
+        assert item.photo == small_recording / row["photo_file_name"]
+        assert item.touches == tuple(small_recording / row[f"touch_{finger}_file_name"] for finger in "ab")
+        assert item.backgrounds == tuple(small_recording / row[f"touch_{finger}_before_file_name"] for finger in "ab")
+
+
+def test_grasps_that_closed_on_nothing_are_left_out(small_recording):
+    assert Counter(item.object_id for item in load_grasps(small_recording)) == {"ribs-0000": 2, "bumps-0001": 2}
+
+
+def test_the_source_of_a_recording_is_what_its_writer_said(small_recording):
+    assert recording_source(small_recording) == "drawn test pictures, not a simulation of contact"
+
+
+def test_a_recording_with_misses_alone_is_an_error(tmp_path):
+    folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 0, misses=2)
+    with pytest.raises(DatasetError, match=r"r must hold successful grasps with a photo and a touch; it holds none"):
+        load_grasps(folder)
+
+
+def test_what_the_recording_says_is_wrong_comes_as_our_own_error(tmp_path):
+    with pytest.raises(DatasetError, match=r"recording\.json"):
+        load_grasps(tmp_path)
+
+
+def test_a_line_that_a_crash_left_is_dropped_and_said(small_recording, tmp_path, caplog):
+    shutil.copytree(small_recording, tmp_path / "r")
+    with (tmp_path / "r" / "metadata.jsonl").open("a") as file:
+        file.write('{"grasp_id": "0')
+    with caplog.at_level(logging.WARNING):
+        assert len(load_grasps(tmp_path / "r")) == 4
+    assert "half-written" in caplog.text
+
+
+def test_touches_with_another_number_of_fingers_are_refused_by_name():
+    assert finger_count([grasp("mug", fingers="a")]) == 1
+    assert finger_count([grasp("mug"), grasp("cup")]) == 2
+    with pytest.raises(DatasetError, match=r"mug-0 has 2, cup-0 has 1; keep the sensors in recordings of their own"):
+        finger_count([grasp("mug"), grasp("cup", fingers="a")])
+
+
+def test_the_data_digest_follows_bytes_and_ids_and_not_the_place(small_recording, tmp_path):
+    shutil.copytree(small_recording, tmp_path / "r")
+    grasps = load_grasps(tmp_path / "r")
+    before = data_digest(grasps)
+    assert before == data_digest(load_grasps(small_recording))
+    assert before != data_digest(grasps[::-1])
+    assert before != data_digest([dataclasses.replace(grasps[0], object_id="other"), *grasps[1:]])
+    for path in (grasps[0].photo, grasps[1].touches[1], grasps[2].backgrounds[0]):
+        kept = path.read_bytes()
+        path.write_bytes(kept[:-1] + bytes([kept[-1] ^ 1]))
+        assert data_digest(grasps) != before
+        path.write_bytes(kept)
+    assert data_digest(grasps) == before
+
+
+def test_the_data_digest_names_a_file_that_is_not_there(small_recording, tmp_path):
+    shutil.copytree(small_recording, tmp_path / "r")
+    grasps = load_grasps(tmp_path / "r")
+    grasps[1].touches[0].unlink()
+    with pytest.raises(DatasetError, match=rf"{grasps[1].touches[0].name} cannot be read .*`retrieve check`"):
+        data_digest(grasps)
+
+
+# Splits ----------------------------------------------------------------------------------------------------
+
+
+def parts_of(split):
+    return {"train": split.train, "validation": split.validation, "test": split.test}
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=st.lists(st.integers(1, 3), min_size=6, max_size=40), seed=seeds)
+def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
+    grasps = grasps_of(*counts)
+    split = make_split(grasps, validation=0.2, test=0.25, seed=seed)
+    together = [name for part in parts_of(split).values() for name in part]
+    assert sorted(together) == sorted({item.object_id for item in grasps})
+    assert min(map(len, parts_of(split).values())) >= 2
+
+
+@settings(max_examples=50, deadline=None)
+@given(count=st.integers(6, 120), seed=seeds, validation=st.floats(0, 0.35), test=st.floats(0, 0.35))
+def test_shares_are_met_to_half_an_object_or_the_least_of_two(count, seed, validation, test):
+    split = make_split(grasps_of(*[1] * count), validation=validation, test=test, seed=seed)
+    for share, part in ((validation, split.validation), (test, split.test)):
+        if share * count < 2:
+            assert len(part) == (2 if share else 0)
+        else:
+            assert abs(len(part) - share * count) <= 0.5
+
+
+def test_the_papers_shares_of_98_objects_are_18_and_10():
+    split = make_split(grasps_of(*[1] * 98), validation=0.1, test=0.184, seed=0)
+    assert [len(part) for part in parts_of(split).values()] == [70, 10, 18]
+
+
+linked = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 7)), min_size=1, max_size=20)
+
+
+@settings(max_examples=50, deadline=None)
+@given(links=linked, seed=seeds)
+def test_objects_that_share_a_sequence_however_indirectly_stay_together(links, seed):
+    """The oracle joins one pair of objects at a time until nothing changes."""
+    grasps = [*grasps_of(*[1] * 12), *(grasp(f"object-{i:02d}", 1 + n, f"s{s}") for n, (i, s) in enumerate(links))]
+    label = {item.object_id: item.object_id for item in grasps}
+    for _ in range(len(label)):
+        for one in grasps:
+            for two in grasps:
+                if one.sequence_id is not None and one.sequence_id == two.sequence_id:
+                    label[one.object_id] = label[two.object_id] = min(label[one.object_id], label[two.object_id])
+    try:
+        split = make_split(grasps, validation=0.2, test=0.2, seed=seed)
+    except DatasetError:
+        assert len(set(label.values())) < 6  # six groups always make three parts of two
+        return
+    part_of = {name: part for part, names in parts_of(split).items() for name in names}
+    for one, two in zip(label, label.values(), strict=True):
+        assert part_of[one] == part_of[two]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_large_group_is_left_to_training_where_small_ones_meet_the_share(seed):
+    """The naive draw takes whichever group comes first, here often ten objects for a share of four."""
+    grasps = [*(grasp(f"linked-{i}", 0, "day one") for i in range(10)), *grasps_of(*[1] * 10)]
+    split = make_split(grasps, validation=0.1, test=0.2, seed=seed)
+    assert (len(split.train), len(split.validation), len(split.test)) == (14, 2, 4)
+
+
+def test_a_split_depends_on_its_seed_and_not_on_the_order_of_grasps():
+    grasps = grasps_of(*[2] * 20)
+    split = make_split(grasps, validation=0.2, test=0.2, seed=1)
+    assert split == make_split(grasps[::-1], validation=0.2, test=0.2, seed=1)
+    others = {make_split(grasps, validation=0.2, test=0.2, seed=seed).test for seed in range(5)}
+    assert len(others) == 5
+
+
+@pytest.mark.parametrize(("validation", "test", "parts"), [(0.0, 0.0, 1), (0.2, 0.0, 2), (0.0, 0.2, 2), (0.2, 0.2, 3)])
+def test_a_part_with_no_share_is_empty_and_too_few_objects_are_counted_in_the_error(validation, test, parts):
+    split = make_split(grasps_of(*[1] * 2 * parts), validation=validation, test=test, seed=0)
+    assert (split.validation == ()) == (validation == 0)
+    assert (split.test == ()) == (test == 0)
+    few = 2 * parts - 1
+    with pytest.raises(DatasetError, match=rf"into {parts} parts .* has {few} objects in {few} such groups"):
+        make_split(grasps_of(*[1] * few), validation=validation, test=test, seed=0)
+
+
+def test_shares_that_leave_too_few_to_train_on_are_told_in_objects():
+    with pytest.raises(
+        DatasetError, match=r"has 7 objects in 7 such groups, and the shares part them into 1 \+ 3 \+ 3"
+    ):
+        make_split(grasps_of(*[1] * 7), validation=0.4, test=0.4, seed=0)
+
+
+def test_objects_in_one_sequence_cannot_be_split_and_the_error_says_so():
+    grasps = [grasp(f"object-{i}", 0, "one long take") for i in range(9)]
+    with pytest.raises(DatasetError, match="has 9 objects in 1 such groups"):
+        make_split(grasps, validation=0.2, test=0.2, seed=0)
+
+
+def test_a_split_survives_json_and_selects_its_grasps():
+    grasps = grasps_of(*[2] * 8)
+    split = make_split(grasps, validation=0.25, test=0.25, seed=4)
+    assert Split.from_dict(json.loads(json.dumps(split.to_dict()))) == split
+    for part, names in parts_of(split).items():
+        assert split.select(grasps, part) == [item for item in grasps if item.object_id in names]
+
+
+def test_a_split_file_may_leave_out_the_seed():
+    split = Split.from_dict({"train": ["a", "b"], "validation": [], "test": ["c"]})
+    assert split == Split(seed=0, train=("a", "b"), validation=(), test=("c",))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        None,
+        [],
+        "train",
+        7,
+        {},
+        {"train": ["a"], "test": ["b"]},
+        {"train": "mug", "validation": [], "test": []},
+        {"train": ["mug", 3], "validation": [], "test": []},
+        {"train": None, "validation": [], "test": []},
+    ],
+    ids=repr,
+)
+def test_what_is_no_split_is_refused_with_the_form_of_one(data):
+    with pytest.raises(DatasetError, match=r'a split must be \{"seed": 0, "train": \[object ids\]'):
+        Split.from_dict(data)
+
+
+@pytest.mark.parametrize("seed", ["1", None, 1.5, True])
+def test_the_seed_of_a_split_is_a_whole_number(seed):
+    with pytest.raises(DatasetError, match="seed of a split must be a whole number"):
+        Split.from_dict({"seed": seed, "train": [], "validation": [], "test": []})
+
+
+# Pairs -----------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=counts, seed=seeds, step=st.integers(0, 10**6), touches=st.integers(1, 7))
+def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, seed, step, touches):
+    grasps = grasps_of(*counts)
+    batch = PairSampler(grasps, seed=seed).batch(step, touches)
+    rows = pairs(batch)
+    assert len(rows) == 8 * touches
+    assert float(batch.labels.mean()) == 0.5
+    own = {item.photo for item in grasps}
+    for row in range(touches):
+        mine = [pair for pair in rows if pair[0] == row]
+        assert [label for *_, label in mine] == [1, 1, 1, 1, 0, 0, 0, 0]
+        assert all((touch == photo) == bool(label) for _, touch, _, photo, label in mine)
+        assert all(photo in own for _, _, photo, _, _ in mine)
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=counts, seed=seeds, positives=st.integers(1, 5), negatives=st.integers(1, 5))
+def test_other_numbers_of_photos_are_drawn_as_asked(counts, seed, positives, negatives):
+    sampler = PairSampler(grasps_of(*counts), seed=seed, positives=positives, negatives=negatives)
+    for _, labels in _labels_by_touch(sampler.batch(3, 5)).items():
+        assert labels == [1] * positives + [0] * negatives
+
+
+def _labels_by_touch(batch):
+    found = {}
+    for row, *_, label in pairs(batch):
+        found.setdefault(row, []).append(label)
+    return found
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=counts, seed=seeds, touches=st.integers(1, 9))
+def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used(counts, seed, touches):
+    batch = PairSampler(grasps_of(*counts), seed=seed).batch(0, touches)
+    assert len(batch.photos) == len(set(batch.photos)) == len(batch.photo_objects)
+    assert set(batch.photo_index.tolist()) == set(range(len(batch.photos)))
+    names = sorted({item.object_id for item in grasps_of(*counts)})
+    assert [names[i] for i in batch.photo_objects] == [str(photo).rsplit("-", 1)[0] for photo in batch.photos]
+    assert [names[i] for i in batch.touch_objects] == [item.object_id for item in batch.grasps]
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=counts, seed=seeds, touches=st.integers(1, 7))
+def test_at_any_moment_every_object_has_been_used_equally_often(counts, seed, touches):
+    sampler, used = PairSampler(grasps_of(*counts), seed=seed), Counter(range(len(counts)))
+    used.subtract(range(len(counts)))
+    for step in range(12):
+        for index in sampler.batch(step, touches).touch_objects.tolist():
+            used[index] += 1
+            assert max(used.values()) - min(used.values()) <= 1
+
+
+@settings(max_examples=50, deadline=None)
+@given(counts=counts, seed=seeds)
+def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, seed):
+    sampler, objects = PairSampler(grasps_of(*counts), seed=seed), len(counts)
+    drawn = [item for step in range(2 * max(counts)) for item in sampler.batch(step, objects).grasps]
+    for index, count in enumerate(counts):
+        mine = [item.grasp_id for item in drawn if item.object_id == f"object-{index:02d}"]
+        for start in range(0, len(mine) - count + 1, count):
+            assert len(set(mine[start : start + count])) == count
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=seeds, steps=st.permutations(range(5)))
+def test_a_batch_depends_on_seed_and_step_and_not_on_what_was_asked_before(seed, steps):
+    grasps = grasps_of(3, 1, 4, 2)
+    sampler = PairSampler(grasps, seed=seed)
+    in_order = [contents(PairSampler(grasps, seed=seed).batch(step, 4)) for step in range(5)]
+    for step in steps:
+        sampler.every_touch()
+        assert contents(sampler.batch(step, 4)) == in_order[step]
+
+
+def test_the_order_of_the_grasps_of_two_objects_does_not_matter():
+    grasps = grasps_of(3, 4)
+    one, two = PairSampler(grasps, seed=5), PairSampler(grasps[3:] + grasps[:3], seed=5)
+    assert contents(one.batch(2, 6)) == contents(two.batch(2, 6))
+
+
+def test_batches_of_other_steps_and_other_seeds_differ():
+    grasps = grasps_of(*[6] * 8)
+    batches = [PairSampler(grasps, seed=seed).batch(step, 6) for seed in (0, 1) for step in range(10)]
+    assert len({str(contents(batch)) for batch in batches}) == 20
+
+
+def test_positives_are_drawn_without_repeats_where_the_object_has_enough_photos():
+    for count in (4, 9):
+        batch = PairSampler(grasps_of(count, count), seed=0).batch(0, 2)
+        photos = [photo for row, _, photo, _, label in pairs(batch) if label == 1 and row == 0]
+        assert len(set(photos)) == 4
+    batch = PairSampler(grasps_of(2, 2), seed=0).batch(0, 2)
+    assert len([photo for row, _, photo, _, label in pairs(batch) if label == 1 and row == 0]) == 4
+
+
+def test_a_photo_shared_by_grasps_of_one_object_counts_as_one():
+    grasps = [grasp("mug", number, photo="mug-0.jpg") for number in range(3)] + grasps_of(2)
+    batch = PairSampler(grasps, seed=0).every_touch()
+    assert Counter(str(photo).rsplit("-", 1)[0] for photo in batch.photos) == {"mug": 1, "object-00": 2}
+
+
+def test_negatives_draw_the_object_first_so_that_one_with_many_photos_is_not_met_more_often():
+    """The naive draw over all other photos would meet the object of 60 in 60 / 61 of the pairs."""
+    sampler = PairSampler(grasps_of(1, 1, 60), seed=0, positives=1, negatives=500)
+    batch = sampler.batch(0, 3)
+    row = batch.touch_objects.tolist().index(0)
+    negatives = [batch.photo_objects[p] for t, p in zip(batch.touch_index, batch.photo_index, strict=True) if t == row]
+    met = Counter(map(int, negatives[1:]))
+    # 500 fair draws: the deviation is 11, and six of them are allowed.
+    assert abs(met[1] - 250) < 67
+    assert met[1] + met[2] == 500
+
+
+def test_the_pairs_for_evaluation_hold_every_touch_once_and_are_the_same_each_time():
+    grasps = grasps_of(3, 1, 5)
+    sampler = PairSampler(grasps, seed=0)
+    batch = sampler.every_touch()
+    assert [item.grasp_id for item in batch.grasps] == [item.grasp_id for item in grasps]
+    assert Counter(batch.touch_index.tolist()) == dict.fromkeys(range(9), 8)
+    sampler.batch(0, 5)
+    assert contents(sampler.every_touch()) == contents(batch)
+
+
+@pytest.mark.parametrize("grasps", [[], grasps_of(5)], ids=["none", "one object"])
+def test_fewer_than_two_objects_make_no_pairs(grasps):
+    with pytest.raises(DatasetError, match=rf"at least 2 objects in each part of the split; got {min(len(grasps), 1)}"):
+        PairSampler(grasps, seed=0)
+
+
+def test_one_photo_of_two_objects_would_be_its_own_negative_and_is_refused():
+    with pytest.raises(DatasetError, match="a photo file must belong to one object"):
+        PairSampler([grasp("mug", photo="same.jpg"), grasp("cup", photo="same.jpg")], seed=0)
+
+
+# Cache -----------------------------------------------------------------------------------------------------
+
+
+def test_an_image_is_loaded_once_while_the_cache_has_room_and_again_when_it_has_not():
+    calls = []
+
+    def load(*paths):
+        calls.append(paths)
+        return np.full((2, 2, 3), float(str(paths[0])), dtype=np.float32)
+
+    cache = ImageCache(load, limit_bytes=100)  # one image has 48 bytes
+    for _ in range(2):
+        for name in ("1", "2", "3"):
+            assert cache(Path(name), None)[0, 0, 0] == float(name)
+    assert Counter(str(paths[0]) for paths in calls) == {"1": 1, "2": 1, "3": 2}
+    assert cache(Path("1"), Path("2")) is not cache(Path("1"), None)

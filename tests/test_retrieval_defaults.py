@@ -1,0 +1,133 @@
+"""Which model and index a command takes where the user names none."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from retrieval import defaults
+from retrieval.errors import BadInput, CheckpointError
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def nothing_shipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(defaults, "shipped_model", lambda: tmp_path / "none.safetensors")
+
+
+def state_file():
+    return Path(os.environ["XDG_STATE_HOME"]) / "touch-retrieval" / "last.json"
+
+
+def an_index(folder):
+    folder.mkdir(parents=True)
+    (folder / "CURRENT").write_text("gen-000001")
+    return folder
+
+
+def test_what_is_given_is_taken_even_if_it_is_not_there():
+    assert defaults.find_model("none.safetensors") == (Path("none.safetensors"), "given")
+    assert defaults.find_index("none") == (Path("none"), "given")
+
+
+def test_the_last_model_is_taken_while_it_is_there(tmp_path, monkeypatch):
+    shipped, last = tmp_path / "shipped.safetensors", tmp_path / "last.safetensors"
+    monkeypatch.setattr(defaults, "shipped_model", lambda: shipped)
+    shipped.touch()
+    last.touch()
+    assert defaults.find_model(None)[0] == shipped
+    assert "train your own" in defaults.find_model(None)[1]
+    defaults.remember("model", Path("last.safetensors"))
+    assert defaults.find_model(None) == (last, "the last one trained")
+    last.unlink()
+    assert defaults.find_model(None)[0] == shipped
+
+
+@pytest.mark.usefixtures("nothing_shipped")
+def test_without_any_model_the_error_says_what_to_run():
+    with pytest.raises(CheckpointError, match=r"make one with `retrieve train`, or name it with --model"):
+        defaults.find_model(None)
+
+
+def test_the_index_of_this_folder_comes_before_the_last_one(tmp_path):
+    last = an_index(tmp_path / "elsewhere" / "index")
+    defaults.remember("index", last)
+    assert defaults.find_index(None) == (last, "the last one built")
+    an_index(tmp_path / "index")
+    assert defaults.find_index(None) == (Path("index"), "in this folder")
+
+
+def test_a_folder_that_is_no_index_is_not_taken_for_one(tmp_path):
+    (tmp_path / "index").mkdir()
+    (tmp_path / "other").mkdir()
+    defaults.remember("index", tmp_path / "other")
+    with pytest.raises(BadInput, match=r"no index here and none was built before; run `retrieve build-index"):
+        defaults.find_index(None)
+
+
+def test_paths_are_remembered_in_full_each_kind_on_its_own(tmp_path, monkeypatch):
+    defaults.remember("model", Path("a.safetensors"))
+    defaults.remember("index", Path("index"))
+    defaults.remember("model", Path("b.safetensors"))
+    expected = {"model": str(tmp_path / "b.safetensors"), "index": str(tmp_path / "index")}
+    assert json.loads(state_file().read_text()) == expected
+    assert os.listdir(state_file().parent) == ["last.json"]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"3", b"null", b"\xff", b'{"model": 3, "index": null}', b'{"model": "/none"}']
+)
+@pytest.mark.usefixtures("nothing_shipped")
+def test_a_note_that_makes_no_sense_is_as_none_and_is_replaced(content, tmp_path):
+    state_file().parent.mkdir(parents=True)
+    state_file().write_bytes(content)
+    with pytest.raises(CheckpointError):
+        defaults.find_model(None)
+    with pytest.raises(BadInput):
+        defaults.find_index(None)
+    index = an_index(tmp_path / "built")
+    defaults.remember("index", index)
+    assert defaults.find_index(None)[0] == index
+
+
+def test_where_the_note_cannot_be_written_nothing_is_said(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    defaults.remember("index", tmp_path)
+    with pytest.raises(BadInput):
+        defaults.find_index(None)
+
+
+def test_a_user_without_a_home_folder_does_without_the_note(tmp_path, monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.setattr(Path, "home", homeless)
+    defaults.remember("index", tmp_path)
+    with pytest.raises(BadInput, match="no index here"):
+        defaults.find_index(None)
+
+
+def test_without_the_variable_the_note_lies_below_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    defaults.remember("model", tmp_path / "m.safetensors")
+    assert (tmp_path / "home" / ".local" / "state" / "touch-retrieval" / "last.json").is_file()
+
+
+def test_a_crash_while_noting_leaves_the_old_note(tmp_path, monkeypatch):
+    defaults.remember("model", tmp_path / "old.safetensors")
+    before = state_file().read_bytes()
+
+    def refuse(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    defaults.remember("model", tmp_path / "new.safetensors")
+    assert state_file().read_bytes() == before

@@ -1,0 +1,65 @@
+"""Guess curves against every draw enumerated, and intervals against published values."""
+
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.evaluation.metrics import binomial_interval, guess_curve
+
+
+def curve_by_enumeration(true_score, others, k):
+    """Every set of rivals, every order of equals: how often the true photo stands among the first n."""
+    found, cases = np.zeros(k), 0
+    for rivals in combinations(range(len(others)), k - 1):
+        scores = [true_score, *(others[rival] for rival in rivals)]
+        for order in permutations(range(k)):
+            ranked = sorted(range(k), key=lambda place: (-scores[place], order[place]))
+            found[ranked.index(0) :] += 1
+            cases += 1
+    return found / cases
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 3), st.lists(st.integers(0, 3), min_size=3, max_size=5), st.integers(1, 4))
+def test_the_curve_is_what_every_draw_and_every_order_of_equals_gives(true_score, others, k):
+    np.testing.assert_allclose(
+        guess_curve(true_score, others, k), curve_by_enumeration(true_score, others, k), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("k", [1, 5, 10])
+def test_a_constant_scorer_is_exactly_chance(k):
+    np.testing.assert_allclose(guess_curve(0.0, np.zeros(40), k), np.arange(1, k + 1) / k)
+
+
+def test_the_best_and_the_worst_photo():
+    assert guess_curve(1.0, np.zeros(9), 5).tolist() == [1, 1, 1, 1, 1]
+    assert guess_curve(-1.0, np.zeros(9), 5).tolist() == [0, 0, 0, 0, 1]
+
+
+def test_too_few_rivals_and_scores_that_are_not_finite_are_refused():
+    with pytest.raises(BadInput, match="needs k >= 1 and 4 other photos; got 3"):
+        guess_curve(0.0, np.zeros(3), 5)
+    with pytest.raises(NumericalError):
+        guess_curve(np.nan, np.zeros(9), 5)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (0, 10, 0.0, 0.3084971078),  # 1 - 0.025 ** (1 / 10)
+        (10, 10, 0.6915028922, 1.0),
+        (4, 20, 0.0573, 0.4366),  # printed to four digits in tables of the method
+    ],
+)
+def test_the_interval_is_that_of_clopper_and_pearson(successes, trials, low, high):
+    assert binomial_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_an_interval_needs_trials():
+    with pytest.raises(BadInput):
+        binomial_interval(1, 0)

@@ -1,0 +1,73 @@
+"""The progress of long work: lines where nobody watches, a bar on a terminal, nothing where asked to be quiet."""
+
+import pytest
+
+from retrieval import progress
+from retrieval.progress import Bar
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands still until `clock[0]` is moved on."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_line_comes_every_fifteen_seconds_and_at_the_end(clock, capsys):
+    with Bar("train", 40, "steps") as bar:
+        for _ in range(40):
+            clock[0] += 1.0
+            bar.advance(note="loss 0.5")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == [
+        "train: 16/40 steps, 1.0 per second, 24 s left  loss 0.5",
+        "train: 32/40 steps, 1.0 per second, 8 s left  loss 0.5",
+        "train: 40/40 steps, 1.0 per second, 0 s left  loss 0.5",
+    ]
+
+
+def test_resumed_work_is_counted_in_full_and_timed_from_where_it_went_on(clock, capsys):
+    with Bar("embed", 100, "photos", done=60) as bar:
+        clock[0] += 20.0
+        bar.advance(10)
+    assert capsys.readouterr().err == "embed: 70/100 photos, 0.5 per second, 60 s left\n"
+
+
+def test_work_that_takes_no_time_is_not_divided_by_zero(clock, capsys):
+    with Bar("check", 2, "images") as bar:
+        bar.advance(2)
+    assert "check: 2/2 images" in capsys.readouterr().err
+
+
+def test_quiet_work_says_nothing(clock, capsys):
+    with Bar("check", 3, "images", quiet=True) as bar:
+        clock[0] += 100.0
+        bar.advance(3)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_an_error_inside_goes_on_its_way():
+    with pytest.raises(KeyError), Bar("check", 3, "images", quiet=True):
+        raise KeyError
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_on_a_terminal_there_is_a_bar_that_stops_whatever_happens(monkeypatch, capsys, fails):
+    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
+    bar = Bar("train", 5, "steps", done=2)
+    try:
+        with bar:
+            bar.advance(note="loss 0.25")
+            assert bar._rich.tasks[0].completed == 3
+            assert bar._rich.tasks[0].fields["note"] == "loss 0.25"
+            if fails:
+                raise KeyError
+    except KeyError:
+        assert fails
+    assert not bar._rich.live.is_started
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "train" in err
+    assert "3/5" in err

@@ -1,0 +1,181 @@
+"""The page and the table of a query: self-contained, harmless whatever the names hold, whole when a photo is gone."""
+
+import base64
+import json
+import shutil
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from retrieval.build import build_index
+from retrieval.checkpoint import load_checkpoint
+from retrieval.report import print_table, query_html
+from retrieval.search import Match, QueryResult, Searcher
+
+SCRIPT = "<script>alert(1)</script>"
+ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the text outside `style`."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.text, self._inside = [], "", ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self._inside = tag
+
+    def handle_data(self, data):
+        if self._inside != "style":
+            self.text += data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match"):
+    """A result with these (object, logit, probability, photo, metadata)."""
+    index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
+    index |= {"catalogue": "catalog", "model": "m.safetensors", "trained_on": "nothing"}
+    ranked = [Match(rank, *match) for rank, match in enumerate(matches, start=1)]
+    return QueryResult([list(touch) for touch in touches], index, {"decode": 1.0, "total": 2.0}, verdict, ranked)
+
+
+ONE = ("mug", 1.5, 0.8, "mug/1.jpg", {})
+
+
+@pytest.fixture(scope="module")
+def answer(catalogue, model, touch, tmp_path_factory):
+    """A real result over a catalogue with metadata, and that catalogue."""
+    folder = tmp_path_factory.mktemp("report")
+    own = shutil.copytree(catalogue, folder / "catalog")
+    lines = [json.dumps({"object_id": path.name, "shelf": "B4"}) for path in own.iterdir()]
+    (own / "metadata.jsonl").write_text("\n".join(lines))
+    build_index(own, load_checkpoint(model), folder / "index", quiet=True)
+    return Searcher.open(folder / "index").query([touch, touch], top=5), own
+
+
+def test_the_page_needs_nothing_outside_itself(answer):
+    page = query_html(*answer)
+    for word in ("http:", "https:", "file:", "//cdn", "@import", "url("):
+        assert word not in page
+    parsed = Page(page)
+    assert {tag for tag, _ in parsed.tags}.isdisjoint({"script", "link", "iframe", "object", "a"})
+    assert len(parsed.all("img")) == 4 + 5
+    assert all(image["src"].startswith("data:image/jpeg;base64,") for image in parsed.all("img"))
+    assert not [attributes for _, attributes in parsed.tags if {"href", "srcset", "action"} & set(attributes)]
+
+
+def test_the_pictures_are_thumbnails_in_their_own_shape_and_colours(tmp_path):
+    picture = np.zeros((300, 1200, 3), np.uint8)
+    picture[..., 2] = 200  # red, in OpenCV's order
+    cv2.imwrite(str(tmp_path / "wide.png"), picture)
+    page = Page(query_html(made_up(("mug", 1.5, 0.8, "wide.png", {})), tmp_path))
+    data = base64.b64decode(page.all("img")[0]["src"].split(",")[1])
+    decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded.shape == (80, 320, 3)
+    np.testing.assert_allclose(decoded.mean(axis=(0, 1)), (0, 0, 200), atol=4)  # JPEG's own loss
+
+
+def test_the_page_names_rank_probability_logit_photo_and_metadata(answer):
+    result, catalogue = answer
+    text = Page(query_html(result, catalogue)).text
+    for match in result.results:
+        for words in (f"{match.rank}. {match.object_id}", f"{match.logit:+.2f}", match.photo, "shelf: B4"):
+            assert words in text
+    assert "2 grasps against 24 photos of 8 objects" in text
+    assert "The grasps are taken as independent: their logits add." in text
+
+
+@pytest.mark.parametrize("place", ["object", "photo", "key", "value", "touch"])
+def test_names_and_metadata_cannot_inject_markup(place, tmp_path):
+    parts = {name: SCRIPT if name == place else name for name in ("object", "photo", "key", "value", "touch")}
+    match = (parts["object"], 1.5, 0.8, parts["photo"], {parts["key"]: parts["value"]})
+    page = query_html(made_up(match, touches=[[parts["touch"], "b.png"]]), tmp_path)
+    assert "<script" not in page
+    assert (SCRIPT.split("/")[-1] if place == "touch" else SCRIPT) in Page(page).text
+
+
+def test_a_quote_in_a_name_cannot_leave_its_attribute(tmp_path, touch):
+    shutil.copy(touch[0], tmp_path / "1.png")
+    page = Page(query_html(made_up(('" onerror="alert(1)', 1.5, 0.8, "1.png", {})), tmp_path))
+    assert [set(image) for image in page.all("img")] == [{"class", "src", "alt"}]
+    assert page.all("img")[0]["alt"] == 'photo of " onerror="alert(1)'
+
+
+def test_metadata_of_any_json_kind_is_shown(tmp_path):
+    metadata = {"n": 3, "none": None, "list": [SCRIPT, 1], "deep": {"a": {"b": SCRIPT}}, "": "empty key"}
+    page = query_html(made_up((*ONE[:4], metadata)), tmp_path)
+    assert "<script" not in page
+    assert page.count(ESCAPED) == 2
+
+
+def test_a_vanished_or_broken_photo_leaves_a_blank_and_the_rest_stands(answer, tmp_path):
+    result, catalogue = answer
+    own = shutil.copytree(catalogue, tmp_path / "catalog")
+    (own / result.results[0].photo).unlink()
+    broken = own / result.results[1].photo
+    broken.write_bytes(broken.read_bytes()[:300])
+    page = Page(query_html(result, own))
+    assert len(page.all("img")) == 4 + 3
+    assert page.text.count("no picture at its place") == 2
+    assert result.results[0].object_id in page.text
+
+
+def test_vanished_gel_images_leave_blanks_too(tmp_path):
+    page = Page(query_html(made_up(ONE, touches=[["gone_a.png", "gone_b.png"]]), tmp_path))
+    assert page.all("img") == []
+    assert page.text.count("no picture at its place") == 3
+
+
+@pytest.mark.parametrize(
+    ("probability", "words"),
+    [(1.0, "over 99.9 %"), (0.99934, "over 99.9 %"), (0.5, "50.0 %"), (0.013, "1.3 %"), (1e-9, "under 0.1 %")],
+)
+def test_a_probability_is_never_shown_as_certain(probability, words, tmp_path):
+    text = Page(query_html(made_up(("mug", 1.5, probability, "1.jpg", {})), tmp_path)).text
+    assert words in text
+    assert "100.0 %" not in text
+
+
+def test_the_verdict_is_said(tmp_path):
+    assert "Most likely mug, probability 80.0 %." in Page(query_html(made_up(ONE), tmp_path)).text
+    rejected = Page(query_html(made_up(ONE, verdict="no match"), tmp_path))
+    assert "may not be in the catalogue" in rejected.text
+    assert "Most likely" not in rejected.text
+    assert not [tag for tag in rejected.all("div") if "first" in tag.get("class", "")]
+
+
+def test_a_model_without_calibration_shows_no_probability(tmp_path):
+    page = Page(query_html(made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated"), tmp_path))
+    assert "Most likely mug." in page.text
+    assert "never calibrated" in page.text
+    assert not [tag for tag in page.all("div") if tag.get("class") == "bar"]
+
+
+# The table on a terminal ---------------------------------------------------------------------------------------
+
+
+def test_the_table_has_a_line_for_each_object(answer, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    result, _ = answer
+    print_table(result)
+    out = capsys.readouterr().out
+    for match in result.results:
+        line = next(line for line in out.splitlines() if match.photo in line)
+        assert match.object_id in line
+        assert f"{match.probability:.3f}" in line
+
+
+@pytest.mark.parametrize("name", ["[bold]mug[/bold]", "[/red]", ":smile:", "[link=x]y"])
+def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    print_table(made_up((name, 1.5, None, f"{name}.jpg", {})))
+    out = capsys.readouterr().out
+    assert f" {name} " in out
+    assert f"{name}.jpg" in out

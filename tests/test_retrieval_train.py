@@ -1,0 +1,305 @@
+"""Training: shared images, resumption bit for bit, interruption, frozen towers, and ranks that equal one process."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from retrieval.batches import FrozenFeatures, TrainedFeatures
+from retrieval.checkpoint import load_checkpoint
+from retrieval.dataset import PairSampler, load_grasps, make_split
+from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
+from retrieval.fusion import Matcher
+from retrieval.losses import match_loss
+from retrieval.train import Trainer, batch_loss, build_matcher, set_training_mode, state_path, train
+from tests.conftest import TINY
+
+CPU = torch.device("cpu")
+
+
+def with_training(config, **changes):
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, **changes))
+
+
+def trainer_for(recording, out, config=TINY):
+    grasps = load_grasps(recording)
+    return Trainer(config, make_split(grasps, validation=0.25, test=0.2, seed=0), grasps, out, source="test")
+
+
+def same_weights(left, right):
+    return all(torch.equal(left[name], right[name]) for name in left)
+
+
+def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, monkeypatch):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors")
+    batch = trainer.sampler.batch(0, 4)
+    assert len(batch.labels) == 16  # pairs, of 4 touches and no more than 16 photos
+    counts = {"touch": 0, "photo": 0}
+    for name, tower in (("touch", trainer.matcher.touch_tower), ("photo", trainer.matcher.photo_tower)):
+        tower.register_forward_hook(
+            lambda _, images, __, name=name: counts.update({name: counts[name] + len(images[0])})
+        )
+    with trainer.features as features:
+        trainer.train_step(features.prepare(trainer.matcher, batch).result())
+    assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
+
+
+def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
+    """Without the contrastive term and dropout: exactly the paper's loss."""
+    config = with_training(TINY, contrastive_weight=0.0)
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, standardise=False, dropout=0.0))
+    torch.manual_seed(0)
+    matcher = build_matcher(config)
+    sampler = PairSampler(load_grasps(recording), seed=0)
+    with TrainedFeatures(config, CPU) as source:
+        loaded = source.prepare(matcher, sampler.batch(0, 3)).result()
+        loss, logits = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
+    batch = loaded.batch
+    one_by_one = torch.cat(
+        [
+            matcher(loaded.touches[touch][None], loaded.photos[photo][None])
+            for touch, photo in zip(batch.touch_index, batch.photo_index, strict=True)
+        ]
+    )
+    torch.testing.assert_close(logits, one_by_one, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(loss, match_loss(one_by_one, torch.from_numpy(batch.labels)), rtol=1e-5, atol=1e-6)
+
+
+def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording, tmp_path):
+    out = tmp_path / "m.safetensors"
+    train(recording, out, with_training(TINY, contrastive_weight=0.0), quiet=True)
+    torch.manual_seed(TINY.training.seed)
+    first = build_matcher(TINY).state_dict()
+    last = load_checkpoint(out).matcher.state_dict()
+    assert torch.equal(first["touch_projection.weight"], last["touch_projection.weight"])
+    assert torch.equal(first["log_scale"], last["log_scale"])
+    assert not torch.equal(first["head.second.weight"], last["head.second.weight"])
+
+
+def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recording, tmp_path):
+    whole, parts = trainer_for(recording, tmp_path / "a.safetensors"), tmp_path / "b.safetensors"
+    whole.run(quiet=True)
+    broken = trainer_for(recording, parts)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(broken, 3)
+    resumed = trainer_for(recording, parts)
+    resumed.resume()
+    assert resumed.step == 3
+    resumed.run(quiet=True)
+    assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
+    assert whole.best == resumed.best
+    assert (tmp_path / "a.safetensors").read_bytes() == parts.read_bytes()
+    assert not state_path(parts).exists()
+
+
+def stop_after(trainer, steps):
+    """Run, and fail like a power cut in the step after `steps`, once the state of that step is on disk."""
+    train_step = trainer.train_step
+
+    def failing(loaded):
+        if trainer.step == steps:
+            raise RuntimeError("power cut")
+        return train_step(loaded)
+
+    trainer.train_step = failing
+    trainer.run(quiet=True)
+
+
+def test_an_unfinished_training_is_neither_overwritten_nor_resumed_by_another(recording, tmp_path):
+    out = tmp_path / "m.safetensors"
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(trainer_for(recording, out), 3)
+    with pytest.raises(CheckpointError, match="--resume"):
+        train(recording, out, TINY, quiet=True)
+    with pytest.raises(CheckpointError, match="another config"):
+        train(recording, out, with_training(TINY, learning_rate=1e-4), resume=True, quiet=True)
+    out.unlink()
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        train(recording, out, TINY, resume=True, quiet=True)
+
+
+def test_there_is_nothing_to_resume_without_a_state(recording, tmp_path):
+    with pytest.raises(CheckpointError, match="there is no"):
+        train(recording, tmp_path / "m.safetensors", TINY, resume=True, quiet=True)
+
+
+def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, tmp_path):
+    trainer = trainer_for(
+        recording, tmp_path / "m.safetensors", with_training(TINY, iterations=1000, validate_every=900)
+    )
+    train_step = trainer.train_step
+
+    def interrupted(loaded):
+        if trainer.step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return train_step(loaded)
+
+    trainer.train_step = interrupted
+    with pytest.raises(Interrupted, match="stopped at step 2 of 1000"):
+        trainer.run(quiet=True)
+    assert load_checkpoint(tmp_path / "m.safetensors").provenance["step"] == 2
+    assert state_path(tmp_path / "m.safetensors").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_frozen_towers_are_run_once_for_each_image_and_do_not_change(recording, tmp_path):
+    config = with_training(TINY, freeze_towers=True)
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
+    before = {name: value.clone() for name, value in trainer.matcher.photo_tower.state_dict().items()}
+    seen = []
+    trainer.matcher.photo_tower.register_forward_hook(lambda _, images, __: seen.append(len(images[0])))
+    trainer.run(quiet=True)
+    assert isinstance(trainer.features, FrozenFeatures)
+    assert same_weights(before, trainer.matcher.photo_tower.state_dict())
+    known = {photo for part in trainer.sampler.photos for photo in part} | set(trainer.validation.photos)
+    assert sum(seen) <= len(known)
+
+
+def test_frozen_batch_norm_keeps_its_running_statistics(recording):
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, tower="resnet18"))
+    matcher = Matcher(config.matcher)
+    before = matcher.photo_tower.bn1.running_mean.clone()
+    set_training_mode(matcher, dataclasses.replace(config.training, freeze_batch_norm=True))
+    matcher.photo_tower(torch.rand(2, 3, 32, 32))
+    assert torch.equal(before, matcher.photo_tower.bn1.running_mean)
+    set_training_mode(matcher, config.training)
+    matcher.photo_tower(torch.rand(2, 3, 32, 32))
+    assert not torch.equal(before, matcher.photo_tower.bn1.running_mean)
+
+
+def test_training_takes_the_number_of_fingers_from_the_recording(model):
+    assert load_checkpoint(model).config.matcher.fingers == 2
+
+
+def test_a_background_policy_needs_frames_of_the_untouched_gel(recording, tmp_path):
+    grasps = [dataclasses.replace(grasp, backgrounds=()) for grasp in load_grasps(recording)]
+    config = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, background="difference"))
+    split = make_split(grasps, validation=0.25, test=0.2, seed=0)
+    with pytest.raises(DatasetError, match="no-contact frame for each finger"):
+        Trainer(config, split, grasps, tmp_path / "m.safetensors", source="test").run(quiet=True)
+    train(recording, tmp_path / "n.safetensors", with_training(config, iterations=1), quiet=True)
+
+
+def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("retrieval.encode.has_fast_bfloat16", lambda device: False)
+    with pytest.raises(ConfigError, match="bfloat16 needs hardware"):
+        train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
+
+
+def test_a_training_that_diverges_says_so_and_writes_nothing(recording, tmp_path):
+    from retrieval.errors import NumericalError
+
+    trainer = trainer_for(recording, tmp_path / "m.safetensors")
+    with torch.no_grad():
+        trainer.matcher.head.out.bias.fill_(torch.nan)
+    with pytest.raises(NumericalError, match="lower learning_rate"):
+        trainer.run(quiet=True)
+    assert not (tmp_path / "m.safetensors").exists()
+
+
+GRADIENTS = """
+import sys, torch
+from pathlib import Path
+from retrieval import distributed
+from retrieval.batches import TrainedFeatures
+from retrieval.dataset import PairSampler, load_grasps
+from retrieval.losses import contrastive_loss
+from retrieval.train import batch_loss, build_matcher, set_training_mode
+from tests.conftest import TINY
+
+torch.set_num_threads(1)
+distributed.start()
+torch.manual_seed(0)
+matcher = build_matcher(TINY)
+set_training_mode(matcher, TINY.training)
+with TrainedFeatures(TINY, torch.device("cpu")) as source:
+    loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
+    torch.manual_seed(1)
+    if sys.argv[3] == "local":  # the naive way: every rank's loss over its own share of the images
+        rows = torch.tensor(distributed.share(len(loaded.batch.photos)))
+        touch = matcher.touch_code(matcher.touch_features(loaded.touches)).embedding
+        photo = matcher.photo_code(matcher.photo_features(loaded.photos)).embedding
+        touches = torch.tensor(distributed.share(len(loaded.batch.grasps)))
+        labels = torch.from_numpy(loaded.batch.touch_objects)[touches], torch.from_numpy(loaded.batch.photo_objects)[rows]
+        loss = contrastive_loss(touch, photo, *labels, matcher.log_scale)
+    elif sys.argv[3] == "contrast":
+        touch, photo = source.train_features(matcher, loaded)
+        labels = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
+        loss = contrastive_loss(
+            matcher.touch_code(touch).embedding, matcher.photo_code(photo).embedding, *labels, matcher.log_scale
+        )
+    else:
+        loss, _ = batch_loss(matcher, TINY.training, loaded.batch, *source.train_features(matcher, loaded))
+loss.backward()
+distributed.average_gradients(matcher)
+if distributed.rank() == 0:
+    torch.save({name: value.grad for name, value in matcher.named_parameters() if value.grad is not None}, sys.argv[2])
+distributed.stop()
+"""
+
+
+def gradients(recording, tmp_path, ranks, loss):
+    """Gradients of one batch, reckoned by so many ranks."""
+    script, out = tmp_path / "gradients.py", tmp_path / f"{loss}{ranks}.pt"
+    script.write_text(GRADIENTS)
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *torchrun, str(script), str(recording), str(out), loss]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    return torch.load(out, weights_only=True)
+
+
+def difference(ours, reference):
+    """Largest difference of a gradient, relative to the largest gradient."""
+    scale = max(float(value.abs().max()) for value in reference.values())
+    return max(float((ours[name] - reference[name]).abs().max()) for name in reference) / scale
+
+
+def test_two_ranks_have_the_gradient_of_one_process(recording, tmp_path):
+    one, two = (gradients(recording, tmp_path, ranks, "all") for ranks in (1, 2))
+    assert difference(two, one) < 1e-5  # float32, summed in another order
+
+
+def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, tmp_path):
+    reference = gradients(recording, tmp_path, 1, "contrast")
+    assert difference(gradients(recording, tmp_path, 2, "contrast"), reference) < 1e-5
+    assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
+
+
+def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_path):
+    """SIGKILL by the system, through the command line."""
+    out = tmp_path / "m.safetensors"
+    config = tmp_path / "tiny.toml"
+    config.write_text(
+        '[matcher]\ntower = "small"\ntower_output = "pooled"\nhidden = 16\nembedding_dim = 8\nstandardise = true\n'
+        '[training]\ninit = "random"\niterations = 40\ntouches_per_batch = 2\nvalidate_every = 5\n'
+        "validation_fraction = 0.25\ncontrastive_weight = 1.0\n[preprocessing]\ntouch_px = 32\nphoto_px = 32\n"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "retrieval.cli",
+        "train",
+        str(recording),
+        "--out",
+        str(out),
+        "--config",
+        str(config),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 120
+        while not state_path(out).exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.kill()
+        process.communicate()
+    assert state_path(out).exists()
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert load_checkpoint(out).provenance["step"] > 0
