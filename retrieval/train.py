@@ -106,6 +106,7 @@ class Trainer:
         self.validation = self._sampler("validation", grasps).every_touch() if split.validation else None
         features = FrozenFeatures if settings.freeze_towers else TrainedFeatures
         self.features: FeatureSource = features(config, self.device)
+        set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
 
     def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
@@ -278,14 +279,16 @@ def build_matcher(config: Config) -> Matcher:
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
-    """Training mode; what is frozen keeps evaluation mode, so that its running statistics stand still."""
-    matcher.train()
+    """Training mode; what is frozen stays in evaluation mode, so that its running statistics stand still.
+
+    Frozen towers are never switched, not even for a moment: another thread may be encoding with them.
+    """
+    towers = (matcher.touch_tower, matcher.photo_tower)
+    for part in matcher.children():
+        part.train(not (settings.freeze_towers and part in towers))
     for module in matcher.modules():
         if settings.freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
-    if settings.freeze_towers:
-        matcher.touch_tower.eval()
-        matcher.photo_tower.eval()
 
 
 def batch_loss(

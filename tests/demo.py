@@ -134,9 +134,7 @@ def score_shipped(arguments: argparse.Namespace) -> int:
     print("| test | value | 95 % interval (objects resampled) | chance |\n|---|---|---|---|")
     print(f"| pair accuracy | {by_object(right, touched)} | 0.50 |")
     for k in (5, 10):
-        guesses = [
-            guess_curve(line[own], np.delete(line, own), k)[0] for line, own in zip(table, owner, strict=True)
-        ]
+        guesses = [guess_curve(line[own], np.delete(line, own), k)[0] for line, own in zip(table, owner, strict=True)]
         print(f"| K={k}, first guess | {by_object(np.array(guesses), owner)} | {1 / k:.2f} |")
     print(f"\n{len(names)} objects that were never trained on, {arguments.grasps} touches each, one photo an object.")
     return 0

@@ -52,7 +52,8 @@ def test_every_retrieve_command_of_the_readme_runs(home):
 
 def test_the_two_make_commands_exist_and_the_first_lines_name_them():
     for line in commands("make"):
-        assert subprocess.run(["make", "-n", *line[1:]], cwd=ROOT, capture_output=True, check=False).returncode == 0, line
+        dry = subprocess.run(["make", "-n", *line[1:]], cwd=ROOT, capture_output=True, check=False)
+        assert dry.returncode == 0, line
     assert [line[1] for line in commands("make")][:2] == ["demo", "test"]
 
 

@@ -150,6 +150,8 @@ def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, 
 
 def test_frozen_towers_are_run_once_for_each_image_and_do_not_change(recording, tmp_path):
     config = with_training(TINY, freeze_towers=True)
+    # ResNet-18 has batch statistics, which would move if a tower were ever in training mode.
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, tower="resnet18"))
     trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
     before = {name: value.clone() for name, value in trainer.matcher.photo_tower.state_dict().items()}
     seen = []
@@ -226,7 +228,10 @@ with TrainedFeatures(TINY, torch.device("cpu")) as source:
         touch = matcher.touch_code(matcher.touch_features(loaded.touches)).embedding
         photo = matcher.photo_code(matcher.photo_features(loaded.photos)).embedding
         touches = torch.tensor(distributed.share(len(loaded.batch.grasps)))
-        labels = torch.from_numpy(loaded.batch.touch_objects)[touches], torch.from_numpy(loaded.batch.photo_objects)[rows]
+        touch_objects, photo_objects = (
+            torch.from_numpy(labels) for labels in (loaded.batch.touch_objects, loaded.batch.photo_objects)
+        )
+        labels = touch_objects[touches], photo_objects[rows]
         loss = contrastive_loss(touch, photo, *labels, matcher.log_scale)
     elif sys.argv[3] == "contrast":
         touch, photo = source.train_features(matcher, loaded)

@@ -1,0 +1,60 @@
+"""Building an index from JPEG files end to end, against the bare photo tower on images that are ready."""
+
+import tempfile
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import cv2
+import torch
+
+from retrieval.build import BATCH, build_index
+from retrieval.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.config import Config
+from retrieval.encode import to_batch
+from tests import synthetic
+from tests.benchmarks.common import Line, as_text, in_turns, matcher_of
+
+PHOTOS = {"small": 256}
+DRAWN = 16
+
+
+def measure(config: Config, photos: int | None = None, photo_px: int = 512, repetitions: int = 3) -> Iterator[Line]:
+    """One line. Files: `photos` JPEG of `photo_px` x `photo_px` pixels, of `DRAWN` different pictures."""
+    number = photos or PHOTOS.get(config.matcher.tower, 64)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        catalogue = _write_catalogue(folder / "catalog", number, photo_px)
+        provenance = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
+        model, matcher = folder / "random.safetensors", matcher_of(config)
+        save_checkpoint(model, matcher, config, split=None, calibration=None, provenance=provenance)
+        checkpoint, fresh = load_checkpoint(model), count()
+        images = [config.preprocessing.load_photo(path) for path in sorted(catalogue.rglob("*.jpg"))]
+        ready = [to_batch(images[start : start + BATCH]) for start in range(0, number, BATCH)]
+
+        @torch.inference_mode()
+        def bare() -> None:
+            for batch in ready:
+                matcher.photo_features(batch)
+
+        def build() -> None:
+            build_index(catalogue, checkpoint, folder / f"index{next(fresh)}", quiet=True)
+
+        times = in_turns({"build": build, "bare": bare}, repetitions)
+    ours, other, ratio = number / times.median("build"), number / times.median("bare"), times.ratio("build", "bare")
+    yield Line(
+        "build",
+        config.matcher.tower,
+        f"{ours:.3g} photos per second end to end ({number} JPEG files of {photo_px} px), {other:.3g} through the bare "
+        f"tower: the build takes {as_text(ratio)} as long",
+        {"photos": number, "build_per_s": ours, "bare_per_s": other, "ratio": ratio[0]},
+    )
+
+
+def _write_catalogue(folder: Path, photos: int, px: int) -> Path:
+    drawn = [synthetic.draw_photo(synthetic.make_object(seed), 0, px) for seed in range(min(DRAWN, photos))]
+    for number in range(photos):
+        path = folder / f"object{number % 16:02}" / f"{number}.jpg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), drawn[number % len(drawn)][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    return folder

@@ -1,0 +1,86 @@
+"""What every benchmark shares: models with random weights, random images, and arms timed in turns."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from retrieval.config import Config, load_config
+from retrieval.fusion import Matcher
+
+REPETITIONS = 5
+
+
+@dataclass(frozen=True)
+class Line:
+    """One result: a sentence for people, and its figures."""
+
+    benchmark: str
+    tower: str
+    text: str
+    figures: dict[str, float]
+
+    def __str__(self) -> str:
+        return f"{self.benchmark}, {self.tower}: {self.text}"
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of each arm in each repetition."""
+
+    seconds: dict[str, list[float]]
+
+    def median(self, arm: str) -> float:
+        """Median seconds of an arm."""
+        return float(np.median(self.seconds[arm]))
+
+    def ratio(self, slow: str, fast: str, scale: float = 1.0) -> tuple[float, float, float]:
+        """How many times longer `slow` took: by the medians, and the least and most of single repetitions."""
+        each = scale * np.array(self.seconds[slow]) / np.array(self.seconds[fast])
+        return scale * self.median(slow) / self.median(fast), float(each.min()), float(each.max())
+
+
+def in_turns(arms: Mapping[str, Callable[[], object]], repetitions: int) -> Times:
+    """Run every arm once unmeasured, then all of them in turn, `repetitions` times."""
+    seconds: dict[str, list[float]] = {name: [] for name in arms}
+    for repetition in range(repetitions + 1):
+        for name, arm in arms.items():
+            start = time.perf_counter()
+            arm()
+            if repetition:
+                seconds[name].append(time.perf_counter() - start)
+    return Times(seconds)
+
+
+def config_of(tower: str) -> Config:
+    """The preset `small` for the tower of that name, else the paper's with another tower; first weights random."""
+    config = load_config("small" if tower == "small" else "paper")
+    return dataclasses.replace(
+        config,
+        matcher=dataclasses.replace(config.matcher, tower=tower),
+        training=dataclasses.replace(config.training, init="random"),
+    )
+
+
+def matcher_of(config: Config) -> Matcher:
+    """A matcher with random weights, in evaluation mode."""
+    torch.manual_seed(0)
+    return Matcher(config.matcher).eval()
+
+
+def random_images(count: int, px: int, seed: int) -> list[np.ndarray]:
+    """Images (px, px, 3) float32 in 0..1."""
+    return list(np.random.default_rng(seed).random((count, px, px, 3), dtype=np.float32))
+
+
+def as_text(ratio: tuple[float, float, float]) -> str:
+    """The ratio, and its range over the repetitions."""
+    return "{:.3g} times ({:.3g} to {:.3g})".format(*ratio)
+
+
+def duration(seconds: float) -> str:
+    """Seconds or milliseconds with three digits."""
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"

@@ -1,0 +1,55 @@
+"""The benchmarks run, at sizes that say nothing about time."""
+
+import json
+import sys
+
+import pytest
+
+from tests.benchmarks import __main__ as program
+from tests.benchmarks import build, rerank, step
+from tests.benchmarks.common import config_of, in_turns
+from tests.conftest import TINY
+
+SMALLEST = {
+    "rerank": (rerank.measure, {"candidates": (3, 40), "sample": 5, "repetitions": 1}, 2),
+    "build": (build.measure, {"photos": 3, "photo_px": 64, "repetitions": 1}, 1),
+    "step": (step.measure, {"touches": 2, "photos_each": 2, "repetitions": 1}, 1),
+}
+
+
+def test_every_benchmark_has_a_smallest_case():
+    assert set(SMALLEST) == set(program.BENCHMARKS)
+
+
+@pytest.mark.parametrize("name", sorted(SMALLEST))
+def test_a_benchmark_gives_its_lines(name):
+    measure, sizes, count = SMALLEST[name]
+    lines = list(measure(TINY, **sizes))
+    assert len(lines) == count
+    for line in lines:
+        assert str(line).startswith(f"{name}, small: ")
+        assert all(value > 0 for value in line.figures.values())
+        json.dumps(line.figures, allow_nan=False)
+
+
+def test_the_arms_take_turns_and_the_first_round_is_not_measured():
+    order = []
+    times = in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
+    assert order == ["a", "b"] * 3
+    assert [len(seconds) for seconds in times.seconds.values()] == [2, 2]
+    low, high = sorted(times.seconds["a"][n] / times.seconds["b"][n] for n in range(2))
+    assert times.ratio("a", "b")[1:] == (low, high)
+
+
+def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
+    monkeypatch.setattr(program, "BENCHMARKS", {"step": lambda config: step.measure(TINY, 2, 2, 1)})
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "--tower", "small", "resnet18", "--only", "step", "--json"])
+    program.main()
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["benchmark"] for line in lines] == ["step", "step"]
+
+
+def test_the_presets_are_those_that_users_train_with():
+    assert config_of("small").preprocessing.photo_px == 128
+    paper = config_of("resnet18")
+    assert (paper.matcher.tower, paper.matcher.hidden, paper.preprocessing.photo_px) == ("resnet18", 1024, 256)
