@@ -120,16 +120,16 @@ def score_fold(outcomes: dict[str, Any], grasps: list[Grasp], scores: NDArray[np
         chosen = [grasps[row] for row in rows]
         table = scores[np.ix_(rows, rows)]
         kept = outcomes.setdefault(name, {"pair": [], **{f"K={k}": [] for k in KS}, **{f"curve{k}": [] for k in KS}})
-        kept["pair"] += pair_outcomes(chosen, table, seed)
+        kept["pair"] += pair_outcomes(chosen, table, seed, rng)
         for row in range(len(rows)):
             others = np.delete(table[row], row)
             for k in KS:
                 rivals = rng.choice(others, k - 1, replace=False)
-                kept[f"K={k}"].append(int(table[row, row] > rivals.max()))
+                kept[f"K={k}"].append(settled(guess_curve(float(table[row, row]), rivals, k)[0], rng))
                 kept[f"curve{k}"].append(guess_curve(float(table[row, row]), others, k).tolist())
 
 
-def pair_outcomes(grasps: list[Grasp], table: NDArray[np.float32], seed: int) -> list[int]:
+def pair_outcomes(grasps: list[Grasp], table: NDArray[np.float32], seed: int, rng: np.random.Generator) -> list[int]:
     """One true and one false pair for each touch: 1 where the logit is on the right side of 0."""
     sampler = PairSampler(grasps, seed=seed, positives=1, negatives=1)
     pairs = sampler.every_touch()
@@ -138,8 +138,13 @@ def pair_outcomes(grasps: list[Grasp], table: NDArray[np.float32], seed: int) ->
     outcomes = []
     for touch, photo, label in zip(pairs.touch_index, pairs.photo_index, pairs.labels, strict=True):
         logit = table[line[pairs.grasps[touch].grasp_id], column[pairs.photos[photo]]]
-        outcomes.append(int(pair_accuracy(np.array([logit, -logit]), np.array([label, 1 - label])) == 1.0))
+        outcomes.append(settled(pair_accuracy(np.array([logit, -logit]), np.array([label, 1 - label])), rng))
     return outcomes
+
+
+def settled(chance: float, rng: np.random.Generator) -> int:
+    """1 or 0; equals are settled by a draw, so that a constant scorer is at chance."""
+    return int(chance) if chance in (0.0, 1.0) else int(rng.random() < chance)
 
 
 def name_the_billet(grasps: list[Grasp]) -> dict[str, Any]:

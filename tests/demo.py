@@ -38,11 +38,13 @@ SEED_SCORED = 60
 GRASPS = 3
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Run one of the two jobs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     jobs = parser.add_subparsers(dest="job", required=True)
-    jobs.add_parser("demo", help="the main job from end to end")
+    demo = jobs.add_parser("demo", help="the main job from end to end")
+    demo.add_argument("--objects", type=int, default=200)
+    demo.add_argument("--iterations", type=int, default=250)
     ship = jobs.add_parser("ship", help="train the checkpoint that comes with the package")
     ship.add_argument("out", type=Path)
     ship.add_argument("--objects", type=int, default=520)
@@ -51,7 +53,7 @@ def main() -> int:
     score = jobs.add_parser("score", help="judge that checkpoint on other drawn objects")
     score.add_argument("--objects", type=int, default=100)
     score.add_argument("--grasps", type=int, default=6)
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     run = {"demo": run_demo, "ship": train_shipped, "score": score_shipped}[arguments.job]
     return run(arguments)
 
@@ -59,9 +61,9 @@ def main() -> int:
 def run_demo(arguments: argparse.Namespace) -> int:
     """Draw, train, index, query; stops at the first command that fails."""
     say("These are drawn test pictures (tests/synthetic.py), not a simulation of contact and not real touches.")
-    unseen = draw_once()
+    unseen = draw_once(arguments.objects)
     model, index, page = FOLDER / "model.safetensors", FOLDER / "index", FOLDER / "query.html"
-    train = ("train", FOLDER / "recording", "--out", model, "--config", "small", "--iterations", "250")
+    train = ("train", FOLDER / "recording", "--out", model, "--config", "small", "--iterations", arguments.iterations)
     steps = [] if model.exists() else [train]
     steps.append(("build-index", FOLDER / "catalog", "--model", model, "--out", index))
     touches = synthetic.write_queries(FOLDER / "touches", unseen, touches_per_object=GRASPS)
@@ -78,13 +80,13 @@ def run_demo(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def draw_once() -> list[synthetic.DrawnObject]:
+def draw_once(objects: int) -> list[synthetic.DrawnObject]:
     """Draw what is not there yet; returns the catalogue's objects, which the recording does not hold."""
     unseen = synthetic.make_objects(20, seed=SEED_UNSEEN)
     if not (FOLDER / "model.safetensors").exists():
-        say("drawing a recording: 200 objects, 4 grasps each")
+        say(f"drawing a recording: {objects} objects, 4 grasps each")
         shutil.rmtree(FOLDER, ignore_errors=True)
-        synthetic.write_recording(FOLDER / "recording", synthetic.make_objects(200), 4, before=False)
+        synthetic.write_recording(FOLDER / "recording", synthetic.make_objects(objects), 4, before=False)
     if not (FOLDER / "catalog").exists():
         say("drawing a catalogue: 20 other objects, 3 photos each")
         synthetic.write_catalogue(FOLDER / "catalog", unseen)

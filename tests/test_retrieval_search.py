@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from indexes.generation import Generation
 from retrieval import defaults
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.encode import touch_batch
+from retrieval.encode import to_batch, touch_batch
 from retrieval.errors import BadInput, CheckpointError, ImageError
 from retrieval.search import Searcher
 from tests import synthetic
@@ -70,17 +71,19 @@ def variant(model, path, **changes):
     return load_checkpoint(path)
 
 
-@torch.inference_mode()
-def oracle(checkpoint, touches, catalogue):
-    """{photo path: sum of match logits}: the full network on every touch with every photo, one pair at a time."""
-    preprocessing, logits = checkpoint.config.preprocessing, {}
-    for path in sorted(catalogue.rglob("*.jpg")):
-        photo = torch.from_numpy(preprocessing.load_photo(path)).permute(2, 0, 1)[None]
-        total = 0.0
-        for touch in touches:
-            total += float(checkpoint.matcher(touch_batch([[preprocessing.load_touch(file) for file in touch]]), photo))
-        logits[path.relative_to(catalogue).as_posix()] = total
-    return logits
+@pytest.fixture(scope="module")
+def oracle(searcher, catalogue):
+    """Touches -> {photo path: sum of match logits}: the full network on every touch with every photo, pair by pair."""
+    matcher, pre = searcher.checkpoint.matcher, searcher.checkpoint.config.preprocessing
+    photos = {path.relative_to(catalogue).as_posix(): pre.load_photo(path) for path in catalogue.rglob("*.jpg")}
+
+    @cache
+    @torch.inference_mode()
+    def of_touch(touch):
+        images = touch_batch([[pre.load_touch(file) for file in touch]])
+        return {name: float(matcher(images, to_batch([photo]))) for name, photo in photos.items()}
+
+    return lambda touches: {name: sum(of_touch(touch)[name] for touch in touches) for name in photos}
 
 
 def best_by_object(logits):
@@ -105,9 +108,9 @@ def half_tolerance(searcher, grasps):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, searcher, grasps, catalogue):
+def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, searcher, grasps, oracle):
     touches = grasps[:count]
-    expected = oracle(searcher.checkpoint, touches, catalogue)
+    expected = oracle(touches)
     result = searcher.query(touches)
     tolerance = half_tolerance(searcher, count)
     assert tolerance < 0.01
@@ -122,9 +125,9 @@ def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, searcher, 
         assert expected[photo] == pytest.approx(logit, abs=2 * tolerance)
 
 
-def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, grasps, catalogue, monkeypatch):
+def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, grasps, oracle, catalogue, monkeypatch):
     """The rounding taken away, what is left is ranking: no tie, no tolerance."""
-    expected = best_by_object(oracle(searcher.checkpoint, grasps[:1], catalogue))
+    expected = best_by_object(oracle(grasps[:1]))
     logits = np.array([logit for _, _, logit in expected])
     assert np.diff(-logits).min() > 1e-6  # the drawn pictures give no near ties
     checkpoint, rows = searcher.checkpoint, searcher.generation.rows
@@ -259,7 +262,7 @@ def test_the_classifier_judges_at_least_as_many_photos_as_objects_are_wanted(sea
 
 
 @torch.inference_mode()
-def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, grasps, catalogue):
+def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, grasps, oracle):
     """Two plain loops: the 5 best inner products of each grasp, then the full network on their union."""
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, near = checkpoint.config.preprocessing.load_touch, set()
@@ -267,7 +270,7 @@ def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, grasps, c
         touch = checkpoint.matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
         products = generation.embeddings[generation.slots] @ checkpoint.matcher.touch_code(touch).embedding[0].numpy()
         near |= {generation.rows[row]["path"] for row in np.argsort(-products)[:5]}
-    logits = oracle(checkpoint, grasps, catalogue)
+    logits = oracle(grasps)
     expected = best_by_object({photo: logits[photo] for photo in near})
     result = searcher.query(grasps, candidates=5, top=5)
     assert result.index["scored"] == len(near) < 24
