@@ -3,7 +3,7 @@
     python -m tests.billets --data BILLETS --weights MOBILENET.pt --out FOLDER
 
 Nine billets, sixteen places each; a place has one touch (one finger) and one photo. Every welded billet is held out
-once, with one ground billet: trained on the other seven (two of them choose the checkpoint), indexed and scored. The
+once, with one ground billet: of the other seven, five train and two choose the checkpoint. Then all is scored. The
 same is done with touches of which nothing is left but an 8 x 6 blurred colour thumbnail: what that control reaches is
 lighting and gel drift of the capture, or coarse shape, and no sense of touch. Writes report.md and results.json.
 """

@@ -2,12 +2,12 @@
 
 import json
 import sys
+import time
 
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import build, rerank, step
-from tests.benchmarks.common import config_of, in_turns
+from tests.benchmarks import build, common, rerank, step
 from tests.conftest import TINY
 
 SMALLEST = {
@@ -22,7 +22,8 @@ def test_every_benchmark_has_a_smallest_case():
 
 
 @pytest.mark.parametrize("name", sorted(SMALLEST))
-def test_a_benchmark_gives_its_lines(name):
+def test_a_benchmark_gives_its_lines(name, monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
     measure, sizes, count = SMALLEST[name]
     lines = list(measure(TINY, **sizes))
     assert len(lines) == count
@@ -32,13 +33,25 @@ def test_a_benchmark_gives_its_lines(name):
         json.dumps(line.figures, allow_nan=False)
 
 
-def test_the_arms_take_turns_and_the_first_round_is_not_measured():
+def test_the_arms_take_turns_and_the_first_round_is_not_measured(monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
     order = []
-    times = in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
+    times = common.in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
     assert order == ["a", "b"] * 3
-    assert [len(seconds) for seconds in times.seconds.values()] == [2, 2]
     low, high = sorted(times.seconds["a"][n] / times.seconds["b"][n] for n in range(2))
     assert times.ratio("a", "b")[1:] == (low, high)
+
+
+def test_a_short_arm_is_called_until_its_time_can_be_told():
+    calls = {"short": 0, "long": 0}
+
+    def arm(name, seconds):
+        calls[name] += 1
+        time.sleep(seconds)
+
+    common.in_turns({"short": lambda: arm("short", 0.002), "long": lambda: arm("long", 0.25)}, 1)
+    assert calls["long"] == 2
+    assert 10 < calls["short"] <= 101
 
 
 def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
@@ -50,6 +63,6 @@ def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
 
 
 def test_the_presets_are_those_that_users_train_with():
-    assert config_of("small").preprocessing.photo_px == 128
-    paper = config_of("resnet18")
+    assert common.config_of("small").preprocessing.photo_px == 128
+    paper = common.config_of("resnet18")
     assert (paper.matcher.tower, paper.matcher.hidden, paper.preprocessing.photo_px) == ("resnet18", 1024, 256)

@@ -24,15 +24,21 @@ def clustered(count: int, dim: int, centres: int, seed: int = 0) -> np.ndarray:
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 
+def naive_wrong_hits(seed):
+    """Share of wrong hits of plain HNSW over 200 copies of twenty vectors."""
+    distinct = unit(20, 32, seed)
+    faiss.omp_set_num_threads(1)  # the same graph every time
+    naive = faiss.IndexHNSWFlat(32, 32, faiss.METRIC_INNER_PRODUCT)
+    naive.add(np.tile(distinct, (200, 1)))
+    return (naive.search(distinct, 20)[1] % 20 != np.arange(20)[:, None]).mean()
+
+
 def test_a_thousand_copies_of_twenty_vectors_lose_naive_hnsw_and_not_ours(tmp_path):
+    # Which graphs go wrong depends on the version of FAISS; that some do, does not.
+    assert max(naive_wrong_hits(seed) for seed in range(8)) > 0.02
+
     distinct = unit(20, 32)
     copies = np.tile(distinct, (1000, 1))
-    naive = faiss.IndexHNSWFlat(32, 32, faiss.METRIC_INNER_PRODUCT)
-    naive.add(copies[:4000])  # 200 copies each are enough for it to go wrong
-    found = naive.search(distinct, 20)[1]
-    wrong = (found % 20 != np.arange(20)[:, None]).mean()
-    assert wrong > 0.02
-
     rows = [{"id": f"{number:05d}"} for number in range(len(copies))]
     store = IndexStore(tmp_path / "index")
     ours = store.write(rows, copies, fingerprint={}, kind="hnsw", threads=1)

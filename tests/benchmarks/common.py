@@ -12,6 +12,7 @@ from retrieval.config import Config, load_config
 from retrieval.fusion import Matcher
 
 REPETITIONS = 5
+LEAST_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -44,15 +45,23 @@ class Times:
 
 
 def in_turns(arms: Mapping[str, Callable[[], object]], repetitions: int) -> Times:
-    """Run every arm once unmeasured, then all of them in turn, `repetitions` times."""
+    """Run every arm once unmeasured, then all of them in turn, `repetitions` times.
+
+    A short arm is called again and again for about `LEAST_S` at its turn, and the mean of the calls is taken.
+    """
+    calls = {name: max(1, int(LEAST_S / _seconds(arm, 1))) for name, arm in arms.items()}
     seconds: dict[str, list[float]] = {name: [] for name in arms}
-    for repetition in range(repetitions + 1):
+    for _ in range(repetitions):
         for name, arm in arms.items():
-            start = time.perf_counter()
-            arm()
-            if repetition:
-                seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(_seconds(arm, calls[name]))
     return Times(seconds)
+
+
+def _seconds(arm: Callable[[], object], calls: int) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        arm()
+    return (time.perf_counter() - start) / calls
 
 
 def config_of(tower: str) -> Config:

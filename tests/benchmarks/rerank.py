@@ -14,7 +14,7 @@ BATCH = 16
 
 
 def measure(
-    config: Config, candidates: tuple[int, ...] = (100, 1000), sample: int = 32, repetitions: int = REPETITIONS
+    config: Config, candidates: tuple[int, ...] = (100, 1000), sample: int = BATCH, repetitions: int = REPETITIONS
 ) -> Iterator[Line]:
     """One line for each number of candidates. The whole network runs on `sample` pairs, and its time is scaled."""
     matcher, pre = matcher_of(config), config.preprocessing
