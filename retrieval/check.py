@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.dataset import Grasp, Split, load_grasps
-from retrieval.errors import ImageError
+from retrieval.errors import DatasetError, ImageError
 from retrieval.images import decode_rgb, read_bytes, resize
 from retrieval.progress import Bar
 
@@ -74,9 +74,28 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
             f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides: "
             f"{_some(leaking)}",
         )
-    absent = sorted({grasp.object_id for grasp in grasps} - set(part_of))
+    recorded = {grasp.object_id for grasp in grasps}
+    unknown = sorted(set(part_of) - recorded)
+    if unknown:
+        yield Finding(
+            "warning", "split-unknown", f"the split names {len(unknown)} object(s) not recorded: {_some(unknown)}"
+        )
+    absent = sorted(recorded - set(part_of))
     if absent:
         yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {_some(absent)}")
+
+
+def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
+    """Raise DatasetError for a split that leaks, or whose parts have too few objects in the recording for pairs."""
+    for finding in check_split(grasps, split):
+        if finding.severity == "error":
+            raise DatasetError(f"{finding.message}; every object and sequence must stand in one part of the split")
+    for part in ("train", "validation"):
+        count = len({grasp.object_id for grasp in split.select(grasps, part)})
+        if count < 2 and (part == "train" or split.validation):
+            raise DatasetError(
+                f"pairs need at least 2 objects in the {part} part of the split; the recording has {count} of them"
+            )
 
 
 def _look(path: Path) -> _Seen:

@@ -52,9 +52,8 @@ def save_checkpoint(
     calibration: Calibration | None,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write `path` and its model card (`path` with suffix .md) atomically. Raises CheckpointError for a name in .md."""
-    if path.suffix == ".md":
-        raise CheckpointError(f"{path} is where the model card goes; name the checkpoint {path.stem}.safetensors")
+    """Write `path` and its model card (`path` with suffix .md) atomically. Raises CheckpointError where it cannot."""
+    require_writable(path)
     header = {
         "config": config.to_dict(),
         "split": split.to_dict() if split else None,
@@ -64,6 +63,20 @@ def save_checkpoint(
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
     write_tensors(path, state, header)
     _write_atomically(path.with_suffix(".md"), _model_card(path.name, header).encode())
+
+
+def require_writable(path: Path) -> None:
+    """Raise CheckpointError where no checkpoint can be written to `path`; asked before hours are spent on one."""
+    if path.suffix == ".md":
+        raise CheckpointError(f"{path} is where the model card goes; name the checkpoint {path.stem}.safetensors")
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _beside(path).touch()
+        _beside(path).unlink()
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -161,8 +174,12 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
 def _write_atomically(path: Path, data: bytes) -> None:
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    beside = _beside(path)
     try:
         with beside.open("wb") as file:
             file.write(data)

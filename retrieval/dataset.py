@@ -145,7 +145,7 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
         raise DatasetError(
             f"a split into {len(wanted)} parts needs two objects in each, and objects that share a sequence stay "
             f"together; the recording has {total} objects in {len(groups)} such groups, and the shares part them into "
-            f"{' + '.join(str(len(part)) for part in wanted)}"
+            f"{' + '.join(str(len(part)) for part in wanted)}; record more objects, or give a split of your own"
         )
     return Split(seed=seed, train=train, **chosen)
 

@@ -53,6 +53,15 @@ def gather_rows(local: Tensor, count: int) -> Tensor:
     return torch.cat(list(all_gather(local)))[:count]  # type: ignore[no-untyped-call]
 
 
+def any_rank(flag: bool, device: torch.device) -> bool:
+    """Whether `flag` holds on any rank: one answer for all, and nobody gets it before everybody has asked."""
+    if world_size() == 1:
+        return flag
+    count = torch.tensor(float(flag), device=device)
+    dist.all_reduce(count)
+    return bool(count.item() > 0)
+
+
 def average_gradients(model: nn.Module) -> None:
     """Replace every gradient by its mean over the ranks."""
     if world_size() == 1:

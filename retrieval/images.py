@@ -121,7 +121,7 @@ def _check_pixels(size: tuple[int, int], name: str | Path) -> None:
     if width < 1 or height < 1:
         raise ImageError(name, f"has no pixels ({width} x {height})")
     if width * height > MAX_PIXELS:
-        raise ImageError(name, _too_large(f"{width} x {height} ="))
+        raise ImageError(name, _too_large(f"{width} x {height} = {width * height}"))
 
 
 def _too_large(size: str) -> str:

@@ -23,7 +23,15 @@ from torch import Tensor, nn
 from retrieval import distributed
 from retrieval.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.calibration import Calibration, fit_calibration, pair_accuracy, pair_auc
-from retrieval.checkpoint import Checkpoint, load_checkpoint, read_tensors, save_checkpoint, write_tensors
+from retrieval.check import require_fit
+from retrieval.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    read_tensors,
+    require_writable,
+    save_checkpoint,
+    write_tensors,
+)
 from retrieval.config import Config, TrainingConfig
 from retrieval.dataset import (
     Grasp,
@@ -72,6 +80,9 @@ def train(
         split = make_split(
             grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed
         )
+    else:
+        require_fit(split, grasps)
+    require_writable(out)
     trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
     if not resume and state_path(out).exists():
         raise CheckpointError(
@@ -134,9 +145,11 @@ class Trainer:
                 upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
                 result = self.train_step(loaded)
                 bar.advance(note=f"loss {result.loss:.3f}  accuracy {result.accuracy:.2f}{self._best_note()}")
-                if stop.is_set() or self.step % self.config.training.validate_every == 0 or self.step == total:
+                # All ranks stop after the same step: one that went on would wait for the others for ever.
+                stopped = distributed.any_rank(stop.is_set(), self.device)
+                if stopped or self.step % self.config.training.validate_every == 0 or self.step == total:
                     self._validate_and_save(finished=self.step == total)
-                if stop.is_set() and self.step < total:
+                if stopped and self.step < total:
                     raise Interrupted(
                         f"stopped at step {self.step} of {total}; {self.out} is usable, --resume goes on from here"
                     )
@@ -179,8 +192,11 @@ class Trainer:
         metrics, calibration = self.validate()
         better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
         self.best = max(self.best, metrics.get("validation_auc", -math.inf))
-        if distributed.rank():
-            return
+        if not distributed.rank():
+            self._save(metrics, calibration, better, finished)
+        distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
+
+    def _save(self, metrics: dict[str, float], calibration: Calibration | None, better: bool, finished: bool) -> None:
         if better:
             self._save_best(metrics, calibration)
         if finished:

@@ -23,7 +23,7 @@ def test_every_benchmark_has_a_smallest_case():
 
 @pytest.mark.parametrize("name", sorted(SMALLEST))
 def test_a_benchmark_gives_its_lines(name, monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "LEAST_S", 0.0)  # one call of each arm
     measure, sizes, count = SMALLEST[name]
     lines = list(measure(TINY, **sizes))
     assert len(lines) == count
@@ -55,6 +55,7 @@ def test_a_short_arm_is_called_until_its_time_can_be_told():
 
 
 def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
     monkeypatch.setattr(program, "BENCHMARKS", {"step": lambda config: step.measure(TINY, 2, 2, 1)})
     monkeypatch.setattr(sys, "argv", ["benchmarks", "--tower", "small", "resnet18", "--only", "step", "--json"])
     program.main()
