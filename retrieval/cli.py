@@ -8,8 +8,11 @@ import dataclasses
 import json
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,27 +26,62 @@ if TYPE_CHECKING:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
+    _replace_closed_streams()
     arguments = build_parser().parse_args(argv)
     logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING)
-    try:
-        arguments.run(arguments)
-        sys.stdout.flush()
-        return 0
-    except BrokenPipeError:  # the reader of stdout has left, as `| head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except KeyboardInterrupt:
+    with _noticed_interrupts() as interrupts:
+        try:
+            arguments.run(arguments)
+            sys.stdout.flush()
+            return 0
+        except BrokenPipeError:  # the reader of stdout has left, as `| head` does
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except KeyboardInterrupt:
+            return _fail(arguments, "stopped by Ctrl-C", 1)
+        except Exception as error:
+            if arguments.debug:
+                raise
+            return _explain(arguments, error, interrupted=bool(interrupts))
+
+
+def _explain(arguments: argparse.Namespace, error: Exception, interrupted: bool) -> int:
+    """Say what went wrong in one line; returns the exit code."""
+    code = getattr(error, "exit_code", None)  # every error tree of the project carries one
+    if code is not None:
+        return _fail(arguments, str(error), code)
+    if interrupted:
         return _fail(arguments, "stopped by Ctrl-C", 1)
-    except Exception as error:
-        code = getattr(error, "exit_code", None)  # every error tree of the project carries one
-        if arguments.debug:
-            raise
-        if code is not None:
-            return _fail(arguments, str(error), code)
-        if isinstance(error, OSError):
-            named = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
-            return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 2 if named else 1)
-        return _fail(arguments, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
+    if isinstance(error, OSError):
+        named = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
+        return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 2 if named else 1)
+    return _fail(arguments, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
+
+
+def _replace_closed_streams() -> None:
+    """A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+
+
+@contextmanager
+def _noticed_interrupts() -> Iterator[list[int]]:
+    """The Ctrl-C signals so far; each raises KeyboardInterrupt as usual. One that breaks off an import may come out as
+    another error: numpy.linalg half loaded raises RecursionError."""
+    seen: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield seen
+        return
+
+    def on_interrupt(number: int, frame: object) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _fail(arguments: argparse.Namespace, message: str, code: int) -> int:

@@ -6,6 +6,7 @@ process; with negatives from the own rank alone it would differ by half. Started
 """
 
 import os
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -48,9 +49,24 @@ def gather_rows(local: Tensor, count: int) -> Tensor:
     """All ranks' rows (count, d) from this rank's share (`share(count)`, d), with gradients to the other ranks."""
     if world_size() == 1:
         return local
-    from torch.distributed.nn.functional import all_gather
+    rows: Tensor = _Gather.apply(local)  # type: ignore[no-untyped-call]
+    return rows[:count]
 
-    return torch.cat(list(all_gather(local)))[:count]  # type: ignore[no-untyped-call]
+
+class _Gather(torch.autograd.Function):
+    """All ranks' rows; backward, the sum over ranks of the gradients of this rank's own rows."""
+
+    @staticmethod
+    def forward(ctx: Any, local: Tensor) -> Tensor:
+        parts = [torch.empty_like(local, memory_format=torch.contiguous_format) for _ in range(world_size())]
+        dist.all_gather(parts, local.contiguous())
+        return torch.cat(parts)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        total = gradient.clone(memory_format=torch.contiguous_format)
+        dist.all_reduce(total)
+        return total.chunk(world_size())[rank()]
 
 
 def any_rank(flag: bool, device: torch.device) -> bool:

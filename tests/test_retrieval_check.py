@@ -269,6 +269,12 @@ def test_an_object_that_the_split_leaves_out_is_a_warning(clean):
     assert found == ("warning", "split-absent", f"the split leaves out 1 object(s): {split.train[0]}")
 
 
+def test_an_object_of_the_split_that_was_not_recorded_is_a_warning(clean):
+    split = good_split(clean)
+    found = one(check_recording(clean, Split(0, (*split.train, "ghost"), split.validation, split.test), quiet=True))
+    assert found == ("warning", "split-unknown", "the split names 1 object(s) not recorded: ghost")
+
+
 def test_a_split_is_checked_without_a_look_at_the_pictures(broken):
     shutil.rmtree(broken.folder / "images")
     grasps = load_grasps(broken.folder)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -147,3 +148,28 @@ def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
     done = subprocess.run(f"{' '.join(query)} | true", shell=True, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "Broken pipe" not in done.stderr
+
+
+def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(workplace, model):
+    """Python's print falls back to stdout where stderr is closed."""
+    main(["build-index", "catalog/", "--model", str(model)])
+    query = f"{sys.executable} -m retrieval.cli query --gelsight a.png b.png --index index --json"
+    done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
+    assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)
+    assert subprocess.run(f"{query} >&- 2>&-", shell=True, check=False).returncode == 0
+
+
+def test_ctrl_c_that_comes_out_as_another_error_is_still_ctrl_c(monkeypatch, capsys):
+    """Breaking off the import of numpy.linalg ends in a RecursionError."""
+
+    def interrupted(*_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise RecursionError from None
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("retrieval.cli.run_check", interrupted)
+    assert main(["check", "recording"]) == 1
+    assert capsys.readouterr().err == "retrieve check: stopped by Ctrl-C\n"
+    assert signal.getsignal(signal.SIGINT) is before

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from retrieval.batches import FrozenFeatures, TrainedFeatures
-from retrieval.checkpoint import load_checkpoint
-from retrieval.dataset import PairSampler, load_grasps, make_split
+from retrieval.checkpoint import load_checkpoint, read_tensors
+from retrieval.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.fusion import Matcher
 from retrieval.losses import match_loss
@@ -278,15 +278,78 @@ def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, 
     assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
 
 
+TINY_TOML = """
+[matcher]
+tower = "small"
+tower_output = "pooled"
+hidden = 16
+embedding_dim = 8
+standardise = true
+[training]
+init = "random"
+iterations = 40
+touches_per_batch = 2
+validate_every = 30
+validation_fraction = 0.25
+contrastive_weight = 1.0
+[preprocessing]
+touch_px = 32
+photo_px = 32
+"""
+
+
+def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_path):
+    """A rank that left before the files are written, or that stopped at another step, would take the other down."""
+    out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
+    config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 100000"))
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*torchrun, "-m", "retrieval.cli", "train", str(recording), "--out", str(out), "--config", str(config)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not state_path(out).exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=120)
+    assert "--resume goes on from here" in said
+    stopped = read_tensors(state_path(out))[1]["step"]
+    assert stopped > 0
+    # A fresh and short one: nothing is there for a rank to read before the other has written it.
+    config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 2"))
+    state_path(out).unlink()
+    out.unlink()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    assert load_checkpoint(out).provenance["step"] == 2
+
+
+def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    bad = {
+        "shares 1 object": Split(0, tuple(names[:6]), tuple(names[5:9]), ()),
+        "2 objects in the train part.*has 0": Split(0, ("nothing", "known"), tuple(names), ()),
+        "2 objects in the validation part.*has 1": Split(0, tuple(names[:6]), (names[6], "unknown"), ()),
+    }
+    for message, split in bad.items():
+        with pytest.raises(DatasetError, match=message):
+            train(recording, tmp_path / "m.safetensors", TINY, split=split, quiet=True)
+
+
+@pytest.mark.parametrize("name", ["folder", "model.md", "file/model.safetensors"])
+def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(recording, tmp_path, monkeypatch, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(Trainer, "train_step", lambda *_: pytest.fail("trained"))
+    with pytest.raises(CheckpointError, match=r"is a folder; name the file|model card goes|cannot be written"):
+        train(recording, tmp_path / name, TINY, quiet=True)
+
+
 def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_path):
     """SIGKILL by the system, through the command line."""
     out = tmp_path / "m.safetensors"
     config = tmp_path / "tiny.toml"
-    config.write_text(
-        '[matcher]\ntower = "small"\ntower_output = "pooled"\nhidden = 16\nembedding_dim = 8\nstandardise = true\n'
-        '[training]\ninit = "random"\niterations = 40\ntouches_per_batch = 2\nvalidate_every = 5\n'
-        "validation_fraction = 0.25\ncontrastive_weight = 1.0\n[preprocessing]\ntouch_px = 32\nphoto_px = 32\n"
-    )
+    config.write_text(TINY_TOML.replace("validate_every = 30", "validate_every = 5"))
     command = [
         sys.executable,
         "-m",
