@@ -85,7 +85,8 @@ class Generation:
             got = self.fingerprint.get(key)
             if got != value:
                 raise MismatchedIndex(
-                    f"{self.folder.parent}: the index was made with {key} {got!r}, asked for is {value!r}; "
+                    f"{self.folder.parent}: the index was made with {key} {got and got[:12]!r}, "
+                    f"asked for is {value[:12]!r}; "
                     f"use what made it, or {AGAIN}"
                 )
 

@@ -51,11 +51,11 @@ class FeatureSource(Protocol):
 class BatchImages:
     """Loads the images of batches on threads of its own while the step before them is computed."""
 
-    def __init__(self, config: Config, device: torch.device, threads: int = 2) -> None:
+    def __init__(self, config: Config, device: torch.device, *, threads: int = 2, keep_bytes: int = 4 << 30) -> None:
         self.config, self.device = config, device
         self.uses_background = config.preprocessing.background != "none"
-        self._touch = ImageCache(config.preprocessing.load_touch)
-        self._photo = ImageCache(config.preprocessing.load_photo)
+        self._touch = ImageCache(config.preprocessing.load_touch, keep_bytes)
+        self._photo = ImageCache(config.preprocessing.load_photo, keep_bytes)
         self._ahead = ThreadPoolExecutor(1)
         self._threads = ThreadPoolExecutor(threads)
 
@@ -115,7 +115,7 @@ class FrozenFeatures(BatchImages):
     """Features of towers that stand still: each image is encoded the first time it is met, and never again."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
-        super().__init__(config, device)
+        super().__init__(config, device, keep_bytes=0)  # an image is read once: its features are kept
         self._kept: dict[str | Path, Tensor] = {}
 
     def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":

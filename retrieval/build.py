@@ -59,6 +59,11 @@ class BuildReport:
         """Plain dictionary for JSON."""
         return asdict(self)
 
+    def _measured(self) -> str:
+        if not self.recall["queries"]:
+            return ""  # exact by construction
+        return f" Recall@{self.recall['at']} against exact search: {self.recall['value']:.3f}, measured on this index."
+
     def lines(self) -> Iterator[str]:
         """The report for people."""
         rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
@@ -66,7 +71,7 @@ class BuildReport:
             f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
             f"{self.embedded} embedded, {self.reused} unchanged, {self.removed} removed{rate}"
         )
-        yield f"candidate search: {self.kind}. {self.reason}"
+        yield f"candidate search: {self.kind}. {self.reason}{self._measured()}"
         yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
         if self.ignored:
             yield f"{len(self.ignored)} file(s) ignored, not images by name: {', '.join(self.ignored[:5])}"
@@ -138,7 +143,7 @@ def build_index(
         reused=len(made.rows) - made.count,
         removed=sum(row["id"] not in kept for row in parent.rows) if parent else 0,
         skipped=made.skipped,
-        ignored=list(catalogue.ignored),
+        ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(out.resolve())],
         notes=list(catalogue.notes),
         kind=choice.kind,
         reason=" ".join(filter(None, (why, choice.reason))),

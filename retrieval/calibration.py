@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 from scipy.special import expit, log_expit
-from scipy.stats import rankdata
 
 from retrieval.errors import BadInput, NumericalError
 
@@ -95,6 +93,8 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
     its derivative by the slope grows with the slope. Bracketed roots are found at any scale and offset of the logits;
     a quasi-Newton search of both at once stops early at logits of 1000 +- 1.
     """
+    from scipy.optimize import brentq  # slow to import, and no query needs it
+
     positives, negatives = y.sum(), (1 - y).sum()
     targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
     # Both classes weigh the same, whatever their counts: the odds are even by definition.
@@ -135,6 +135,8 @@ def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
     """
     z, y = _checked(logits, labels)
     positives, negatives = y.sum(), (1 - y).sum()
+    from scipy.stats import rankdata  # slow to import, and no query needs it
+
     rank_sum = rankdata(z)[y == 1].sum()
     return float((rank_sum - positives * (positives + 1) / 2) / (positives * negatives))
 

@@ -52,7 +52,7 @@ def save_checkpoint(
     calibration: Calibration | None,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write `path` and its model card (`path` with suffix .md) atomically. Raises CheckpointError where it cannot."""
+    """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot."""
     require_writable(path)
     header = {
         "config": config.to_dict(),
@@ -62,7 +62,7 @@ def save_checkpoint(
     }
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
     write_tensors(path, state, header)
-    _write_atomically(path.with_suffix(".md"), _model_card(path.name, header).encode())
+    _write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
 
 
 def require_writable(path: Path) -> None:
@@ -77,6 +77,11 @@ def require_writable(path: Path) -> None:
         _beside(path).unlink()
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
+
+
+def beside(path: Path, ending: str) -> Path:
+    """The file that goes with a checkpoint: `model.safetensors` and ".md" give `model.md`, `v1.2` gives `v1.2.md`."""
+    return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -297,6 +297,7 @@ def run_query(arguments: argparse.Namespace) -> None:
     if arguments.html:
         from retrieval.report import query_html
 
+        arguments.html.parent.mkdir(parents=True, exist_ok=True)
         arguments.html.write_text(query_html(result, searcher.catalogue), "utf-8")
         _say(f"page: {arguments.html}")
     _say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")

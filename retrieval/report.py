@@ -30,7 +30,8 @@ def print_table(result: QueryResult) -> None:
         ("probability", "right"),
         ("logit", "right"),
     ):
-        table.add_column(title, justify=justify)  # type: ignore[arg-type]
+        # The object is the answer: folded where it is long, never cut.
+        table.add_column(title, justify=justify, no_wrap=title != "object", overflow="fold")  # type: ignore[arg-type]
     table.add_column("photo", overflow="fold")
     for match in result.results:
         probability = "-" if match.probability is None else f"{match.probability:.3f}"

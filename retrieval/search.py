@@ -78,7 +78,7 @@ class Searcher:
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
         Raises the errors of `indexes.store.IndexStore.open`, CheckpointError, and MismatchedIndex for another model.
         """
-        generation = IndexStore(index).open(verify=verify)
+        generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         checkpoint = load_checkpoint(Path(model) if model else _model_of(generation))
         generation.require(fingerprint(checkpoint))
         return cls(index, generation, checkpoint)

@@ -26,6 +26,7 @@ from retrieval.calibration import Calibration, fit_calibration, pair_accuracy, p
 from retrieval.check import require_fit
 from retrieval.checkpoint import (
     Checkpoint,
+    beside,
     load_checkpoint,
     read_tensors,
     require_writable,
@@ -54,7 +55,7 @@ from retrieval.towers.weights import initialise_tower
 
 def state_path(out: Path) -> Path:
     """Where an unfinished training of `out` keeps what it needs to go on."""
-    return out.with_suffix(".state.safetensors")
+    return beside(out, ".state.safetensors")
 
 
 def train(
