@@ -9,6 +9,7 @@ of contact and no measure of what the method does on real sensors.
 """
 
 import argparse
+import os
 import shutil
 import sys
 import tempfile
@@ -60,6 +61,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def run_demo(arguments: argparse.Namespace) -> int:
     """Draw, train, index, query; stops at the first command that fails."""
+    os.environ["XDG_STATE_HOME"] = str(FOLDER / "state")  # what users' own commands remember stays theirs
     say("These are drawn test pictures (tests/synthetic.py), not a simulation of contact and not real touches.")
     unseen = draw_once(arguments.objects)
     model, index, page = FOLDER / "model.safetensors", FOLDER / "index", FOLDER / "query.html"
