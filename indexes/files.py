@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from indexes.errors import RowError
 
-HASH_BLOCK_BYTES = 1 << 20
-
 
 @contextmanager
 def durable(path: Path) -> Iterator[BinaryIO]:
@@ -55,11 +53,8 @@ def remove_folder(folder: Path) -> None:
 
 def digest(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
-    total = hashlib.sha256()
     with path.open("rb") as handle:
-        while block := handle.read(HASH_BLOCK_BYTES):
-            total.update(block)
-    return total.hexdigest()
+        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def write_array(path: Path, dtype: Any, shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]) -> None:

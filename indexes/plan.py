@@ -122,13 +122,13 @@ def check_name(name: str) -> None:
 
 def lay_out(content: Content, kind: type[VectorIndex], asked: Parameters, seed: int) -> Plan:
     """Give every row a slot: equal vectors share one; the parent's structure is kept where that is sound."""
-    old = np.empty((0, content.fresh.shape[1]), np.float32)
-    inherited = 0 if content.parent is None else len(content.parent.embeddings)
-    if content.parent is not None:
-        old = content.parent.embeddings
+    if content.parent is None:
+        old, rows_before = np.empty((0, content.fresh.shape[1]), np.float32), np.empty(0, np.int64)
+    else:
+        old, rows_before = content.parent.embeddings, content.parent.slots
+    inherited = len(old)
     pool = np.concatenate([old, content.fresh])
     first = first_of_equals(pool)
-    rows_before = np.empty(0, np.int64) if content.parent is None else content.parent.slots
     position = np.where(content.origin < 0, inherited - 1 - content.origin, 0)
     reused = content.origin >= 0
     position[reused] = rows_before[content.origin[reused]]

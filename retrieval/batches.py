@@ -1,11 +1,10 @@
 """From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
 
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -25,27 +24,6 @@ class Loaded:
     batch: PairBatch
     touches: Tensor
     photos: Tensor
-
-
-class FeatureSource(Protocol):
-    """Where a training run gets the features of a batch from; a context manager that owns threads."""
-
-    def __init__(self, config: Config, device: torch.device) -> None: ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
-        """Start loading a batch on another thread."""
-
-    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
-        """Features of all distinct touches (T, F) and photos (N, F), with gradients where towers train."""
-
-    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """The same in evaluation mode, in batches, for any number of pairs."""
 
 
 class BatchImages:
@@ -125,21 +103,13 @@ class FrozenFeatures(BatchImages):
     @torch.inference_mode()
     def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
         new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._kept}
-        self._encode(
-            list(new.values()),
-            lambda part: touch_features(matcher, map(self.touch, part)),
-            lambda g: g.grasp_id,
-        )
+        if new:
+            self._kept.update(zip(new, touch_features(matcher, map(self.touch, new.values())), strict=True))
         photos = [path for path in batch.photos if path not in self._kept]
-        self._encode(photos, lambda part: photo_features(matcher, map(self.photo, part)), lambda path: path)
+        if photos:
+            self._kept.update(zip(photos, photo_features(matcher, map(self.photo, photos)), strict=True))
         touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
         return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
-
-    def _encode(
-        self, items: list[Any], encode: Callable[[list[Any]], Tensor], key: Callable[[Any], str | Path]
-    ) -> None:
-        if items:
-            self._kept.update(zip(map(key, items), encode(items), strict=True))
 
     def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
         """The features, as constants of the step."""
@@ -149,3 +119,7 @@ class FrozenFeatures(BatchImages):
         """The features of all pairs at once."""
         loaded = self.prepare(matcher, pairs).result()
         return loaded.touches, loaded.photos
+
+
+FeatureSource = TrainedFeatures | FrozenFeatures
+"""Where a training run gets the features of a batch from."""

@@ -17,10 +17,10 @@ from indexes.choice import Choice, choose_kind
 from indexes.errors import CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
 from indexes.generation import Generation
 from indexes.store import IndexStore
-from retrieval.catalogue import Catalogue, PhotoBytes, SkippedPhoto, list_catalogue, read_photos
+from retrieval.catalogue import Catalogue, PhotoBytes, SkippedPhoto, decode_photo, list_catalogue, read_photos
 from retrieval.checkpoint import Checkpoint
 from retrieval.encode import Image, batches, encode_photos
-from retrieval.errors import BadInput, DatasetError, ImageError, NumericalError
+from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.progress import Bar
 from retrieval.version import __version__
 
@@ -132,7 +132,7 @@ def build_index(
             parent=parent,
             software=__version__,
         )
-    kept = {row["id"] for row in made.rows}
+    kept, inside = {row["id"] for row in made.rows}, out.resolve()
     return BuildReport(
         index=str(out),
         generation=generation.name,
@@ -143,7 +143,7 @@ def build_index(
         reused=len(made.rows) - made.count,
         removed=sum(row["id"] not in kept for row in parent.rows) if parent else 0,
         skipped=made.skipped,
-        ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(out.resolve())],
+        ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(inside)],
         notes=list(catalogue.notes),
         kind=choice.kind,
         reason=" ".join(filter(None, (why, choice.reason))),
@@ -206,10 +206,10 @@ class _Embedded:
         row = _row(item)
         if self.parent is not None and self.parent.reusable({row["id"]: item.digest}):
             return _Prepared(row, None)
-        try:
-            return _Prepared(row, self.checkpoint.config.preprocessing.photo(item.decode()))
-        except ImageError as error:
-            return SkippedPhoto(item.photo.path, error.reason)
+        image = decode_photo(item)
+        if isinstance(image, SkippedPhoto):
+            return image
+        return _Prepared(row, self.checkpoint.config.preprocessing.photo(image))
 
     def add(self, part: Sequence[_Prepared | SkippedPhoto]) -> None:
         """Take the next photos, one batch for the tower."""

@@ -73,8 +73,8 @@ def require_writable(path: Path) -> None:
         raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _beside(path).touch()
-        _beside(path).unlink()
+        _temporary(path).touch()
+        _temporary(path).unlink()
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
 
@@ -179,20 +179,20 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _beside(path: Path) -> Path:
+def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
 def _write_atomically(path: Path, data: bytes) -> None:
-    beside = _beside(path)
+    temporary = _temporary(path)
     try:
-        with beside.open("wb") as file:
+        with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        beside.replace(path)
+        temporary.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _model_card(name: str, header: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
-from robot.recording import read_recording
+from robot.recording import read_info, read_recording
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def load_grasps(folder: Path) -> list[Grasp]:
 
 def recording_source(folder: Path) -> str:
     """What a recording says of where it comes from."""
-    return str(read_recording(folder).info["source"])
+    return str(read_info(folder)["source"])
 
 
 def finger_count(grasps: Sequence[Grasp]) -> int:

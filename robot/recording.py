@@ -63,7 +63,7 @@ def read_recording(folder: str | Path) -> Recording:
     Raises RecordingError with the file and line; half a last line, left by a crash, is dropped with a note.
     """
     root = Path(folder)
-    info = _read_info(root)
+    info = read_info(root)
     path = root / METADATA_FILE
     lines, torn = _whole_lines(_read(path))
     grasps: dict[str, RecordedGrasp] = {}
@@ -86,7 +86,8 @@ def read_recording(folder: str | Path) -> Recording:
     return Recording(root, info, tuple(grasps.values()), tuple(notes))
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def read_info(root: Path) -> dict[str, Any]:
+    """Read and check recording.json alone. Raises RecordingError."""
     path = root / INFO_FILE
     if not path.is_file():
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
