@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test test-lowest benchmark clean
 
 demo: $(VENV)/installed
-	$(BIN)/python -m tests.demo demo
+	$(BIN)/retrieve demo
 
 test: $(VENV)/installed
 	$(BIN)/ruff check .
@@ -35,5 +35,5 @@ $(VENV)/installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv --clear $(VENV)
 # PyTorch first and pinned: an unpinned one may bring gigabytes of CUDA libraries that the tests do not use.
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
-	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test]'
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,mesh,calibration]'
 	@touch $@

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 
 from retrieval.calibration import Calibration
 from retrieval.config import Config
@@ -87,6 +87,11 @@ def beside(path: Path, ending: str) -> Path:
 def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError with what is wrong and what to do."""
     state, header = read_tensors(path)
+    if "task" in header:
+        raise CheckpointError(
+            f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
+            "`retrieve train` makes matchers"
+        )
     lacking = [name for name in ("config", "split", "calibration", "provenance") if name not in header]
     if lacking:
         raise CheckpointError(
@@ -98,22 +103,22 @@ def load_checkpoint(path: Path) -> Checkpoint:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
         matcher = Matcher(config.matcher)
-        _load_weights(matcher, state)
+        load_weights(matcher, state)
     except BadInput as error:
         raise CheckpointError(f"{path} is not a checkpoint that this version can use: {error}") from error
     return Checkpoint(path, file_digest(path), matcher.eval(), config, split, calibration, header["provenance"])
 
 
-def _load_weights(matcher: Matcher, state: Mapping[str, Tensor]) -> None:
+def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
-    got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, matcher.state_dict()))
+    got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
     for name in sorted(got.keys() | wanted.keys()):
         if got.get(name) != wanted.get(name):
             raise CheckpointError(
                 f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
                 f"must be {wanted.get(name, 'absent')}"
             )
-    matcher.load_state_dict(state)
+    module.load_state_dict(state)
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:

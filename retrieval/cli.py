@@ -1,4 +1,4 @@
-"""The command line `retrieve`. Heavy packages are imported inside the command that needs them.
+"""The command line `retrieve`: what each command does. Heavy packages are imported inside the command that needs them.
 
 Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input.
 """
@@ -11,17 +11,19 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from retrieval.arguments import build_parser
 from retrieval.errors import BadInput, RetrievalError
-from retrieval.version import __version__
+from retrieval.progress import Bar
 
 if TYPE_CHECKING:
     from retrieval.config import Config
     from retrieval.dataset import Split
+    from robot.collect import Progress
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING)
     with _noticed_interrupts() as interrupts:
         try:
-            arguments.run(arguments)
+            COMMANDS[arguments.command](arguments)
             sys.stdout.flush()
             return 0
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
@@ -89,95 +91,80 @@ def _fail(arguments: argparse.Namespace, message: str, code: int) -> int:
     return code
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The whole command line."""
-    parser = argparse.ArgumentParser(
-        prog="retrieve",
-        description="From the gel images of a grasp, find the catalogue photo of the object in the hand.",
-    )
-    parser.add_argument("--version", action="version", version=f"touch-retrieval {__version__}")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_import(commands)
-    _add_check(commands)
-    _add_train(commands)
-    _add_build_index(commands)
-    _add_query(commands)
-    return parser
+def run_demo(arguments: argparse.Namespace) -> None:
+    """`retrieve demo`."""
+    from retrieval import demo
+
+    demo.run_demo(arguments.out, arguments.objects, arguments.jobs)
 
 
-def _command(commands: Any, name: str, text: str, run: Any) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(run=run)
-    return parser
+def run_collect(arguments: argparse.Namespace) -> None:
+    """`retrieve collect`."""
+    from functools import partial
+
+    from robot.attempt_log import acceptance_table
+    from robot.collect import CollectSettings, collect
+    from robot.rig import load_rig
+
+    gate, gate_name = _load_gate(arguments.gate)
+    settings = CollectSettings(grasps=arguments.grasps)
+    try:
+        with _CollectBar() as bar:
+            tallies = collect(
+                partial(load_rig, arguments.rig, seed=arguments.seed),
+                arguments.out,
+                objects=arguments.objects,
+                seed=arguments.seed,
+                settings=settings,
+                gate=gate,
+                gate_name=gate_name,
+                jobs=arguments.jobs,
+                progress=bar,
+            )
+    except KeyboardInterrupt:
+        _say(f"what was collected is whole in {arguments.out}; the same command goes on with it")
+        raise
+    _say(acceptance_table(tallies, wanted=settings.grasps))
+    accepted = sum(each.accepted for each in tallies)
+    if accepted == 0:
+        raise RetrievalError(f"no grasp was accepted; {arguments.out}/attempts.jsonl says why")
+    _say(f"{arguments.out}: {accepted} accepted grasps of {len(tallies)} objects")
+    if arguments.preview:
+        from robot.sim.preview import write_preview
+
+        _say(f"preview: {write_preview(arguments.out, arguments.out / 'preview.png')}")
 
 
-def _add_import(commands: Any) -> None:
-    parser = _command(commands, "import", "Turn a public data set into a recording.", run_import)
-    parser.add_argument("name", metavar="NAME", help="which data set; an unknown name lists the known ones")
-    parser.add_argument("source", metavar="SRC", type=Path, help="folder with the data set's own files")
-    parser.add_argument("--out", type=Path, required=True, help="recording folder to write")
+def _load_gate(path: Path | None) -> tuple[Any, str | None]:
+    """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
+    if path is None:
+        return None, None
+    from hashlib import sha256
+
+    from retrieval.grasp_success import load_gate
+
+    gate = load_gate(path)
+    return gate, f"learned, sha256 {sha256(path.read_bytes()).hexdigest()}"
 
 
-def _add_check(commands: Any) -> None:
-    parser = _command(
-        commands, "check", "Lint a recording: broken files, duplicates, leakage, swapped folders.", run_check
-    )
-    parser.add_argument("recording", type=Path, help="recording folder")
-    parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects to check")
-    parser.add_argument("--model", type=Path, help="check the split that this checkpoint was trained with")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+class _CollectBar:
+    """Shows robot.collect's progress on a bar, which is made when the first is told."""
 
+    def __init__(self) -> None:
+        self._bar: Bar | None = None
 
-def _add_train(commands: Any) -> None:
-    parser = _command(commands, "train", "Train a matcher on a recording.", run_train)
-    parser.add_argument("recording", type=Path, help="recording folder")
-    parser.add_argument("--out", type=Path, required=True, help="checkpoint to write (.safetensors)")
-    parser.add_argument(
-        "--config", default="small", help="preset (small, mobilenet, paper) or TOML file (default: small)"
-    )
-    parser.add_argument("--init", help="first weights of the towers: random, imagenet, or a state dict file")
-    parser.add_argument("--iterations", type=int, help="optimiser steps, instead of the configuration's")
-    parser.add_argument("--seed", type=int, help="seed of split, pairs and weights, instead of the configuration's")
-    parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects")
-    parser.add_argument("--resume", action="store_true", help="go on with an unfinished training of --out")
+    def __call__(self, now: "Progress") -> None:
+        if self._bar is None:
+            self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
+        note = f"{now.objects_done} of {now.objects} objects, {now.accept_rate:.0%} of {now.attempts} attempts accepted"
+        self._bar.advance(now.settled - self._bar.done, note)
 
+    def __enter__(self) -> "_CollectBar":
+        return self
 
-def _add_build_index(commands: Any) -> None:
-    parser = _command(commands, "build-index", "Make a folder of photos searchable.", run_build_index)
-    parser.add_argument("catalogue", type=Path, help="folder: <object>/<photo> or <object>.<ext>")
-    parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
-    parser.add_argument("--out", type=Path, default=Path("index"), help="index folder (default: index)")
-    parser.add_argument("--kind", help="candidate index (default: exact, unless it breaks --max-ms); see the README")
-    parser.add_argument("--max-ms", type=float, help="longest candidate search in milliseconds")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-
-
-def _add_query(commands: Any) -> None:
-    parser = _command(commands, "query", "Which object is in the hand?", run_query)
-    parser.add_argument(
-        "--gelsight",
-        nargs="+",
-        action="append",
-        type=Path,
-        required=True,
-        metavar="IMAGE",
-        help="gel images of one grasp, one per finger; again for more grasps of the same object",
-    )
-    parser.add_argument(
-        "--background",
-        nargs="+",
-        type=Path,
-        metavar="IMAGE",
-        help="no-contact frames, one per finger, for models with a background policy",
-    )
-    parser.add_argument("--index", help="index folder (default: ./index, else the last one built)")
-    parser.add_argument("--model", help="checkpoint (default: the one the index was built with)")
-    parser.add_argument("--top", type=int, default=10, help="objects to return (default: 10)")
-    parser.add_argument("--candidates", type=int, help="photos that the full classifier judges (default: 1000)")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-    parser.add_argument("--html", type=Path, help="write a page with photos and gel images")
-    parser.add_argument("--no-verify", action="store_true", help="skip the checksums of a huge index")
+    def __exit__(self, *error: Any) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(*error)
 
 
 def run_import(arguments: argparse.Namespace) -> None:
@@ -215,6 +202,13 @@ def run_check(arguments: argparse.Namespace) -> None:
 
 def run_train(arguments: argparse.Namespace) -> None:
     """`retrieve train`."""
+    if arguments.task == "grasp-success":
+        _train_gate(arguments)
+    else:
+        _train_matcher(arguments)
+
+
+def _train_matcher(arguments: argparse.Namespace) -> None:
     from retrieval import defaults, distributed
     from retrieval.train import train
 
@@ -236,10 +230,26 @@ def run_train(arguments: argparse.Namespace) -> None:
     _say(f"{arguments.out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
 
 
+def _train_gate(arguments: argparse.Namespace) -> None:
+    """`retrieve train --task grasp-success`."""
+    refused = {"--config": arguments.config, "--init": arguments.init, "--split": arguments.split}
+    for option, value in {**refused, "--resume": arguments.resume}.items():
+        if value:
+            raise BadInput(f"{option} is of matchers; --task grasp-success takes --iterations and --seed")
+    from retrieval.grasp_success import train_gate
+
+    given = {name: getattr(arguments, name) for name in ("iterations", "seed")}
+    report = train_gate(
+        arguments.recording, arguments.out, **{name: value for name, value in given.items() if value is not None}
+    )
+    for line in report.lines():
+        _say(line)
+
+
 def _training_config(arguments: argparse.Namespace) -> "Config":
     from retrieval.config import load_config
 
-    config = load_config(arguments.config)
+    config = load_config(arguments.config or "small")
     given = {name: getattr(arguments, name) for name in ("init", "iterations", "seed")}
     changed = {name: value for name, value in given.items() if value is not None}
     return dataclasses.replace(config, training=dataclasses.replace(config.training, **changed))
@@ -309,6 +319,17 @@ def run_query(arguments: argparse.Namespace) -> None:
     print_table(result)
     if result.verdict == "no match":
         _say("no photo is above the reject threshold: the object may not be in the catalogue")
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "demo": run_demo,
+    "collect": run_collect,
+    "import": run_import,
+    "check": run_check,
+    "train": run_train,
+    "build-index": run_build_index,
+    "query": run_query,
+}
 
 
 def _print_json(document: Any) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
-from robot.recording import read_info, read_recording
+from robot.recording import RecordedGrasp, read_info, read_recording
 
 log = logging.getLogger(__name__)
 
@@ -37,28 +37,73 @@ def load_grasps(folder: Path) -> list[Grasp]:
 
     Raises DatasetError for an unreadable recording, one without such grasps, or one that mixes numbers of fingers.
     """
+    grasps = [_as_grasp(folder, grasp) for grasp in _recorded(folder) if grasp.grasped is not False]
+    if not grasps:
+        raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
+    finger_count(grasps)
+    return grasps
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One closing of the gripper, whatever came of it.
+
+    outcome: "held", or what went wrong: "missed", "slipped", or "failed" where the recording does not say which.
+    after: the frames after the lift, one file per finger in order, or empty.
+    """
+
+    grasp: Grasp
+    outcome: str
+    after: tuple[Path, ...]
+
+    @property
+    def held(self) -> bool:
+        """Whether the object came up with the gripper."""
+        return self.outcome == "held"
+
+
+def load_attempts(folder: Path) -> list[Attempt]:
+    """Read the successful AND the failed grasps of a recording, in the order of collection.
+
+    A grasp counts by its `outcome`, and where that was not recorded by `grasped`; left out are those with neither,
+    and plans that never came to a grasp. Raises DatasetError as `load_grasps` does.
+    """
+    attempts = [
+        Attempt(_as_grasp(folder, grasp), outcome, _in_finger_order(folder, grasp.touches_after))
+        for grasp in _recorded(folder)
+        if (outcome := _outcome(grasp)) not in (None, "no_plan")
+    ]
+    if not attempts:
+        raise DatasetError(f"{folder} must say of its grasps whether they succeeded (grasped, outcome); none says so")
+    finger_count([attempt.grasp for attempt in attempts])
+    return attempts
+
+
+def _outcome(grasp: RecordedGrasp) -> str | None:
+    if grasp.outcome is not None:
+        return grasp.outcome
+    return None if grasp.grasped is None else "held" if grasp.grasped else "failed"
+
+
+def _recorded(folder: Path) -> tuple[RecordedGrasp, ...]:
     try:
         recording = read_recording(folder)
     except RobotError as error:
         raise DatasetError(str(error)) from error
     for note in recording.notes:
         log.warning("%s", note)
-    grasps = [
-        Grasp(
-            grasp_id=grasp.grasp_id,
-            object_id=grasp.object_id,
-            sequence_id=grasp.sequence_id,
-            photo=folder / grasp.photo,
-            touches=_in_finger_order(folder, grasp.touches),
-            backgrounds=_in_finger_order(folder, grasp.touches_before),
-        )
-        for grasp in recording.grasps
-        if grasp.photo is not None and grasp.touches and grasp.grasped is not False
-    ]
-    if not grasps:
-        raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
-    finger_count(grasps)
-    return grasps
+    return recording.grasps
+
+
+def _as_grasp(folder: Path, grasp: RecordedGrasp) -> Grasp:
+    return Grasp(
+        grasp_id=grasp.grasp_id,
+        object_id=grasp.object_id,
+        sequence_id=grasp.sequence_id,
+        photo=folder / grasp.photo,
+        touches=_in_finger_order(folder, grasp.touches),
+        backgrounds=_in_finger_order(folder, grasp.touches_before),
+    )
 
 
 def recording_source(folder: Path) -> str:

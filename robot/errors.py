@@ -5,12 +5,14 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
 
     RobotError                 the job ran and failed (exit code 1)
     +-- DeviceError            a device is missing, went away, answers late, stale or out of range
+    +-- PlanError              nothing to grasp is seen, or no grasp of it is possible
     +-- StorageError           a recording could not be written: disk full, no permission, folder in use
     +-- BadRobotInput          wrong use or bad input (exit code 2)
         +-- RecordingError     a recording is not usable. For example: a line that is not JSON
         +-- ImporterError      a data set to import is not what its importer reads
         +-- UnknownName        no driver or importer has this name
         +-- RobotConfigError   a setting is unknown or out of range
+        +-- SceneError         a scene is impossible. For example: an object wider than the gripper's stroke
 """
 
 
@@ -22,6 +24,10 @@ class RobotError(Exception):
 
 class DeviceError(RobotError):
     """A device is missing, went away, or its answer is late, stale or out of range."""
+
+
+class PlanError(RobotError):
+    """Nothing to grasp is seen, or no grasp of it is possible with this gripper; another attempt may do better."""
 
 
 class StorageError(RobotError):
@@ -48,3 +54,7 @@ class UnknownName(BadRobotInput):
 
 class RobotConfigError(BadRobotInput):
     """A setting is unknown or out of range."""
+
+
+class SceneError(BadRobotInput):
+    """A scene is impossible: what is asked of the simulation cannot be on a rig."""

@@ -14,13 +14,19 @@ import numpy as np
 from robot.errors import RecordingError
 
 _NUMBERS = ("force_n", "opening_mm", "time_s")
-_PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "sequence_id")
+OUTCOMES = ("held", "missed", "slipped", "no_plan")
+"""What came of an attempt: held or lost (slipped) after the lift, nothing between the jaws, or nothing tried."""
+
+_PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
 
 
 @dataclass(frozen=True)
 class RecordedGrasp:
-    """One grasp. Images are posix paths relative to the recording, touches by finger; None: not recorded."""
+    """One grasp. Images are posix paths relative to the recording, touches by finger; None: not recorded.
+
+    grasped: what the gate decided; training keeps these. outcome: one of OUTCOMES, what the gripper felt.
+    """
 
     grasp_id: str
     object_id: str
@@ -33,6 +39,7 @@ class RecordedGrasp:
     opening_mm: float | None = None
     pose: tuple[float, ...] | None = None
     grasped: bool | None = None
+    outcome: str | None = None
     sequence_id: str | None = None
     time_s: float | None = None
 
@@ -51,6 +58,8 @@ class RecordedGrasp:
             object.__setattr__(self, "pose", _pose(self.pose))
         if self.grasped is not None:
             object.__setattr__(self, "grasped", _boolean("grasped", self.grasped))
+        if self.outcome is not None and self.outcome not in OUTCOMES:
+            raise RecordingError(f"outcome must be one of {', '.join(OUTCOMES)}, got {self.outcome!r}")
 
     def images(self) -> dict[str, str]:
         """The files by column name without `_file_name`: photo, depth, touch_a, touch_a_before, ..."""

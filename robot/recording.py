@@ -5,7 +5,8 @@
     metadata.jsonl    one JSON object a line for each grasp
     images/           PNG or JPEG files
 
-A line holds grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped, sequence_id, time_s.
+A line holds grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (what the success gate
+decided; training leaves out false), outcome (what the gripper felt: held, missed, slipped), sequence_id, time_s.
 Its images are paths relative to the folder: photo_file_name, depth_file_name and for each finger (a, b, ...)
 touch_a_file_name, touch_a_before_file_name (the untouched gel) and touch_a_after_file_name. What was not
 recorded is left out. The folder opens as it is with Hugging Face datasets ("imagefolder").
@@ -195,7 +196,7 @@ class RecordingWriter:
         """Add one grasp: first its images, then its line; when it returns, both are on the disk.
 
         `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to ImageSource.
-        `fields`: force_n, opening_mm, pose, grasped, sequence_id, time_s.
+        `fields`: force_n, opening_mm, pose, grasped, outcome, sequence_id, time_s.
         Raises RecordingError, StorageError.
         """
         if self._file.closed:
@@ -255,7 +256,7 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
         "rig": None,
         "units": UNITS,
         "seed": None,
-        "software_version": _software_version(),
+        "software_version": software_version(),
         "background": "none",
     }
     try:
@@ -266,7 +267,8 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
     return full
 
 
-def _software_version() -> str:
+def software_version() -> str:
+    """Version of this project as installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

@@ -19,12 +19,12 @@ STAGES = (
     ("check", "towers"),
     ("fusion",),
     ("encode", "distributed", "calibration"),
-    ("checkpoint", "batches"),
+    ("checkpoint", "batches", "gate"),
     ("train", "defaults"),
     ("build",),
     ("search",),
-    ("report", "evaluation"),
-    ("cli",),
+    ("report", "evaluation", "grasp_success"),
+    ("arguments", "cli", "demo"),
 )
 
 
@@ -108,7 +108,7 @@ def test_indexes_import_with_numpy_alone():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", [[], ["import"], ["check"], ["train"], ["build-index"], ["query"]])
+@pytest.mark.parametrize("command", [[], ["demo"], ["collect"], ["import"], ["check"], ["train"], ["build-index"], ["query"]])
 def test_help_loads_nothing_heavy(command):
     code = f"from retrieval.cli import main\nmain({[*command, '--help']!r})"
     done = run_blocked(code, HEAVY)

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -10,8 +11,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 def bounds():
     """Lower bound of every requirement, extras included."""
-    listed = PROJECT["project"]["dependencies"] + PROJECT["project"]["optional-dependencies"]["test"]
-    return {re.split("[<>=]", item)[0].lower(): re.search(r">=([\d.]+)", item)[1] for item in listed}
+    listed = [*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())]
+    return {re.split("[<>=]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
 
 
 def pins(name):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.metrics import binomial_interval, guess_curve
+from retrieval.evaluation.metrics import binomial_interval, grouped_interval, guess_curve
 
 
 def curve_by_enumeration(true_score, others, k):
@@ -63,3 +63,24 @@ def test_the_interval_is_that_of_clopper_and_pearson(successes, trials, low, hig
 def test_an_interval_needs_trials():
     with pytest.raises(BadInput):
         binomial_interval(1, 0)
+
+
+def test_answers_that_are_no_more_alike_within_a_group_than_between_count_in_full():
+    assert grouped_interval([[True, False]] * 10) == pytest.approx(binomial_interval(10, 20))
+    assert grouped_interval([[True] * 7, [True] * 5]) == binomial_interval(12, 12)
+    assert grouped_interval([[True] * 3 + [False]]) == binomial_interval(3, 4)
+
+
+def test_groups_that_are_right_or_wrong_as_a_whole_count_as_one_answer_each():
+    """Ten groups of 50, half of them all wrong: by hand the design effect is 50 * 10 / 9, so they are worth 9 answers,
+    4.5 of them right. Taken for 500 independent answers, the interval would be seven times too narrow."""
+    low, high = grouped_interval([[True] * 50] * 5 + [[False] * 50] * 5)
+    assert binomial_interval(4, 9)[0] < low < binomial_interval(5, 9)[0]
+    assert binomial_interval(4, 9)[1] < high < binomial_interval(5, 9)[1]
+    naive = binomial_interval(250, 500)
+    assert high - low > 7 * (naive[1] - naive[0])
+
+
+def test_a_grouped_interval_needs_answers():
+    with pytest.raises(BadInput):
+        grouped_interval([])

@@ -1,5 +1,6 @@
 """Guess curves of K-way tests and exact intervals; equals count by their expected place."""
 
+from collections.abc import Sequence
 from math import comb
 
 import numpy as np
@@ -38,7 +39,28 @@ def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple
     """Exact interval of a share (Clopper and Pearson 1934): never too narrow for independent trials."""
     if not 0 <= successes <= trials or trials < 1:
         raise BadInput(f"successes must lie within 0..trials, and trials be at least 1; got {successes} of {trials}")
+    return _clopper_pearson(successes, trials, level)
+
+
+def _clopper_pearson(successes: float, trials: float, level: float) -> tuple[float, float]:
     tail = (1 - level) / 2
     low = beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
     high = beta.ppf(1 - tail, successes + 1, trials - successes) if successes < trials else 1.0
     return float(low), float(high)
+
+
+def grouped_interval(right: Sequence[Sequence[bool]]) -> tuple[float, float]:
+    """95 % interval of the share of right answers, given group by group (as object by object).
+
+    Answers of one group are alike, so it is the exact binomial interval for as many answers as would be worth these
+    if they were independent (Korn and Graubard 1998): their number over the design effect, the variance between
+    groups over that of independent answers. Where all answers are right, or all wrong, groups show no difference,
+    and every answer counts. Raises BadInput for no answers.
+    """
+    total, correct = sum(map(len, right)), sum(map(sum, right))
+    if not 0 < correct < total or len(right) < 2:
+        return binomial_interval(correct, total)
+    share = correct / total
+    squares = sum((sum(part) - share * len(part)) ** 2 for part in right) * len(right) / (len(right) - 1)
+    worth = total / max(1.0, squares / (total * share * (1 - share)))
+    return _clopper_pearson(share * worth, worth, 0.95)

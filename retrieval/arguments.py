@@ -1,0 +1,122 @@
+"""The words of the command line: every command with its options. What they do stands in retrieval.cli."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from retrieval.version import __version__
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="retrieve",
+        description="From the gel images of a grasp, find the catalogue photo of the object in the hand.",
+    )
+    parser.add_argument("--version", action="version", version=f"touch-retrieval {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_demo(commands)
+    _add_collect(commands)
+    _add_import(commands)
+    _add_check(commands)
+    _add_train(commands)
+    _add_build_index(commands)
+    _add_query(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text)
+    return parser
+
+
+def _add_demo(commands: Any) -> None:
+    parser = _command(commands, "demo", "The whole job on the simulated rig; ends with an HTML page.")
+    parser.add_argument("--out", type=Path, default=Path("demo"), help="folder to write (default: demo)")
+    parser.add_argument("--objects", type=int, default=20, help="how many objects (default: 20)")
+    parser.add_argument("--jobs", type=int, default=2, help="simulated rigs that work at once (default: 2)")
+
+
+def _add_collect(commands: Any) -> None:
+    parser = _command(commands, "collect", "Collect a recording with a rig on its own; goes on where it was stopped.")
+    parser.add_argument(
+        "--rig", default="sim", help="which rig, by name or TOML file (default: sim, the simulated one)"
+    )
+    parser.add_argument("--objects", type=int, default=98, help="how many objects (default: 98)")
+    parser.add_argument("--grasps", type=int, default=44, help="accepted grasps of each object (default: 44)")
+    parser.add_argument("--out", type=Path, required=True, help="recording folder to write or to go on with")
+    parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (default: 0)")
+    parser.add_argument("--jobs", type=int, default=1, help="simulated rigs that work at once (default: 1)")
+    parser.add_argument("--gate", type=Path, help="grasp-success checkpoint (default: a rule on the area of contact)")
+    parser.add_argument("--preview", action="store_true", help="write preview.png, pictures of some grasps, to --out")
+
+
+def _add_import(commands: Any) -> None:
+    parser = _command(commands, "import", "Turn a public data set into a recording.")
+    parser.add_argument("name", metavar="NAME", help="which data set; an unknown name lists the known ones")
+    parser.add_argument("source", metavar="SRC", type=Path, help="folder with the data set's own files")
+    parser.add_argument("--out", type=Path, required=True, help="recording folder to write")
+
+
+def _add_check(commands: Any) -> None:
+    parser = _command(commands, "check", "Lint a recording: broken files, duplicates, leakage, swapped folders.")
+    parser.add_argument("recording", type=Path, help="recording folder")
+    parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects to check")
+    parser.add_argument("--model", type=Path, help="check the split that this checkpoint was trained with")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+
+
+def _add_train(commands: Any) -> None:
+    parser = _command(commands, "train", "Train a matcher, or a gate for `collect`, on a recording.")
+    parser.add_argument("recording", type=Path, help="recording folder")
+    parser.add_argument(
+        "--task",
+        choices=("match", "grasp-success"),
+        default="match",
+        help="match: does this touch belong to this photo? grasp-success: did the grasp succeed? (default: match)",
+    )
+    parser.add_argument("--out", type=Path, required=True, help="checkpoint to write (.safetensors)")
+    parser.add_argument("--config", help="preset (small, mobilenet, paper) or TOML file (default: small)")
+    parser.add_argument("--init", help="first weights of the towers: random, imagenet, or a state dict file")
+    parser.add_argument("--iterations", type=int, help="optimiser steps, instead of the configuration's")
+    parser.add_argument("--seed", type=int, help="seed of split, pairs and weights, instead of the configuration's")
+    parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects")
+    parser.add_argument("--resume", action="store_true", help="go on with an unfinished training of --out")
+
+
+def _add_build_index(commands: Any) -> None:
+    parser = _command(commands, "build-index", "Make a folder of photos searchable.")
+    parser.add_argument("catalogue", type=Path, help="folder: <object>/<photo> or <object>.<ext>")
+    parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
+    parser.add_argument("--out", type=Path, default=Path("index"), help="index folder (default: index)")
+    parser.add_argument("--kind", help="candidate index (default: exact, unless it breaks --max-ms); see the README")
+    parser.add_argument("--max-ms", type=float, help="longest candidate search in milliseconds")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+
+
+def _add_query(commands: Any) -> None:
+    parser = _command(commands, "query", "Which object is in the hand?")
+    parser.add_argument(
+        "--gelsight",
+        nargs="+",
+        action="append",
+        type=Path,
+        required=True,
+        metavar="IMAGE",
+        help="gel images of one grasp, one per finger; again for more grasps of the same object",
+    )
+    parser.add_argument(
+        "--background",
+        nargs="+",
+        type=Path,
+        metavar="IMAGE",
+        help="no-contact frames, one per finger, for models with a background policy",
+    )
+    parser.add_argument("--index", help="index folder (default: ./index, else the last one built)")
+    parser.add_argument("--model", help="checkpoint (default: the one the index was built with)")
+    parser.add_argument("--top", type=int, default=10, help="objects to return (default: 10)")
+    parser.add_argument("--candidates", type=int, help="photos that the full classifier judges (default: 1000)")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    parser.add_argument("--html", type=Path, help="write a page with photos and gel images")
+    parser.add_argument("--no-verify", action="store_true", help="skip the checksums of a huge index")

@@ -1,0 +1,219 @@
+"""One attempt at a grasp, over the contract alone: look, fit, plan, close, lift, put down.
+
+Every random number of an attempt comes from (seed, object, number). With a rig that prepares its objects from the same
+three, an attempt is a pure function of them: it can be done again, in another process or after a crash.
+"""
+
+import contextlib
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.cylinder import fit_cylinder
+from robot.devices import MAX_AGE_S, RGBD, Box, Pose
+from robot.errors import DeviceError, PlanError, RobotConfigError
+from robot.grasp import GraspPlan, GraspSettings, plan_grasp
+from robot.rig import Rig
+
+OUTPUTS = ("depth", "before", "after")
+"""What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
+
+_OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
+_SIGHT_MM = 150.0
+"""An object may stand so far outside the workspace and still be looked for."""
+
+
+@dataclass(frozen=True)
+class AttemptSettings:
+    """How attempts are made. outputs: which of OUTPUTS are recorded; nothing is asked of a device for the others.
+
+    settle_s: wait between closing and the picture. hold_s: wait between lifting and judging. release_mm: an object is
+    let go so far above where it was grasped, on the inner `table_share` of the workspace. retries: how often an attempt
+    is begun again after a device has failed. jpeg_quality: of colour pictures, 0 to 100; depth is kept exactly.
+    """
+
+    grasp: GraspSettings = field(default_factory=GraspSettings)
+    outputs: tuple[str, ...] = OUTPUTS
+    travel_mm_s: float = 200.0
+    approach_mm_s: float = 50.0
+    closing_mm_s: float = 80.0
+    settle_s: float = 1.0
+    hold_s: float = 1.0
+    release_mm: float = 5.0
+    table_share: float = 0.7
+    retries: int = 2
+    jpeg_quality: int = 95
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        if unknown := sorted(set(self.outputs) - set(OUTPUTS)):
+            raise RobotConfigError(f"outputs must be of {', '.join(OUTPUTS)}; got {unknown[0]!r}")
+        for name in ("travel_mm_s", "approach_mm_s", "closing_mm_s"):
+            self._require(name, 1e-3, math.inf)
+        for name in ("settle_s", "hold_s", "release_mm", "retries"):
+            self._require(name, 0.0, 1e6)
+        self._require("table_share", 0.0, 1.0)
+        self._require("jpeg_quality", 0, 100)
+
+    def _require(self, name: str, least: float, most: float) -> None:
+        value = getattr(self, name)
+        if not least <= value <= most or math.isinf(value):
+            raise RobotConfigError(f"{name} must be from {least:g} to {most:g}, got {value}")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
+
+    outcome: "held", "missed", "slipped" by the gripper after the lift, or "no_plan" for the `reason` given, and then
+    there are no images. at_s, lasted_s: from the photo to the picture of the closed jaws, and to the end.
+    """
+
+    object_id: str
+    number: int
+    outcome: str
+    images: Mapping[str, bytes] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    reason: str | None = None
+    at_s: float = 0.0
+    lasted_s: float = 0.0
+
+
+class Attempter:
+    """Makes attempts with a connected rig."""
+
+    def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
+        settings.grasp.check(rig.arm, rig.gripper)
+        self.rig, self.seed, self.settings = rig, seed, settings
+        lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper
+        self._home = Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)  # behind the table, out of the picture
+        self._sight = Box(
+            (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
+        )
+
+    def run(self, object_id: str, number: int) -> Attempt:
+        """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
+
+        Whatever happens, Ctrl-C included, the jaws do not stay closed.
+        """
+        for trial in range(self.settings.retries + 1):
+            try:
+                return self._once(object_id, number)
+            except DeviceError as error:
+                self._let_go()
+                if trial == self.settings.retries:
+                    raise DeviceError(
+                        f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}"
+                    ) from error
+            except BaseException:
+                self._let_go()
+                raise
+        raise AssertionError("the loop returns or raises")
+
+    def _let_go(self) -> None:
+        """Open the jaws; the first error matters more than that this one may fail too."""
+        with contextlib.suppress(Exception):
+            self.rig.gripper.open(self.rig.gripper.stroke_mm)
+
+    def _once(self, object_id: str, number: int) -> Attempt:
+        rig = self.rig
+        rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
+        rig.gripper.open(rig.gripper.stroke_mm)
+        rig.arm.move_to(self._home, self.settings.travel_mm_s)
+        rig.prepare(object_id, number)
+        start = rig.clock()
+        image = rig.camera.read()
+        try:
+            fit = fit_cylinder(image, rig.camera.extrinsics, self._sight)
+            plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
+        except PlanError as error:
+            lasted = round(rig.clock() - start, 3)
+            return Attempt(object_id, number, "no_plan", reason=str(error), lasted_s=lasted)
+        images = self._pictures(image)
+        touches, fields, at = self._grasp(plan)
+        outcome = self._outcome()
+        if "after" in self.settings.outputs:
+            touches |= self._feel("_after", self.settings.hold_s)
+        self._put_down(plan, outcome == "held", rng)
+        return Attempt(
+            object_id,
+            number,
+            outcome,
+            {**images, **touches},
+            fields,
+            fit.to_dict(),
+            at_s=round(at - start, 3),
+            lasted_s=round(rig.clock() - start, 3),
+        )
+
+    def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
+        """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
+        rig, settings = self.rig, self.settings
+        rig.arm.move_to(plan.above, settings.travel_mm_s)
+        rig.gripper.open(plan.opening_mm)
+        reached = rig.arm.move_to(plan.pose, settings.approach_mm_s)
+        touches = self._feel("_before", MAX_AGE_S) if "before" in settings.outputs else {}
+        closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
+        rig.sleep(settings.settle_s)
+        at = rig.clock()
+        touches |= self._feel("", settings.settle_s)
+        rig.arm.move_to(plan.above, settings.approach_mm_s)
+        rig.sleep(settings.hold_s)
+        fields = {"force_n": plan.force_n, "opening_mm": closed.opening_mm, "pose": reached.as_tuple()}
+        return touches, fields, at
+
+    def _feel(self, moment: str, since_s: float) -> dict[str, bytes]:
+        """Gel images by column; none older than what has just been waited for, which may have been before it."""
+        frames = {finger: sensor.read(max_age_s=min(MAX_AGE_S, since_s)) for finger, sensor in self.rig.sensors.items()}
+        return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}
+
+    def _outcome(self) -> str:
+        status = self.rig.gripper.state().status
+        if status not in _OUTCOME_OF:
+            raise DeviceError(
+                f"{self.rig.gripper.name} must be holding, no_part or part_lost after a lift; it says {status}"
+            )
+        return _OUTCOME_OF[status]
+
+    def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
+        """Let go: of a held object on the table, at a random place and turned at random."""
+        rig, settings = self.rig, self.settings
+        low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
+        x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
+        yaw = float(rng.uniform(0.0, math.pi))
+        if held:
+            z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))
+            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.travel_mm_s)
+            rig.arm.move_to(Pose(float(x), float(y), z, yaw), settings.approach_mm_s)
+        rig.gripper.open(rig.gripper.stroke_mm)
+
+    def _pictures(self, image: RGBD) -> dict[str, bytes]:
+        pictures = {"photo": self._jpeg(image.colour)}
+        if "depth" in self.settings.outputs and image.depth_m is not None:
+            pictures["depth"] = _encoded(".png", depth_in_mm(image.depth_m))
+        return pictures
+
+    def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
+        return _encoded(".jpg", np.ascontiguousarray(pixels[..., ::-1]), quality)
+
+
+def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    """Whole millimetres as a recording keeps them, 0 where unknown or beyond 65 m."""
+    depth = np.rint(depth_m.astype(np.float64) * 1000)
+    known = np.isfinite(depth) & (depth > 0) & (depth < 65536)
+    return np.where(known, depth, 0).astype(np.uint16)
+
+
+def _encoded(suffix: str, pixels: npt.NDArray[Any], options: list[int] | None = None) -> bytes:
+    done, data = cv2.imencode(suffix, pixels, options or [])
+    if not done:
+        raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as {suffix[1:].upper()}")
+    return bytes(data.tobytes())

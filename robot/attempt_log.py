@@ -1,0 +1,191 @@
+"""attempts.jsonl: what came of every attempt at a grasp, those without a grasp included, and acceptance by object.
+
+It lies beside the recording, a line for each attempt: object_id, number, outcome, accepted, ended_s (second since the
+recording began, while the rig worked), and where there was a grasp its grasp_id, the gate's score and fit (method and
+error of the cylinder), else the reason. A line is written before its grasp is appended to the recording: after a crash
+at most the last line is half or has no grasp, and then it does not count.
+"""
+
+import contextlib
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from robot.errors import RecordingError
+from robot.recorded_grasp import OUTCOMES
+from robot.recording import Recording
+from robot.storage import storage_errors
+
+ATTEMPTS_FILE = "attempts.jsonl"
+
+
+@dataclass(frozen=True)
+class LoggedAttempt:
+    """One line."""
+
+    object_id: str
+    number: int
+    outcome: str
+    accepted: bool
+    ended_s: float
+    grasp_id: str | None = None
+    score: float | None = None
+    fit: Mapping[str, Any] | None = None
+    reason: str | None = None
+
+    def to_row(self) -> dict[str, Any]:
+        """The JSON object; what there is not is left out."""
+        return {key: value for key, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def from_row(cls, row: Any) -> Self:
+        """Raises RecordingError for what `to_row` never writes."""
+        try:
+            attempt = cls(**row)
+            whole = isinstance(attempt.number, int) and isinstance(attempt.accepted, bool)
+            if not whole or attempt.outcome not in OUTCOMES or not isinstance(attempt.object_id, str):
+                raise ValueError(f"got {row!r}")
+            float(attempt.ended_s)
+        except (TypeError, ValueError) as error:
+            raise RecordingError(f"is no attempt: {error}") from error
+        return attempt
+
+
+def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
+    """The attempts whose grasps, if any, are in the recording. Raises RecordingError for a damaged file."""
+    return [attempt for attempt, _ in _read(folder / ATTEMPTS_FILE, grasp_ids)]
+
+
+def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
+    """Attempts that count, each with where its line ends in the file."""
+    try:
+        lines = path.read_bytes().splitlines(keepends=True)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    found: list[tuple[LoggedAttempt, int]] = []
+    end = 0
+    for number, line in enumerate(lines, start=1):
+        last = number == len(lines)
+        if last and not line.endswith(b"\n"):
+            break
+        attempt = _parsed(path, number, line)
+        if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
+            if last:
+                break
+            raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
+        end += len(line)
+        found.append((attempt, end))
+    return found
+
+
+def _parsed(path: Path, number: int, line: bytes) -> LoggedAttempt:
+    try:
+        return LoggedAttempt.from_row(json.loads(line))
+    except (ValueError, RecordingError, RecursionError) as error:
+        raise RecordingError(f"{path}, line {number}: {error}") from error
+
+
+class AttemptLog:
+    """Appends to attempts.jsonl, of which only what counts is kept. The recording's writer holds the folder's lock."""
+
+    def __init__(self, folder: Path, grasp_ids: Set[str]) -> None:
+        self.folder = folder
+        read = _read(folder / ATTEMPTS_FILE, grasp_ids)
+        self.attempts = [attempt for attempt, _ in read]
+        self._end = read[-1][1] if read else 0
+        with storage_errors(folder):
+            self._descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+            os.ftruncate(self._descriptor, self._end)
+
+    def append(self, attempt: LoggedAttempt) -> None:
+        """Write one line to the disk; whatever fails, no half of it stays. Raises StorageError."""
+        data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        try:
+            with storage_errors(self.folder):
+                written = 0
+                while written < len(data):
+                    written += os.pwrite(self._descriptor, data[written:], self._end + written)
+                os.fsync(self._descriptor)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, self._end)
+            raise
+        self._end += len(data)
+        self.attempts.append(attempt)
+
+    def close(self) -> None:
+        """Let go of the file; once."""
+        os.close(self._descriptor)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+# Acceptance ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Tally:
+    """What came of the attempts at one object."""
+
+    object_id: str
+    attempts: int = 0
+    accepted: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def add(self, attempt: LoggedAttempt) -> None:
+        """Count one more."""
+        self.attempts += 1
+        self.accepted += attempt.accepted
+        self.outcomes[attempt.outcome] += 1
+        if attempt.reason:
+            self.reasons[attempt.reason] += 1
+
+
+def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
+    """By object, in order of first appearance."""
+    tallies: dict[str, Tally] = {}
+    for attempt in attempts:
+        tallies.setdefault(attempt.object_id, Tally(attempt.object_id)).add(attempt)
+    return tallies
+
+
+def acceptance(recording: Recording) -> list[Tally]:
+    """Attempts, accepted ones and outcomes by object; of the grasps alone where the attempts were not logged."""
+    logged = read_attempts(recording.folder, {grasp.grasp_id for grasp in recording.grasps})
+    if logged:
+        return list(tally(logged).values())
+    tallies: dict[str, Tally] = {}
+    for grasp in recording.grasps:
+        each = tallies.setdefault(grasp.object_id, Tally(grasp.object_id))
+        each.attempts += 1
+        each.accepted += grasp.grasped is not False
+        each.outcomes.update([grasp.outcome] if grasp.outcome else [])
+    return list(tallies.values())
+
+
+def acceptance_table(tallies: Sequence[Tally], wanted: int | None = None) -> str:
+    """Plain text, a line an object and one for all; objects that have fewer than `wanted` are marked."""
+    width = max([len(each.object_id) for each in tallies] + [6])
+    lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
+    total = Tally("all")
+    for each in tallies:
+        lines.append(_line(each, width) + ("  gave up" if wanted is not None and each.accepted < wanted else ""))
+        total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
+        total.outcomes += each.outcomes
+    return "\n".join([*lines, _line(total, width)])
+
+
+def _line(each: Tally, width: int) -> str:
+    outcomes = "  ".join(f"{each.outcomes[name]:>{len(name)}}" for name in OUTCOMES)
+    return f"{each.object_id:{width}}  {each.accepted:>8}  {each.attempts:>2}  {outcomes}"

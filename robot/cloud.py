@@ -1,0 +1,219 @@
+"""From a depth picture to the points of the one thing on the table: the table's plane, then what stands out of it."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import RGBD, Box
+from robot.errors import PlanError
+
+Array = npt.NDArray[np.float64]
+Depth = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+MAX_HEIGHT_MM = 400.0
+_NEAR_TABLE_MM = 40.0
+_TABLE_TOLERANCE_MM = 6.0
+_MAX_SLOPE = 0.1
+_SAMPLES, _HYPOTHESES = 3000, 64
+_LEAST_MM, _LEAST_PX, _MOST_POINTS = 5.0, 30, 900
+_FILTER_PX = 5
+
+
+@dataclass(frozen=True)
+class Table:
+    """The plane z = a x + b y + c (mm) of the rig's frame, and how far a depth pixel strays along its ray."""
+
+    a: float
+    b: float
+    c: float
+    noise_mm: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Where every pixel looks in the rig's frame: its point is the camera's place + depth_mm * direction."""
+
+    x: npt.NDArray[np.float32]
+    """(W,) of the camera's frame, for a depth of 1."""
+    y: npt.NDArray[np.float32]
+    """(H,) likewise."""
+    pose: Array
+    """(4, 4): camera frame to rig frame, mm."""
+
+    @property
+    def pixel(self) -> float:
+        """Width of a pixel at a depth of 1."""
+        return float(self.x[1] - self.x[0])
+
+    @classmethod
+    def of(cls, image: RGBD, extrinsics: Array) -> "Rays":
+        """For the pixels of `image`."""
+        lens, (rows, columns) = image.intrinsics, image.colour.shape[:2]
+        x = (np.arange(columns, dtype=np.float32) - lens.cx) / lens.fx
+        y = (np.arange(rows, dtype=np.float32) - lens.cy) / lens.fy
+        return cls(x.astype(np.float32), y.astype(np.float32), extrinsics)
+
+    def along(self, normal: Array) -> Depth:
+        """(H, W): the component along a vector of the rig's frame, for a depth of 1."""
+        local = (self.pose[:3, :3].T @ normal).astype(np.float32)
+        return np.asarray(self.x[None, :] * local[0] + (self.y[:, None] * local[1] + local[2]))
+
+    def points(self, depth_mm: Depth, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> Array:
+        """(N, 3) in the rig's frame, mm."""
+        depth = depth_mm[rows, columns].astype(np.float64)
+        local = np.stack([self.x[columns] * depth, self.y[rows] * depth, depth], axis=1)
+        return np.asarray(local @ self.pose[:3, :3].T + self.pose[:3, 3])
+
+
+@dataclass(frozen=True)
+class Thing:
+    """What stands on the table: (N, 3) points (mm; z above the table), the table, and what was noticed."""
+
+    points: Array
+    table: Table
+    missing: float
+    """Share of the pixels of its outline that have no depth."""
+    cut_off: bool
+    """Whether it touches the picture's border, so that a part of it is not seen."""
+
+
+def find_table(depth_mm: Depth, rays: Rays) -> Table:
+    """Fit the table near z = 0, where the calibration has it: RANSAC over three points, then least squares.
+
+    Where too little of it is seen, z = 0 is taken, and a note says so.
+    """
+    points = _sample(depth_mm, rays)
+    near = points[np.abs(points[:, 2]) < _NEAR_TABLE_MM]
+    if len(near) < 100:
+        return Table(0.0, 0.0, 0.0, 2.0, ("hardly any table is seen: z = 0 of the calibration is taken for it",))
+    plane = _best_plane(near)
+    for _ in range(3):
+        off = near[:, 2] - _heights(plane, near)
+        inside = near[np.abs(off) < _TABLE_TOLERANCE_MM]
+        design = np.c_[inside[:, :2], np.ones(len(inside))]
+        plane = np.asarray(np.linalg.lstsq(design, inside[:, 2], rcond=None)[0], np.float64)
+    off = near[:, 2] - _heights(plane, near)
+    noise = 1.4826 * float(np.median(np.abs(off))) / max(abs(_steepness(rays)), 0.1)
+    a, b, c = map(float, plane)
+    return Table(a, b, c, max(noise, 0.3), _table_notes(a, b, c))
+
+
+def _table_notes(a: float, b: float, c: float) -> tuple[str, ...]:
+    slope = float(np.degrees(np.arctan(np.hypot(a, b))))
+    if abs(c) < 15.0 and slope < 2.0:
+        return ()
+    return (f"the table is {c:.0f} mm high and {slope:.1f} degrees steep by the camera: calibrate it again",)
+
+
+def _steepness(rays: Rays) -> float:
+    """Rise of the middle ray for a depth of 1: the share of depth noise that shows as height."""
+    return float(rays.pose[2, 2])
+
+
+def _sample(depth_mm: Depth, rays: Rays) -> Array:
+    step = max(1, int(np.sqrt(depth_mm.size / _SAMPLES)))
+    rows, columns = np.nonzero(np.isfinite(depth_mm[::step, ::step]))
+    return rays.points(depth_mm, rows * step, columns * step)
+
+
+def _best_plane(points: Array) -> Array:
+    """The steepest-limited plane through three points that most points lie on; (3,) a, b, c."""
+    rng = np.random.default_rng(0)
+    some = points[rng.choice(len(points), min(len(points), 400), replace=False)]
+    triples = some[rng.integers(len(some), size=(_HYPOTHESES, 3))]
+    system = np.concatenate([triples[..., :2], np.ones((_HYPOTHESES, 3, 1))], axis=2)
+    good = np.abs(np.linalg.det(system)) > 100.0  # mm2: three points in a line say nothing
+    planes = np.linalg.solve(system[good], triples[good][..., 2:])[..., 0]
+    planes = planes[(np.hypot(planes[:, 0], planes[:, 1]) < _MAX_SLOPE)]
+    planes = np.concatenate([planes, [[0.0, 0.0, float(np.median(points[:, 2]))]]])
+    off = some[None, :, 2] - _heights(planes.T[..., None], some)
+    return np.asarray(planes[(np.abs(off) < _TABLE_TOLERANCE_MM).sum(1).argmax()])
+
+
+def _heights(plane: Array, points: Array) -> Array:
+    return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
+
+
+def find_thing(depth_mm: Depth, rays: Rays, region: Box | None = None) -> Thing:
+    """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
+    table = find_table(depth_mm, rays)
+    above = _above(depth_mm, rays, table)
+    least = max(_LEAST_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
+    raised = (above > least) & (above < MAX_HEIGHT_MM)
+    if region is not None:
+        raised &= _inside(depth_mm, rays, region)
+    patch = _largest(raised)
+    rows, columns = (patch.mask & raised[patch.window]).nonzero()
+    rows, columns = rows + patch.window[0].start, columns + patch.window[1].start
+    points = rays.points(depth_mm, rows, columns)
+    points[:, 2] = above[rows, columns]
+    level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * rays.pixel) ** 2
+    points = _without_strays(points, level)
+    if len(points) > _MOST_POINTS:
+        points = points[np.sort(np.random.default_rng(0).choice(len(points), _MOST_POINTS, replace=False))]
+    return Thing(points, table, _missing(depth_mm[patch.window], patch.mask), patch.cut_off)
+
+
+def _above(depth_mm: Depth, rays: Rays, table: Table) -> Depth:
+    """(H, W) height above the table in mm, NaN where depth is unknown."""
+    normal = np.array([-table.a, -table.b, 1.0])
+    start = float(normal @ rays.pose[:3, 3]) - table.c
+    return np.asarray(depth_mm * rays.along(normal) + np.float32(start))
+
+
+def _inside(depth_mm: Depth, rays: Rays, region: Box) -> Mask:
+    inside = np.ones(depth_mm.shape, bool)
+    for axis in (0, 1):
+        unit = np.eye(3)[axis]
+        where = depth_mm * rays.along(unit) + np.float32(rays.pose[axis, 3])
+        inside &= (where >= region.lower[axis]) & (where <= region.upper[axis])
+    return inside
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """Connected pixels: where in the picture, which of them there, and whether they touch its border."""
+
+    window: tuple[slice, slice]
+    mask: Mask
+    cut_off: bool
+
+
+def _largest(raised: Mask) -> _Patch:
+    """The largest connected part after single pixels have been outvoted. Raises PlanError."""
+    voted = cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(voted, connectivity=8)
+    sizes = stats[1:, cv2.CC_STAT_AREA]
+    if count < 2 or sizes.max() < _LEAST_PX:
+        raise PlanError("depth shows nothing on the table: the object is gone, transparent or out of the picture")
+    best = 1 + int(sizes.argmax())
+    left, top, width, height = (int(value) for value in stats[best, :4])
+    window = slice(top, top + height), slice(left, left + width)
+    rows, columns = raised.shape
+    cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
+    return _Patch(window, labels[window] == best, cut_off)
+
+
+def _missing(depth_mm: Depth, mask: Mask) -> float:
+    """Share of unknown pixels in the convex outline of the mask."""
+    ys, xs = np.nonzero(mask)
+    hull = cv2.convexHull(np.stack([xs, ys], axis=1).astype(np.int32))
+    outline = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1).astype(bool)
+    return float(np.isnan(depth_mm[outline]).mean())
+
+
+def _without_strays(points: Array, level: float, cell_mm: float = 6.0) -> Array:
+    """Drop points with fewer neighbours in plan than a level surface has, of which `level` points see each mm2.
+
+    Outliers lie along their ray, far from the thing's footprint and from each other.
+    """
+    cells = np.floor((points[:, :2] - points[:, :2].min(0)) / cell_mm).astype(np.intp) + 1
+    grid = np.zeros(tuple(cells.max(0) + 2), np.float32)
+    np.add.at(grid, (cells[:, 0], cells[:, 1]), 1.0)
+    around = cv2.boxFilter(grid, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    kept = around[cells[:, 0], cells[:, 1]] >= max(3.0, 0.3 * level * 9 * cell_mm**2)
+    return points[kept] if kept.any() else points

@@ -1,0 +1,309 @@
+"""Collect a recording with a rig on its own, as in the paper; a person only changes objects where the rig is real.
+
+Object by object and attempt by attempt: photo, cylinder, random grasp, gel images before, during and after, lift, what
+the gripper felt, and the gate, which decides what training keeps. What it rejects is recorded too, and attempts that
+came to no grasp are logged (robot.attempt_log). `grasps` accepted ones are wanted of each object, in a bounded number
+of attempts: an object that cannot be grasped is reported, not tried for ever.
+
+A recording is written by one writer in one order, so that it is the same whatever the number of jobs, and a
+collection that was stopped or killed goes on where it was when it is started again.
+"""
+
+import functools
+import json
+import re
+import time
+import zlib
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.attempt import Attempt, Attempter, AttemptSettings
+from robot.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
+from robot.errors import RecordingError, RobotConfigError
+from robot.gates import ContactAreaGate, Gate, GraspFrames, judge
+from robot.recording import INFO_FILE, RecordingWriter, read_info, software_version
+from robot.rig import Rig
+from robot.workers import Jobs, RigMaker
+
+_ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]")
+_TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
+
+
+@dataclass(frozen=True)
+class CollectSettings:
+    """What is wanted of each object: so many accepted grasps, in at most so many attempts (None: 4 a grasp and 10)."""
+
+    grasps: int = 44
+    most_attempts: int | None = None
+    attempt: AttemptSettings = field(default_factory=AttemptSettings)
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a number below 1."""
+        if self.grasps < 1 or self.limit < 1:
+            raise RobotConfigError(f"grasps and most_attempts must be at least 1, got {self.grasps} and {self.limit}")
+
+    @property
+    def limit(self) -> int:
+        """Most attempts at one object."""
+        default = _ATTEMPTS_PER_GRASP * self.grasps + _SPARE_ATTEMPTS
+        return default if self.most_attempts is None else self.most_attempts
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a collection is. settled: accepted grasps, and those that objects given up will never have."""
+
+    objects: int
+    objects_done: int
+    wanted: int
+    settled: int
+    accepted: int
+    attempts: int
+    seconds_left: float | None
+
+    @property
+    def accept_rate(self) -> float:
+        """Share of the attempts that gave an accepted grasp."""
+        return self.accepted / self.attempts if self.attempts else 0.0
+
+
+def collect(
+    make_rig: RigMaker,
+    out: str | Path,
+    *,
+    objects: int | Sequence[str],
+    seed: int,
+    settings: CollectSettings | None = None,
+    gate: Gate | None = None,
+    gate_name: str | None = None,
+    jobs: int = 1,
+    progress: Callable[[Progress], None] | None = None,
+) -> list[Tally]:
+    """Collect into the folder `out`, or go on with what is there; returns what came of every object.
+
+    make_rig builds the rig; it is called once, and with jobs > 1 in every process too. objects: names, or how many of
+    the rig's. gate: see robot.gates; gate_name says which one it is, for it must be the same when a collection goes on.
+    Raises RobotConfigError, RecordingError (the folder holds something else, or was collected otherwise), DeviceError
+    (a device failed too often), StorageError; what was recorded before is whole, and the rig is closed with its jaws
+    open. KeyboardInterrupt likewise.
+    """
+    settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
+    rig = make_rig()
+    _check_jobs(rig, jobs)
+    names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
+    _check_names(names)
+    with rig:
+        info = _info(rig, seed, settings, gate_name or repr(gate))
+        _check_goes_on(Path(out), info, strict=rig.can_run_jobs)
+        attempter = Attempter(rig, seed, settings.attempt)
+        with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
+            collection = _Collection(writer, log, names, settings, gate, progress)
+            with Jobs(jobs, attempter, make_rig) as workers:
+                collection.run(workers)
+    return [collection.tallies[name] for name in names]
+
+
+def _check_jobs(rig: Rig, jobs: int) -> None:
+    if jobs < 1:
+        raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
+    if jobs > 1 and not rig.can_run_jobs:
+        raise RobotConfigError(f"there is one such rig ({type(rig).__name__}), so jobs must be 1, got {jobs}")
+
+
+def _check_names(names: Sequence[str]) -> None:
+    if not names:
+        raise RobotConfigError("at least one object must be collected, got none")
+    if len(set(names)) != len(names):
+        raise RobotConfigError("objects must have different names; one was given twice")
+
+
+# What the recording says of its collection ------------------------------------------------------------------
+
+
+def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
+    """recording.json: the rig's own, and all that a collection depends on."""
+    said = {
+        **rig.info,
+        "seed": seed,
+        "background": "before each grasp" if "before" in settings.attempt.outputs else "none",
+        "devices": rig.settings(),
+        "collection": {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit},
+    }
+    try:
+        return dict(json.loads(json.dumps(said, allow_nan=False)))
+    except (TypeError, ValueError) as error:
+        raise RobotConfigError(f"what the rig says of itself must be plain JSON: {error}") from error
+
+
+def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> None:
+    """Raise RecordingError where a recording that exists was collected otherwise.
+
+    strict: simulated attempts depend on the software, those of a real rig go on after it was brought up to date.
+    """
+    if not (folder / INFO_FILE).is_file():
+        return
+    found = read_info(folder)
+    if "collection" not in found:
+        raise RecordingError(f"{folder} holds a recording that was not collected by a rig; give another folder")
+    if strict:
+        wanted = {**wanted, "software_version": software_version()}
+    for name, value in _flat(wanted).items():
+        old = _flat(found).get(name)
+        if old != value:
+            what = name.replace("collection.", "").replace("_", " ")
+            raise RecordingError(
+                f"{folder} was collected with {what} {old!r}, not {value!r}; give another folder, or the same settings"
+            )
+
+
+def _flat(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested keys joined by dots."""
+    flat: dict[str, Any] = {}
+    for key, value in info.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+# Collecting -------------------------------------------------------------------------------------------------
+
+
+class _Collection:
+    """Decides which attempts are made, and writes down what came of them."""
+
+    def __init__(
+        self,
+        writer: RecordingWriter,
+        log: AttemptLog,
+        names: Sequence[str],
+        settings: CollectSettings,
+        gate: Gate,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
+        _check_log(log, writer, names)
+        self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
+        self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
+        self._pending: dict[str, deque[Callable[[], Attempt]]] = defaultdict(deque)
+        self._progress = progress
+        self._start, self._settled_before = time.monotonic(), self._settled()
+
+    def run(self, workers: Jobs) -> None:
+        """Attempts are recorded object by object; workers may be ahead, but never make one that is not wanted."""
+        self._report()
+        for name in self.names:
+            while self._wants(name):
+                self._submit_ahead(workers, name)
+                self._record(self._pending[name].popleft()())
+                self._report()
+
+    def _submit_ahead(self, workers: Jobs, name: str) -> None:
+        """Give out the attempts that are wanted next, this object's first."""
+        later = self.names[self.names.index(name) :]
+        for each in later:
+            while self._wants(each, ahead=True):
+                if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
+                    return
+                number = self.tallies[each].attempts + len(self._pending[each])
+                self._pending[each].append(workers.submit(each, number))
+
+    def _wants(self, name: str, ahead: bool = False) -> bool:
+        """Whether another attempt is needed, if all that are under way are going to be accepted."""
+        under_way, so_far = len(self._pending[name]) if ahead else 0, self.tallies[name]
+        return so_far.accepted + under_way < self.settings.grasps and so_far.attempts + under_way < self.settings.limit
+
+    def _record(self, attempt: Attempt) -> None:
+        """Ask the gate, write the attempt's line and then its grasp."""
+        began, self._seconds = self._seconds, round(self._seconds + attempt.lasted_s, 3)
+        logged = self._judged(attempt)
+        self.log.append(logged)
+        if logged.grasp_id is not None:
+            self.writer.append(
+                logged.grasp_id,
+                attempt.object_id,
+                attempt.images,
+                **attempt.fields,
+                grasped=logged.accepted,
+                outcome=attempt.outcome,
+                sequence_id=logged.grasp_id,
+                time_s=round(began + attempt.at_s, 3),
+            )
+        self.tallies[attempt.object_id].add(logged)
+
+    def _judged(self, attempt: Attempt) -> LoggedAttempt:
+        said = functools.partial(
+            LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
+        )
+        if attempt.outcome == "no_plan":
+            return said(accepted=False, reason=attempt.reason)
+        accepted, score = judge(self.gate, frames_of(attempt.images))
+        return said(
+            accepted=accepted, grasp_id=name_of(attempt.object_id, attempt.number), score=score, fit=attempt.fit
+        )
+
+    def _settled(self) -> int:
+        wanted = self.settings.grasps
+        return sum(self.tallies[name].accepted if self._wants(name) else wanted for name in self.names)
+
+    def _report(self) -> None:
+        if self._progress is None:
+            return
+        tallies = [self.tallies[name] for name in self.names]
+        wanted, settled = len(tallies) * self.settings.grasps, self._settled()
+        fresh = settled - self._settled_before
+        left = (wanted - settled) * (time.monotonic() - self._start) / fresh if fresh else None
+        self._progress(
+            Progress(
+                objects=len(tallies),
+                objects_done=sum(not self._wants(name) for name in self.names),
+                wanted=wanted,
+                settled=settled,
+                accepted=sum(each.accepted for each in tallies),
+                attempts=sum(each.attempts for each in tallies),
+                seconds_left=left,
+            )
+        )
+
+
+def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -> None:
+    """The log must tell of every grasp, in the order in which this collection makes its attempts."""
+    logged = {attempt.grasp_id for attempt in log.attempts} - {None}
+    if lost := writer.grasp_ids - logged:
+        raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
+    order = list(tally(log.attempts))
+    if order != list(names[: len(order)]):
+        raise RecordingError(
+            f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give the same or more"
+        )
+
+
+def name_of(object_id: str, number: int) -> str:
+    """The grasp's id: object and number of the attempt, in characters that file names may have."""
+    plain = _NOT_IN_A_NAME.sub("_", object_id)[:100]
+    if plain != object_id or not plain[0].isalnum():
+        plain = f"x{zlib.crc32(object_id.encode()):08x}_{plain}"
+    return f"{plain}-{number:04}"
+
+
+def frames_of(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
+    """Each finger's frames, decoded from what is recorded: the gate judges what training will see."""
+    moments: dict[str, dict[str, npt.NDArray[np.uint8]]] = defaultdict(dict)
+    for column, data in images.items():
+        if match := _TOUCH.fullmatch(column):
+            moments[match[1]][(match[2] or "_during")[1:]] = _decoded(data)
+    return {
+        finger: GraspFrames(each.get("before"), each["during"], each.get("after")) for finger, each in moments.items()
+    }
+
+
+def _decoded(data: bytes) -> npt.NDArray[np.uint8]:
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None, "it was encoded by robot.attempt"
+    return np.ascontiguousarray(pixels[..., ::-1])

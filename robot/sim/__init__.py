@@ -1,0 +1,1 @@
+"""The simulated rig: objects, contact, gel optics and camera behind the rig contract."""

@@ -1,0 +1,259 @@
+"""The camera over the table: a photo and a Kinect-like depth image of one object, each made when asked for.
+
+One geometry pass (a ray a pixel against the object and the table) serves both. The photo adds normals at the scale of
+a pixel, one lamp, the sky's light, a cast shadow, lens blur and sensor noise; the depth image adds the faults of a
+structured-light or time-of-flight sensor. Camera frame: x right, y down, z forward, mm.
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import SceneError
+from robot.sim.objects import SimObject
+
+Array = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+_GAMMA = 2.2
+_LENS_BLUR_PX = 0.45
+_SHADOW_BLUR_PX = 0.8
+_TABLE_PX_PER_MM = 0.8
+_TABLE_PX = (400, 560)
+_SHADOW_DETAIL = 2.0
+"""Shadows show relief only from this many pixels up."""
+
+_OFF_SURFACE_MM = 0.4
+"""Shadow rays start this far above the surface, so that rounding does not put a point in its own shadow."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the object stands: its origin on the table in mm, and its turn about the vertical in rad."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    yaw_rad: float = 0.0
+
+    def rotation(self) -> Array:
+        """(3, 3): object frame to rig frame."""
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def to_object(self, points: Array) -> Array:
+        """(N, 3) points of the rig frame in the object's."""
+        return (points - [self.x_mm, self.y_mm, 0.0]) @ self.rotation()
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera of square pixels that looks at `target_mm` with the rig's z upward in its picture."""
+
+    px: int = 256
+    focal_px: float = 760.0
+    position_mm: tuple[float, float, float] = (0.0, -560.0, 390.0)
+    target_mm: tuple[float, float, float] = (0.0, 0.0, 85.0)
+
+    def __post_init__(self) -> None:
+        """Raises SceneError for a camera below the table, or one that looks along the vertical or nowhere."""
+        forward = np.subtract(self.target_mm, self.position_mm)
+        if self.px < 1 or not self.focal_px > 0 or not self.position_mm[2] > 0:
+            raise SceneError(f"a camera must have pixels, a focal length and stand above the table, got {self}")
+        if not np.isfinite(forward).all() or np.hypot(forward[0], forward[1]) < 1e-6:
+            raise SceneError(f"a camera must look at a target beside its foot, got {self}")
+
+    @cached_property
+    def to_rig(self) -> Array:
+        """(4, 4): camera frame to rig frame."""
+        forward = np.subtract(self.target_mm, self.position_mm)
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([right, np.cross(forward, right), forward, self.position_mm], axis=1)
+        return matrix
+
+    @cached_property
+    def rays(self) -> Array:
+        """(px * px, 3): unit directions through the pixel centres in the rig frame, row by row."""
+        axis = (np.arange(self.px) + 0.5 - self.px / 2) / self.focal_px
+        x, y = np.meshgrid(axis, axis)
+        local = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+        local /= np.linalg.norm(local, axis=1, keepdims=True)
+        return np.asarray(local @ self.to_rig[:3, :3].T)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """One lamp and a sky. Drawn apart from the object, so that light tells nothing of it."""
+
+    direction: tuple[float, float, float]
+    lamp: tuple[float, float, float]
+    sky: tuple[float, float, float]
+    exposure: float
+    table_seed: int
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> "Lighting":
+        """A lamp from the camera's side of the room, 30 to 65 degrees high, warm or cool."""
+        turn, height = (
+            rng.uniform(math.radians(185), math.radians(355)),
+            rng.uniform(math.radians(30), math.radians(65)),
+        )
+        warmth = rng.uniform(-0.08, 0.08)
+        lamp = rng.uniform(0.75, 1.0) * np.array([1 + warmth, 1.0, 1 - warmth])
+        sky = rng.uniform(0.18, 0.32) * np.array([1 - warmth, 1.0, 1 + warmth])
+        direction = math.cos(height) * math.cos(turn), math.cos(height) * math.sin(turn), math.sin(height)
+        return cls(direction, _triple(lamp), _triple(sky), rng.uniform(0.85, 1.15), int(rng.integers(2**31)))
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+@dataclass(frozen=True)
+class View:
+    """What the camera meets: `distance_mm` along each ray, and which pixels are the object's; both (px * px,).
+
+    `detail_mm`: the size of a pixel on the object.
+    """
+
+    obj: SimObject
+    placement: Placement
+    camera: Camera
+    detail_mm: float
+    distance_mm: Array
+    is_object: npt.NDArray[np.bool_]
+    points: Array = field(repr=False)
+
+
+def look(obj: SimObject, placement: Placement, camera: Camera) -> View:
+    """The geometry pass: the nearest of object and table along each ray."""
+    origin, rays = np.asarray(camera.position_mm), camera.rays
+    if not rays[:, 2].max() < 0:
+        raise SceneError(f"the camera must see nothing but the table behind the object, got {camera}")
+    table = -origin[2] / rays[:, 2]
+    origins = np.broadcast_to(placement.to_object(origin[None]), rays.shape)
+    detail_mm = float(np.linalg.norm(np.subtract(camera.target_mm, camera.position_mm))) / camera.focal_px
+    hit = obj.body.cast(origins, rays @ placement.rotation(), detail_mm)
+    is_object = hit < table
+    distance = np.where(is_object, hit, table)
+    return View(obj, placement, camera, detail_mm, distance, is_object, origin + distance[:, None] * rays)
+
+
+# Photo ------------------------------------------------------------------------------------------------------
+
+
+def photo(view: View, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
+    """(px, px, 3) RGB."""
+    px = view.camera.px
+    light = np.asarray(lighting.direction)
+    normals = np.tile([0.0, 0.0, 1.0], (px * px, 1))
+    normals[view.is_object] = _object_normals(view)
+    lit = np.maximum(normals @ light, 0.0)
+    if shadow:
+        lit *= _lamp_seen(view, normals, light)
+    radiance = _albedo(view, lighting) * (lit[:, None] * lighting.lamp + _sky(view, normals)[:, None] * lighting.sky)
+    radiance += _highlight(view, normals, light, lit)[:, None] * lighting.lamp
+    linear = cv2.GaussianBlur((radiance * lighting.exposure).reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
+    return _develop(linear, noise_seed)
+
+
+def _object_normals(view: View) -> Array:
+    """Normals of the object's pixels, taken across about one pixel so that finer relief does not flicker."""
+    points = view.placement.to_object(view.points[view.is_object])
+    return view.obj.body.normals(points, 0.4 * view.detail_mm) @ view.placement.rotation().T
+
+
+def _lamp_seen(view: View, normals: Array, light: Array) -> Array:
+    """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size."""
+    px = view.camera.px
+    starts = view.placement.to_object(view.points + _OFF_SURFACE_MM * normals)
+    facing = normals @ light > 0
+    seen = np.ones(px * px)
+    towards = np.broadcast_to(light @ view.placement.rotation(), starts[facing].shape)
+    seen[facing] = ~np.isfinite(view.obj.body.cast(starts[facing], towards, _SHADOW_DETAIL * view.detail_mm))
+    return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
+
+
+def _sky(view: View, normals: Array) -> Array:
+    """0..1: the sky seen by each point: the half above, dimmer on the table close to the object."""
+    px = view.camera.px
+    beside = cv2.GaussianBlur(view.is_object.reshape(px, px).astype(np.float64), (0, 0), 0.03 * px).ravel()
+    return (0.6 + 0.4 * normals[:, 2]) * np.where(view.is_object, 1.0, 1.0 - 0.45 * beside)
+
+
+def _highlight(view: View, normals: Array, light: Array, lit: Array) -> Array:
+    """Blinn's highlight of the object's pixels; the rougher the material, the wider and weaker."""
+    half = light - view.camera.rays
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    material = view.obj.material
+    sharpness = 4.0 + 120.0 * (1.0 - material.roughness) ** 2
+    cosine = np.maximum(np.einsum("ij,ij->i", normals, half), 0.0)
+    strength = np.where(view.is_object, material.gloss, 0.03) * (sharpness + 8.0) / 60.0
+    return np.asarray(strength * cosine**sharpness * (lit > 0))
+
+
+def _albedo(view: View, lighting: Lighting) -> Array:
+    """Linear reflectance of each pixel, 0..1."""
+    albedo = _table(lighting.table_seed, view.points) ** _GAMMA
+    albedo[view.is_object] = view.obj.looks.albedo(view.placement.to_object(view.points[view.is_object]))
+    return albedo
+
+
+def _table(seed: int, points: Array) -> Array:
+    """Colour (px * px, 3) of the table top under points of the rig frame: streaked like wood or speckled, but weakly."""
+    rng = np.random.default_rng([71, seed])
+    colour = np.clip(rng.uniform(0.35, 0.85) + rng.uniform(-0.08, 0.08, 3), 0, 1)
+    streaks, strength = int(rng.choice([24, 64, 160])), rng.uniform(0.02, 0.09)
+    grain = cv2.resize(rng.uniform(-1, 1, (160, streaks)).astype(np.float32), _TABLE_PX, interpolation=cv2.INTER_CUBIC)
+    grain += 0.5 * cv2.resize(rng.uniform(-1, 1, (9, 9)).astype(np.float32), _TABLE_PX)
+    at = (points[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
+    at = at.reshape(math.isqrt(len(points)), -1, 2)  # OpenCV wants pictures, and no side of more than 32,767
+    shade = cv2.remap(grain, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(np.clip(colour * (1 + strength * shade.reshape(-1, 1)), 0, 1))
+
+
+def _develop(linear: Array, noise_seed: int) -> Picture:
+    """Gamma, sensor noise of about 1.5 grey levels, 8 bits."""
+    rng = np.random.default_rng([72, noise_seed])
+    values = 255.0 * np.clip(linear, 0.0, 1.0) ** (1 / _GAMMA) + rng.normal(0.0, 1.5, linear.shape)
+    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
+
+
+# Depth ------------------------------------------------------------------------------------------------------
+
+
+def depth(view: View, noise_seed: int) -> npt.NDArray[np.float32]:
+    """(px, px) metres along the camera's axis, NaN where the sensor gives nothing.
+
+    Noise of 1.5 mm at 0.7 m that grows with the square of the distance, pixels that fly between an edge and what is
+    behind it, holes at grazing angles and on glossy surfaces, whole millimetres.
+    """
+    px = view.camera.px
+    rng = np.random.default_rng([73, noise_seed])
+    forward = view.camera.to_rig[:3, 2]
+    exact = (view.distance_mm * (view.camera.rays @ forward)).reshape(px, px)
+    noisy = _flying(exact, rng) + rng.normal(0.0, 1.5, exact.shape) * (exact / 700.0) ** 2
+    noisy[_holes(view, exact, rng)] = np.nan
+    return (np.round(noisy) / 1000.0).astype(np.float32)
+
+
+def _flying(exact: Array, rng: np.random.Generator) -> Array:
+    """Beside an edge a pixel may mix the near and the far surface."""
+    window = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(exact, window), cv2.dilate(exact, window)
+    mixed = near + rng.uniform(0.0, 1.0, exact.shape) * (far - near)
+    return np.where((far - near > 12.0) & (rng.uniform(size=exact.shape) < 0.35), mixed, exact)
+
+
+def _holes(view: View, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Where nothing comes back: steep surfaces, glossy ones now and then, and single pixels anywhere."""
+    px = view.camera.px
+    steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))
+    gloss = np.where(view.is_object, view.obj.material.gloss, 0.0).reshape(px, px)
+    chance = 0.003 + 0.5 * (steep > 6.0) + 0.06 * gloss
+    return np.asarray(rng.uniform(size=exact.shape) < chance)

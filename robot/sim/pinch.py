@@ -1,0 +1,235 @@
+"""Two fingers close on the object: what each meets, how deep it is pressed, how wide the jaws stand, whether it holds.
+
+Gripper frame: x along the closing direction, z up, origin between the fingertips. Finger a comes from -x and looks
+along +x, finger b the other way. A gel's grid has its rows downward (-z) and its columns to the finger's right.
+Each part is worked out when it is asked for, and once.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Pose
+from robot.errors import SceneError
+from robot.sim.camera import Placement
+from robot.sim.contact import Contact, press
+from robot.sim.gel import GelSensor
+from robot.sim.objects import SimObject
+
+Array = npt.NDArray[np.float64]
+Picture = npt.NDArray[np.uint8]
+GRAVITY_M_S2 = 9.81
+SIDES = {"a": 1.0, "b": -1.0}
+"""The way each finger looks along the gripper's x."""
+
+_START_MM = 400.0
+"""Rays towards the object start this far from the closing plane, outside any object that a gripper meets."""
+_TURNS_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
+_REST_RAD = math.radians(0.5)
+"""The object ends at most this far from the position towards which the jaws turn it."""
+
+_SQUEEZED = 0.2
+
+PAD_MM = (15.2, 20.3)
+"""Height and width of a bare finger's pad."""
+
+_FEELERS = (5, 9)
+"""Rows and columns of the coarse grid with which the turning of the object is worked out."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What of the gripper matters here. `safety`: friction must carry this many times the weight, for the lift.
+
+    `grid` and `tolerance` are those of the contact solver: what they cost in error is measured by `frontier`.
+    """
+
+    stroke_mm: float = 110.0
+    safety: float = 1.5
+    grid: tuple[int, int] = (120, 160)
+    tolerance: float = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Pinch:
+    """The jaws closed at `pose` from `opening_mm` with `force_n` on each finger; `sensors` are the fingers that feel.
+
+    A finger without a sensor is a bare rigid one. `seed` draws how far from square the object ends; `passes` counts
+    the work done, by name.
+    """
+
+    obj: SimObject
+    placement: Placement
+    pose: Pose
+    force_n: float
+    opening_mm: float
+    sensors: Mapping[str, GelSensor]
+    hand: Hand
+    seed: int
+    passes: Counter[str]
+    _solved: dict[str, Contact] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Raises SceneError for a force that no gripper has."""
+        if not (math.isfinite(self.force_n) and self.force_n > 0):
+            raise SceneError(f"a grip's force_n must be positive and finite, got {self.force_n}")
+        if not 0 < self.opening_mm <= self.hand.stroke_mm:
+            raise SceneError(f"opening_mm must be above 0, at most {self.hand.stroke_mm:g}; got {self.opening_mm}")
+
+    # Where the object ends ----------------------------------------------------------------------------------
+
+    @cached_property
+    def turned(self) -> Placement:
+        """The object as the closing jaws turn it: towards the nearest position in which they come closest together.
+
+        The jaws push it while they close, so that flat sides end square to the fingers but for a few degrees.
+        """
+        reach = self._reaches.sum(axis=1)
+        reach[np.isinf(reach)] = -np.inf  # turned away from a finger is not narrow
+        step = len(_TURNS_RAD) // 2
+        while 0 < step < len(reach) - 1:
+            further = max(step - 1, step + 1, key=lambda other: float(reach[other]))
+            if not reach[further] > reach[step] + 1e-3:
+                break
+            step = further
+        rest = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _REST_RAD
+        return self._turn(float(_TURNS_RAD[step]) + rest)
+
+    def _turn(self, angle: float) -> Placement:
+        return Placement(self.placement.x_mm, self.placement.y_mm, self.placement.yaw_rad + angle)
+
+    @cached_property
+    def _reaches(self) -> Array:
+        """(turns, fingers): how far along its rays each finger goes until it touches; inf where it meets nothing."""
+        self.passes["turn"] += 1
+        rays = [self._rays(side, _FEELERS, self._turn(angle)) for angle in _TURNS_RAD for side in SIDES.values()]
+        starts, directions = (np.concatenate(parts) for parts in zip(*rays, strict=True))
+        reach = self.obj.body.cast(starts, directions)
+        return np.asarray(reach.reshape(len(_TURNS_RAD), len(SIDES), -1).min(axis=2))
+
+    def _rays(self, side: float, grid: tuple[int, int], placement: Placement) -> tuple[Array, Array]:
+        """Starts and directions, in the object's frame, of parallel rays from the pad of a finger."""
+        height, width = self._field_mm
+        z = height * (0.5 - (np.arange(grid[0]) + 0.5) / grid[0])
+        y = -side * width * ((np.arange(grid[1]) + 0.5) / grid[1] - 0.5)
+        yy, zz = np.meshgrid(y, z)
+        local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
+        grip = Placement(yaw_rad=self.pose.yaw_rad).rotation()
+        starts = placement.to_object(local @ grip.T + [self.pose.x_mm, self.pose.y_mm, self.pose.z_mm])
+        return starts, np.broadcast_to((side * grip[:, 0]) @ placement.rotation(), starts.shape)
+
+    @cached_property
+    def _field_mm(self) -> tuple[float, float]:
+        return next(iter(self.sensors.values())).field_mm if self.sensors else PAD_MM
+
+    @cached_property
+    def missed(self) -> str | None:
+        """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between."""
+        reach = self._reaches[len(_TURNS_RAD) // 2]
+        if (reach < _START_MM - self.opening_mm / 2).any():
+            return "a finger comes down on the object"
+        if not np.isfinite(self._walls["a"]).any() or not np.isfinite(self._walls["b"]).any():
+            return "the object is not between the fingers"
+        return None
+
+    @cached_property
+    def _walls(self) -> dict[str, Array]:
+        """Distance along each finger's rays to the turned object; a bare finger feels its way on the coarse grid."""
+        return {finger: self._wall(finger) for finger in SIDES}
+
+    def _wall(self, finger: str) -> Array:
+        grid = self.hand.grid if finger in self.sensors else _FEELERS
+        self.passes["wall" if finger in self.sensors else "feel"] += 1
+        return self.obj.body.cast(*self._rays(SIDES[finger], grid, self.turned)).reshape(grid)
+
+    # What the fingers feel ----------------------------------------------------------------------------------
+
+    def gap(self, finger: str) -> Array:
+        """(rows, columns) mm from the gel at first touch to the object; inf where there is none."""
+        return np.asarray(self._walls[finger] - self._walls[finger].min())
+
+    def contact(self, finger: str) -> Contact:
+        """The gel of one finger pressed against the object's side. Only where the fingers did not miss."""
+        if finger not in self._solved:
+            self.passes["contact"] += 1
+            self._solved[finger] = press(
+                self.gap(finger),
+                self._pixel_mm,
+                self.sensors[finger].layer,
+                force_n=self.force_n,
+                object_modulus_mpa=self.obj.material.modulus_mpa,
+                object_poisson=self.obj.material.poisson,
+                tolerance=self.hand.tolerance,
+            )
+        return self._solved[finger]
+
+    def touch(self, finger: str, noise_seed: int) -> Picture:
+        """The gel image while the object is held."""
+        if self.missed:
+            return self.sensors[finger].background(noise_seed)
+        self.passes["gel"] += 1
+        return self.sensors[finger].render(self.contact(finger).displacement_mm, noise_seed)
+
+    # What comes of it ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def closed_mm(self) -> float:
+        """Opening when the jaws have come to rest: 0 for a miss, else the width less what gels and object give way.
+
+        A soft object is never squeezed below a fifth of its width, where linear elasticity has long ceased to hold.
+        """
+        if self.missed:
+            return 0.0
+        width = 2 * _START_MM - sum(float(wall.min()) for wall in self._walls.values())
+        gives_way = sum(self.contact(finger).approach_mm for finger in self.sensors)
+        return max(width - gives_way, _SQUEEZED * width)
+
+    @cached_property
+    def slip(self) -> str | None:
+        """Why the object is lost in the lift, or None. Coulomb friction, a hard-finger model.
+
+        The weight must stay below what both fingers' friction carries; the line between the contacts and the mean
+        slope under each finger must lie within the friction cone (Nguyen 1988).
+        """
+        if self.missed:
+            return self.missed
+        friction, weight = self.obj.material.friction, self.obj.mass_kg * GRAVITY_M_S2
+        if 2 * friction * self.force_n < self.hand.safety * weight:
+            return "the object is too heavy for the friction"
+        a, b = self._centres["a"], self._centres["b"]
+        if math.hypot(*(a - b)[1:]) > friction * abs(a[0] - b[0]):
+            return "the fingers press past each other"
+        if any(_mean_slope(self.contact(finger), self._pixel_mm) > friction for finger in self.sensors):
+            return "the side is too steep"
+        return None
+
+    @property
+    def _pixel_mm(self) -> float:
+        return self._field_mm[1] / self.hand.grid[1]
+
+    @cached_property
+    def _centres(self) -> dict[str, Array]:
+        """(x, y, z) of each contact in the gripper frame: the centre of pressure, or a bare finger's nearest point."""
+        return {finger: self._centre(finger) for finger in SIDES}
+
+    def _centre(self, finger: str) -> Array:
+        wall, (height, width) = self._walls[finger], self._field_mm
+        felt = finger in self.sensors
+        weight = self.contact(finger).pressure_mpa if felt else (wall <= wall.min() + 0.1).astype(np.float64)
+        rows, columns = np.indices(wall.shape)
+        share = weight / weight.sum()
+        z = height * (0.5 - ((rows + 0.5) * share).sum() / wall.shape[0])
+        y = -SIDES[finger] * width * (((columns + 0.5) * share).sum() / wall.shape[1] - 0.5)
+        return np.array([SIDES[finger] * (float(wall.min()) - _START_MM), y, z])
+
+
+def _mean_slope(contact: Contact, pixel_mm: float) -> float:
+    """Tangent of the angle between the closing direction and the resultant force of a frictionless contact."""
+    along = np.gradient(contact.displacement_mm, pixel_mm)
+    total = contact.pressure_mpa.sum()
+    return math.hypot(*(float((contact.pressure_mpa * slope).sum() / total) for slope in along))

@@ -1,0 +1,128 @@
+"""A contact sheet that a person can look at: photo, depth, gels before and during, and the wall that each gel met."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import RecordingError
+from robot.recording import RecordedGrasp, read_recording
+from robot.rig import load_rig
+from robot.sim.rig import SimRig
+from robot.storage import storage_errors, write_file
+
+Picture = npt.NDArray[np.uint8]
+TILE_PX = 160
+_HEADER_PX = 24
+_CAPTION_PX = 20
+_DEEPEST_MM = 3.0
+"""Walls are drawn from touched (bright) to this far behind (dark)."""
+
+
+def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
+    """Write a PNG with one grasp of each of up to `rows` objects of a simulated recording, evenly chosen.
+
+    The walls are simulated once more from seed, attempt, pose and force. Raises RecordingError, StorageError.
+    """
+    recording = read_recording(folder)
+    rig = _rig(recording.folder, recording.info)
+    chosen = _one_each(recording.grasps, rows)
+    sheet = np.vstack([_header(tuple(rig.sensors)), *(_row(recording.folder, grasp, rig) for grasp in chosen)])
+    data = cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
+    with storage_errors(Path(out).parent):
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        write_file(Path(out), data)
+    return Path(out)
+
+
+def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
+    """The rig that made the recording."""
+    if info.get("rig") != "sim":
+        raise RecordingError(f"{folder} must be of the simulated rig for a preview with walls, got {info.get('rig')!r}")
+    rig = load_rig("sim", seed=info["seed"], **info["rig_settings"])
+    assert isinstance(rig, SimRig)
+    return rig
+
+
+def _one_each(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
+    """The first accepted grasp of each of up to `rows` objects; of all grasps where none was accepted."""
+    accepted = [grasp for grasp in grasps if grasp.grasped is not False] or list(grasps)
+    first: dict[str, RecordedGrasp] = {}
+    for grasp in accepted:
+        first.setdefault(grasp.object_id, grasp)
+    names = list(first)
+    if not names:
+        raise RecordingError("a preview needs a recording with at least one grasp; this one holds none")
+    picked = np.linspace(0, len(names) - 1, min(rows, len(names))).round().astype(int)
+    return [first[names[index]] for index in picked]
+
+
+def _header(fingers: Sequence[str]) -> Picture:
+    titles = ["photo", "depth"]
+    for finger in fingers:
+        titles += [f"gel {finger} before", f"gel {finger} during", f"wall at {finger}, mm"]
+    return np.hstack([_caption(title, TILE_PX, _HEADER_PX) for title in titles])
+
+
+def _row(folder: Path, grasp: RecordedGrasp, rig: SimRig) -> Picture:
+    """Tiles of one grasp, with its name and force below."""
+    tiles = [_tile(_read(folder, grasp.photo)), _tile(_depth(folder, grasp))]
+    walls = rig.walls(grasp)
+    for finger in rig.sensors:
+        for images in (grasp.touches_before, grasp.touches):
+            tiles.append(_tile(_read(folder, images.get(finger))))
+        tiles.append(_tile(_coloured(walls.get(finger), _DEEPEST_MM)))
+    row = np.hstack(tiles)
+    text = (
+        f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm   {grasp.outcome or ''}"
+    )
+    return np.vstack([row, _caption(text, row.shape[1], _CAPTION_PX)])
+
+
+def _read(folder: Path, path: str | None) -> Picture | None:
+    """RGB pixels of an image of the recording; None where it was not recorded."""
+    image = None if path is None else cv2.imread(str(folder / path), cv2.IMREAD_COLOR)
+    return None if image is None else np.asarray(image[..., ::-1], np.uint8)
+
+
+def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
+    """The depth image as colours over its own range; holes are black."""
+    if grasp.depth is None:
+        return None
+    image = cv2.imread(str(folder / grasp.depth), cv2.IMREAD_UNCHANGED)
+    if image is None or not image.any():
+        return None
+    depth = image.astype(np.float64)
+    known = depth > 0
+    return _coloured(np.where(known, depth - depth[known].min(), np.inf), float(np.ptp(depth[known])))
+
+
+def _coloured(distance: npt.NDArray[Any] | None, deepest: float) -> Picture | None:
+    """Near is bright, `deepest` and beyond dark, nothing at all (inf) black."""
+    if distance is None:
+        return None
+    level = 255 * (1 - np.clip(distance / max(deepest, 1e-6), 0, 1))
+    colours = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where(np.isfinite(distance)[..., None], colours, 0).astype(np.uint8)
+
+
+def _tile(image: Picture | None) -> Picture:
+    """Fit into a square tile, a grey one where there is no image."""
+    tile = np.full((TILE_PX, TILE_PX, 3), 238, np.uint8)
+    if image is not None:
+        scale = (TILE_PX - 4) / max(image.shape[:2])
+        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        top, left = (TILE_PX - size[1]) // 2, (TILE_PX - size[0]) // 2
+        tile[top : top + size[1], left : left + size[0]] = small
+    return tile
+
+
+def _caption(text: str, width: int, height: int) -> Picture:
+    strip = np.full((height, width, 3), 255, np.uint8)
+    return np.asarray(
+        cv2.putText(strip, text, (4, height - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA)
+    )

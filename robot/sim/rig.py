@@ -1,0 +1,329 @@
+"""The simulated rig: devices like any other, over one Scene. An attempt is a pure function of (seed, object, number)."""
+
+import dataclasses
+import math
+import zlib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import RGBD, Arm, Box, Frame, Gripper, GripperState, Intrinsics, Pose, TactileSensor
+from robot.devices import Camera as CameraDevice
+from robot.errors import DeviceError, RecordingError, RobotConfigError
+from robot.recorded_grasp import RecordedGrasp
+from robot.rig import Rig
+from robot.sim.camera import Camera, Placement
+from robot.sim.gel import draw_sensor
+from robot.sim.objects import SimObject, draw_object
+from robot.sim.pinch import PAD_MM, SIDES, Hand
+from robot.sim.scene import Grip, Scene
+from robot.sim.shapes import SHAPES
+
+Array = npt.NDArray[np.float64]
+STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
+"""Of the Weiss WSG-50 that is simulated: distance of the jaws, and its clamping force."""
+
+_ATTEMPT_S = 40.0
+_WORKSPACE = Box((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
+_TABLE_MM = 20.0
+"""Objects stand at most this far from the centre of the workspace in x and y."""
+
+
+class SimClock:
+    """Time that passes only when something is done."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now_s += seconds
+
+
+class World:
+    """What the devices share: the scene of this attempt, where the hand is, what it holds, and the time."""
+
+    def __init__(self, clock: SimClock) -> None:
+        self.clock = clock
+        self.scene: Scene | None = None
+        self.pose = Pose(0.0, 0.0, 300.0, 0.0)
+        self.opening_mm = STROKE_MM
+
+    def now(self) -> Scene:
+        """The scene of this attempt. Raises DeviceError before there is one."""
+        if self.scene is None:
+            raise DeviceError("nothing stands on the simulated table yet; call prepare(object_id, number) first")
+        return self.scene
+
+    @property
+    def lifted(self) -> bool:
+        """Whether the hand has left the place where it closed."""
+        grip = self.now().grip
+        return grip is not None and self.pose.z_mm > grip.pose.z_mm + 1.0
+
+
+class SimRig(Rig):
+    """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
+
+    `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `families`: only these shapes.
+    `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). `contact_grid` (rows,
+    columns) and `contact_tolerance` of the contact solver; `shadow`: whether the lamp casts one; `localisation_mm`:
+    how far off the camera's calibration is, drawn from this range. Raises RobotConfigError, UnknownName, SceneError.
+    """
+
+    can_run_jobs: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        fingers: Sequence[str] = ("a", "b"),
+        optics: str = "led",
+        families: Sequence[str] = (),
+        meshes: str = "",
+        contact_grid: Sequence[int] = (120, 160),
+        contact_tolerance: float = 1e-2,
+        shadow: bool = True,
+        localisation_mm: Sequence[float] = (5.0, 10.0),
+    ) -> None:
+        _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
+        self._seed, self._families, self._meshes = seed, tuple(sorted(families)), meshes
+        self._shadow = shadow
+        self._hand = Hand(STROKE_MM, grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
+        self._sensors = {finger: draw_sensor(seed, finger, optics=optics) for finger in sorted(fingers)}
+        clock = SimClock()
+        self.world = World(clock)
+        super().__init__(
+            SimArm(self.world),
+            SimGripper(self.world),
+            {finger: SimTactileSensor(self.world, finger) for finger in self._sensors},
+            SimCamera(self.world, Camera(), _calibration_error(seed, localisation_mm)),
+            info={
+                "source": "simulated rig",
+                "sensor": f"simulated GelSight ({optics} optics)",
+                "rig": "sim",
+                "fingers": sorted(fingers),
+            },
+            clock=clock,
+            sleep=clock.sleep,
+        )
+
+    def object_ids(self, count: int) -> list[str]:
+        """The first `count` objects of this seed. Raises RobotConfigError for more meshes than there are."""
+        return [self._object(index).object_id for index in range(count)]
+
+    def prepare(self, object_id: str, number: int) -> None:
+        """Stand the object on the table, turned and placed at random, under new light."""
+        obj = self._find(object_id)
+        stream = [self._seed, zlib.crc32(object_id.encode()), number]
+        rng = np.random.default_rng([101, *stream])
+        x, y = rng.uniform(-_TABLE_MM, _TABLE_MM, 2)
+        placement = Placement(float(x), float(y), float(rng.uniform(0.0, 2.0 * math.pi)))
+        self.world.scene = Scene(
+            obj,
+            placement,
+            sensors=self._sensors,
+            hand=self._hand,
+            seed=int(rng.integers(2**31)),
+            shadow=self._shadow,
+        )
+        self.world.clock.now_s = number * _ATTEMPT_S
+
+    def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
+        """Distance (mm) of the object from each gel at first touch, simulated again from what was recorded.
+
+        (rows, columns) of the contact grid, inf where the finger meets nothing; empty for a miss.
+        """
+        if grasp.pose is None or grasp.force_n is None:
+            raise RecordingError(f"{grasp.grasp_id} must have a pose and a force for its walls to be simulated again")
+        self.prepare(grasp.object_id, int(grasp.grasp_id.rsplit("-", 1)[-1]))
+        scene = dataclasses.replace(self.world.now(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
+        return {} if scene.pinch.missed else {finger: scene.pinch.gap(finger) for finger in self.sensors}
+
+    def _find(self, object_id: str) -> SimObject:
+        """The object of this name: procedural ones end in their index, meshes begin with their file's name."""
+        if self._meshes:
+            candidates = [_mesh(path, self._seed) for path in _mesh_files(self._meshes) if _may_be(object_id, path)]
+        else:
+            index = object_id.rsplit("-", 1)[-1]
+            candidates = [self._object(int(index))] if index.isdecimal() else []
+        for candidate in candidates:
+            if candidate.object_id == object_id:
+                return candidate
+        raise RobotConfigError(f"the simulated rig with seed {self._seed} and these settings has no {object_id!r}")
+
+    def _object(self, index: int) -> SimObject:
+        if not self._meshes:
+            return _procedural(self._seed, index, self._families)
+        paths = _mesh_files(self._meshes)
+        if index >= len(paths):
+            raise RobotConfigError(f"{self._meshes} must hold as many STL, OBJ or PLY as objects; it has {len(paths)}")
+        return _mesh(paths[index], self._seed)
+
+
+# An object keeps its baked relief, and a mesh its search tree, from attempt to attempt.
+
+
+@lru_cache(maxsize=4)
+def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
+    return draw_object(seed, index, family=families[index % len(families)] if families else None)
+
+
+@lru_cache(maxsize=4)
+def _mesh(path: Path, seed: int) -> SimObject:
+    from robot.sim.mesh import load_mesh_object
+
+    return load_mesh_object(path, seed)
+
+
+def _mesh_files(folder: str) -> list[Path]:
+    """Raises RobotConfigError for a folder that is none."""
+    if not Path(folder).is_dir():
+        raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
+    return sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in (".stl", ".obj", ".ply"))
+
+
+def _may_be(object_id: str, path: Path) -> bool:
+    """Whether the file's name fits, so that not every mesh must be read."""
+    from robot.sim.mesh import object_prefix
+
+    return object_id.startswith(object_prefix(path))
+
+
+def _check_settings(
+    fingers: Sequence[str],
+    families: Sequence[str],
+    grid: Sequence[int],
+    tolerance: float,
+    localisation_mm: Sequence[float],
+) -> None:
+    if not fingers or len(set(fingers)) != len(fingers) or set(fingers) - set(SIDES):
+        raise RobotConfigError(f'fingers must be ["a"], ["b"] or ["a", "b"], got {list(fingers)}')
+    if unknown := sorted(set(families) - set(SHAPES)):
+        raise RobotConfigError(f"families must be of {', '.join(sorted(SHAPES))}; got {unknown[0]!r}")
+    whole = len(grid) == 2 and all(isinstance(count, int) and 3 <= count <= 2000 for count in grid)
+    if not whole or 4 * grid[0] != 3 * grid[1]:
+        raise RobotConfigError(f"contact_grid must be two whole numbers, 3 rows to 4 columns, got {list(grid)}")
+    if not 0 < tolerance < 1:
+        raise RobotConfigError(f"contact_tolerance must be between 0 and 1, got {tolerance}")
+    if len(localisation_mm) != 2 or not 0 <= localisation_mm[0] <= localisation_mm[1] < math.inf:
+        raise RobotConfigError(f"localisation_mm must be a range of two lengths, got {list(localisation_mm)}")
+
+
+def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
+    """(3,) how far, in mm, the camera believes itself from where it is."""
+    rng = np.random.default_rng([102, seed])
+    turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(localisation_mm[0], localisation_mm[1])
+    return np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
+
+
+# Devices ----------------------------------------------------------------------------------------------------
+
+
+class SimArm(Arm):
+    """Goes where it is told, at once but for the clock."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__("simulated arm", _WORKSPACE, clock=world.clock)
+        self._world = world
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
+        before = self._world.pose.as_tuple()[:3]
+        self._world.clock.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
+        self._world.pose = pose
+        return pose
+
+    def _pose(self) -> Pose:
+        return self._world.pose
+
+
+class SimGripper(Gripper):
+    """Closes on what stands between its fingers; what it reports comes from the mechanics of the pinch."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__(
+            "simulated gripper", stroke_mm=STROKE_MM, min_force_n=FORCE_N[0], max_force_n=FORCE_N[1], clock=world.clock
+        )
+        self._world = world
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _settings(self) -> dict[str, Any]:
+        return {"stroke_mm": STROKE_MM, "force_n": list(FORCE_N)}
+
+    def _open(self, opening_mm: float) -> GripperState:
+        world = self._world
+        world.opening_mm = opening_mm
+        if world.scene is not None and world.scene.grip is not None:
+            world.scene = dataclasses.replace(world.scene, grip=None)
+        return self._state()
+
+    def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
+        world = self._world
+        grip = Grip(world.pose, force_n, world.opening_mm)
+        world.scene = dataclasses.replace(world.now(), grip=grip)
+        world.clock.sleep(world.opening_mm / speed_mm_s)
+        return self._state()
+
+    def _state(self) -> GripperState:
+        scene = self._world.scene
+        if scene is None or scene.grip is None:
+            return GripperState(self._world.opening_mm, 0.0, "idle")
+        pinch = scene.pinch
+        if pinch.missed:
+            return GripperState(0.0, 0.0, "no_part")
+        if self._world.lifted and pinch.slip:
+            return GripperState(0.0, 0.0, "part_lost")
+        return GripperState(pinch.closed_mm, scene.grip.force_n, "holding")
+
+
+class SimTactileSensor(TactileSensor):
+    """The gel of one finger: untouched, pressed, or after the lift."""
+
+    def __init__(self, world: World, finger: str) -> None:
+        super().__init__(f"simulated gel {finger}", finger, clock=world.clock)
+        self._world = world
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _read(self) -> Frame:
+        scene = self._world.now()
+        moment = "_before" if scene.grip is None else "_after" if self._world.lifted else ""
+        return Frame(scene.image(f"touch_{self.finger}{moment}"), self.clock())
+
+
+class SimCamera(CameraDevice):
+    """Looks at the table; it knows where it stands only as well as it was calibrated."""
+
+    def __init__(self, world: World, camera: Camera, error_mm: Array) -> None:
+        believed = camera.to_rig.copy()
+        believed[:3, 3] += error_mm
+        super().__init__("simulated camera", believed, clock=world.clock)
+        self._world, self._camera = world, camera
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _settings(self) -> dict[str, Any]:
+        return {"px": self._camera.px, "focal_px": self._camera.focal_px}
+
+    def _read(self, depth: bool) -> RGBD:
+        scene, centre = self._world.now(), (self._camera.px - 1) / 2
+        lens = Intrinsics(self._camera.focal_px, self._camera.focal_px, centre, centre)
+        return RGBD(scene.image("photo"), scene.image("depth") if depth else None, lens, self.clock())

@@ -1,0 +1,130 @@
+"""What the simulated rig holds for one grasp: an object on a table, fingers, a camera, and WHICH OUTPUTS ARE WANTED.
+
+    scene = Scene(draw_object(0, 3), outputs={"photo", "touch_a"}, grip=Grip(Pose(0, 0, 60, 0.4), force_n=12))
+    images = scene.run()        # {"photo": (256, 256, 3) uint8, "touch_a": (240, 320, 3) uint8}
+
+Outputs have the names of a recording's image columns. Nothing is computed that no output needs: `scene.passes` counts
+what was (view, photo, shadow, depth, turn, wall, feel, contact, gel, background).
+"""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Pose
+from robot.errors import SceneError
+from robot.sim import camera as cameras
+from robot.sim.camera import Camera, Lighting, Placement
+from robot.sim.gel import GelSensor
+from robot.sim.objects import SimObject
+from robot.sim.pinch import SIDES, Hand, Pinch
+
+_TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
+_MOMENTS = {"_before": 1, None: 2, "_after": 3}
+
+
+@dataclass(frozen=True)
+class Grip:
+    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger."""
+
+    pose: Pose
+    force_n: float
+    opening_mm: float = 110.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One object on the table, and what is done to it. `seed` draws light, noise and how the object settles.
+
+    `sensors` are the fingers that feel, by letter; leave one out and the finger is bare. Raises SceneError for what
+    cannot be: an unknown output, a touch without its sensor or without a grip, a finger that no gripper has.
+    """
+
+    obj: SimObject
+    placement: Placement = Placement()
+    camera: Camera = Camera()
+    sensors: Mapping[str, GelSensor] = field(default_factory=dict)
+    hand: Hand = Hand()
+    grip: Grip | None = None
+    seed: int = 0
+    shadow: bool = True
+    outputs: Set[str] = frozenset()
+    passes: Counter[str] = field(default_factory=Counter, repr=False)
+
+    def __post_init__(self) -> None:
+        if unknown := sorted(set(self.sensors) - set(SIDES)):
+            raise SceneError(f"a parallel gripper has the fingers a and b, got {unknown[0]!r}")
+        for name in sorted(self.outputs):
+            self._check(name)
+
+    def _check(self, name: str) -> None:
+        touch = _TOUCH.fullmatch(name)
+        if touch is None and name not in ("photo", "depth"):
+            raise SceneError(f"outputs are photo, depth and touch_a, touch_a_before, touch_a_after, ...; got {name!r}")
+        if touch and touch[1] not in self.sensors:
+            raise SceneError(f"{name} needs a sensor on finger {touch[1]}; this scene has {sorted(self.sensors)}")
+        if touch and touch[2] != "_before" and self.grip is None:
+            raise SceneError(f"{name} needs a grip; give Scene(grip=Grip(pose, force_n))")
+
+    def run(self) -> dict[str, npt.NDArray[Any]]:
+        """The wanted outputs by name, and nothing else."""
+        return {name: self.image(name) for name in sorted(self.outputs)}
+
+    def image(self, name: str) -> npt.NDArray[Any]:
+        """One output: colour (H, W, 3) uint8; `depth` (H, W) float32 in metre, NaN where unknown."""
+        self._check(name)
+        if name == "photo":
+            return self._photo()
+        if name == "depth":
+            self.passes["depth"] += 1
+            return cameras.depth(self._view, self._noise(0, 1))
+        touch = _TOUCH.fullmatch(name)
+        assert touch is not None
+        return self._touch(touch[1], touch[2])
+
+    def _photo(self) -> npt.NDArray[np.uint8]:
+        self.passes.update(["photo", "shadow"] if self.shadow else ["photo"])
+        lighting = Lighting.draw(np.random.default_rng([91, self.seed]))
+        return cameras.photo(self._view, lighting, self._noise(0, 0), self.shadow)
+
+    @cached_property
+    def _view(self) -> cameras.View:
+        """What the camera meets; photo and depth share it."""
+        self.passes["view"] += 1
+        return cameras.look(self.obj, self.placement, self.camera)
+
+    @cached_property
+    def pinch(self) -> Pinch:
+        """The mechanics of the grip, each part worked out when asked for."""
+        if self.grip is None:
+            raise SceneError("no grip in this scene; give Scene(grip=Grip(pose, force_n))")
+        grip = self.grip
+        return Pinch(
+            obj=self.obj,
+            placement=self.placement,
+            pose=grip.pose,
+            force_n=grip.force_n,
+            opening_mm=grip.opening_mm,
+            sensors=self.sensors,
+            hand=self.hand,
+            seed=self.seed,
+            passes=self.passes,
+        )
+
+    def _touch(self, finger: str, moment: str | None) -> npt.NDArray[np.uint8]:
+        """The gel image before, while and after holding; a gel that lost its object is a background."""
+        noise = self._noise(_MOMENTS[moment], ord(finger))
+        if moment == "_before" or (moment == "_after" and self.pinch.slip):
+            self.passes["background"] += 1
+            return self.sensors[finger].background(noise)
+        return self.pinch.touch(finger, noise)
+
+    def _noise(self, *stream: int) -> int:
+        """A seed of its own for each frame of this scene."""
+        return int(np.random.default_rng([92, self.seed, *stream]).integers(2**31))

@@ -1,0 +1,380 @@
+"""Three solids that may stand on a table, fitted to one-sided noisy points: upright cylinder, box, lying cylinder.
+
+Points are (N, 3) in mm with z above the table. All three are judged by the same yardstick, the distance of every point
+from the solid's surface, so that they can be compared (BIC). Surface distances are those of a product of intervals and
+discs: with q the signed distances beyond each pair of faces, it is |max q| inside and the norm of max(q, 0) outside.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+CUT = 3.0
+"""Residuals count up to so many times the noise: beyond, a point is an outlier and costs the same wherever it is."""
+_SPACING_MM = 6.0
+"""Distance to the next of some 300 points on an object of usual size: nothing nearer can be told from seen."""
+_HYPOTHESES = 200
+_ROUNDS = 12
+_NEAR_SIDE = 0.3
+"""Points of a visible side lie at most this share of the radius behind the centre; noise and relief have room."""
+
+
+class Solid(ABC):
+    """A solid on the table: its centre in plan, and its half sizes along `yaw_rad` and across."""
+
+    parameters: int
+    x: float
+    y: float
+    height: float
+    yaw_rad: float
+
+    @property
+    @abstractmethod
+    def half(self) -> tuple[float, float]:
+        """Half sizes in plan: along the axis and across it."""
+
+    @abstractmethod
+    def beyond(self, points: Array) -> tuple[Array, ...]:
+        """Signed distances (N,) beyond each pair of faces, negative between them."""
+
+    def distance(self, points: Array) -> Array:
+        """(N,) distance of points from the surface."""
+        q = np.stack(self.beyond(points))
+        outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(0))
+        return np.asarray(np.where(outside > 0, outside, -q.max(0)))
+
+    @abstractmethod
+    def surface(self) -> tuple[Array, Array]:
+        """(M, 3) points all over the surface but its bottom, and their outward normals."""
+
+    def misfit(self, points: Array, noise_mm: float, eye: Array) -> float:
+        """Bayesian information criterion, outliers cut off, of what is seen and of what should be seen from eye (3,).
+
+        The first alone would let a solid reach far behind what is seen.
+        """
+        squared = np.minimum((self.distance(points) / noise_mm) ** 2, CUT**2)
+        surface, normals = self.surface()
+        facing = surface[((eye - surface) * normals).sum(1) > 0]
+        missed = np.minimum(_nearest_squared(facing, _thinned(points)) / max(noise_mm, _SPACING_MM) ** 2, CUT**2)
+        return float(squared.sum() + len(points) * missed.mean()) + self.parameters * math.log(len(points))
+
+
+@dataclass(frozen=True)
+class Upright(Solid):
+    """A cylinder that stands."""
+
+    x: float
+    y: float
+    radius: float
+    height: float
+    yaw_rad: float = 0.0
+    parameters = 4
+
+    @property
+    def half(self) -> tuple[float, float]:
+        return self.radius, self.radius
+
+    def beyond(self, points: Array) -> tuple[Array, ...]:
+        rho = np.hypot(points[:, 0] - self.x, points[:, 1] - self.y)
+        return rho - self.radius, _slab(points[:, 2] - self.height / 2, self.height / 2)
+
+    def surface(self) -> tuple[Array, Array]:
+        angle, z = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(0.1, 1.0, 6) * self.height)
+        c, s, flat = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+        side = np.stack([self.radius * c, self.radius * s, z], axis=1)
+        share = z / self.height  # the same grid serves as rings of the top
+        top = np.stack([self.radius * share * c, self.radius * share * s, flat + self.height], axis=1)
+        normals = [np.stack([c, s, flat], axis=1), np.stack([flat, flat, flat + 1], axis=1)]
+        return np.concatenate([side, top]) + np.array([self.x, self.y, 0.0]), np.concatenate(normals)
+
+
+@dataclass(frozen=True)
+class Block(Solid):
+    """A box that stands on a face."""
+
+    x: float
+    y: float
+    half_length: float
+    half_width: float
+    height: float
+    yaw_rad: float
+    parameters = 6
+
+    @property
+    def half(self) -> tuple[float, float]:
+        return self.half_length, self.half_width
+
+    def beyond(self, points: Array) -> tuple[Array, ...]:
+        along, across = turned(points[:, :2] - [self.x, self.y], self.yaw_rad).T
+        return (
+            _slab(along, self.half_length),
+            _slab(across, self.half_width),
+            _slab(points[:, 2] - self.height / 2, self.height / 2),
+        )
+
+    def surface(self) -> tuple[Array, Array]:
+        u, v = _grid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 7))
+        one, up = np.ones_like(u), 0.55 + 0.45 * v  # not the lowest tenth, where the table begins
+        faces = [(one, u, up), (-one, u, up), (u, one, up), (u, -one, up), (u, v, one)]
+        points = np.concatenate([np.stack(face, axis=1) for face in faces]) * [*self.half, self.height]
+        normals = np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
+        return _placed(points, normals, self)
+
+
+@dataclass(frozen=True)
+class Lying(Solid):
+    """A cylinder on its side."""
+
+    x: float
+    y: float
+    radius: float
+    half_length: float
+    yaw_rad: float
+    parameters = 5
+
+    @property
+    def height(self) -> float:  # type: ignore[override]
+        return 2 * self.radius
+
+    @property
+    def half(self) -> tuple[float, float]:
+        return self.half_length, self.radius
+
+    def beyond(self, points: Array) -> tuple[Array, ...]:
+        along, across = turned(points[:, :2] - [self.x, self.y], self.yaw_rad).T
+        return np.hypot(across, points[:, 2] - self.radius) - self.radius, _slab(along, self.half_length)
+
+    def surface(self) -> tuple[Array, Array]:
+        angle, u = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(-1, 1, 7))
+        c, s, flat = self.radius * np.cos(angle), self.radius * np.sin(angle), np.zeros_like(angle)
+        side = np.stack([self.half_length * u, c, s + self.radius], axis=1)
+        end = np.stack([self.half_length * np.sign(u), u * c, u * s + self.radius], axis=1)
+        normals = [np.stack([flat, c, s], axis=1), np.stack([np.sign(u), flat, flat], axis=1)]
+        return _placed(np.concatenate([side, end]), np.concatenate(normals), self)
+
+
+def _nearest_squared(points: Array, others: Array) -> Array:
+    """(N,) squared distance to the nearest of others, by |a|^2 + |b|^2 - 2 a b about the middle of the others."""
+    middle = others.mean(0)
+    a, b = points - middle, others - middle
+    squared = (a**2).sum(1) + ((b**2).sum(1)[:, None] - 2 * b @ a.T).min(0)
+    return np.asarray(np.maximum(squared, 0.0))
+
+
+def _grid(first: Array, second: Array) -> tuple[Array, Array]:
+    """All pairs."""
+    a, b = np.meshgrid(first, second)
+    return a.ravel(), b.ravel()
+
+
+def _placed(points: Array, normals: Array, solid: Solid) -> tuple[Array, Array]:
+    """From the solid's own frame to the table's."""
+    c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return points @ turn + [solid.x, solid.y, 0.0], normals @ turn
+
+
+def turned(plan: Array, yaw_rad: float) -> Array:
+    """(N, 2) coordinates along and across the direction of yaw."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.asarray(plan @ np.array([[c, -s], [s, c]]))
+
+
+def _slab(position: Array, half: float) -> Array:
+    return np.asarray(np.abs(position) - half)
+
+
+# Circles ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle in plan, and (3, 3) covariance of x, y and radius for a noise of 1 mm on each of its points."""
+
+    x: float
+    y: float
+    radius: float
+    covariance: Array
+    used: npt.NDArray[np.bool_]
+
+
+def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> Circle | None:
+    """Robust geometric circle through an arc seen from outside; None where no circle of that kind is there.
+
+    plan (N, 2). away (2,): direction of sight; the centre lies behind the arc. largest_mm: bound of the radius.
+    RANSAC over three points with truncated squares, then `refine_circle`.
+    """
+    found = _circle_hypothesis(plan, noise_mm, away, largest_mm)
+    return None if found is None else refine_circle(plan, *found, noise_mm, largest_mm, away)
+
+
+def refine_circle(
+    plan: Array,
+    centre: Array,
+    radius: float,
+    noise_mm: float,
+    largest_mm: float,
+    away: Array,
+    below: Array | None = None,
+) -> Circle | None:
+    """Gauss-Newton with Tukey's weights on |p - c| - r; None where the steps run away.
+
+    A side that faces away cannot be seen: points there are not on the circle. below (N,): how far each point lies
+    below a level top. One that is nearer to the top than to the side belongs to the top, of which the whole rim is
+    seen, and says nothing of the circle unless it lies outside.
+    """
+    edge = np.zeros(len(plan), bool) if below is None else below < 2 * noise_mm
+    for step in range(_ROUNDS):
+        arms = plan - centre
+        rho = np.maximum(np.hypot(arms[:, 0], arms[:, 1]), 1e-9)
+        error = rho - radius
+        weight = _tukey(error / noise_mm) * (edge | (arms @ away < _NEAR_SIDE * radius))
+        if below is not None:
+            weight = weight * (-error < np.maximum(below, 0.0))
+        design = np.c_[-arms / rho[:, None], -np.ones(len(plan))]
+        normal = design.T @ (design * weight[:, None]) + 1e-9 * np.eye(3)
+        move = -np.linalg.solve(normal, design.T @ (weight * error))
+        centre, radius = centre + move[:2], radius + float(move[2])
+        if not 0 < radius < largest_mm:
+            return None
+        if np.abs(move).max() < 1e-2 and step > 1:
+            break
+    return Circle(float(centre[0]), float(centre[1]), radius, np.linalg.inv(normal), weight > 0)
+
+
+def _tukey(scaled: Array) -> Array:
+    """Weight of residuals in units of the noise; 4.7 keeps 95 % of the efficiency for Gaussian noise."""
+    return np.asarray(np.maximum(1 - (scaled / 4.685) ** 2, 0.0) ** 2)
+
+
+def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> tuple[Array, float] | None:
+    """The circle through three points that misses the fewest others."""
+    rng = np.random.default_rng(0)
+    some = _thinned(plan)
+    a, b, c = np.moveaxis(some[rng.integers(len(some), size=(_HYPOTHESES, 3))], 1, 0)
+    centres, radii = _through(a, b, c)
+    behind = (centres - some.mean(0)) @ away > 0
+    good = np.isfinite(radii) & (radii < largest_mm) & behind
+    if not good.any():
+        return None
+    centres, radii = centres[good], radii[good]
+    gap = np.hypot(some[:, 0] - centres[:, :1], some[:, 1] - centres[:, 1:]) - radii[:, None]
+    behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
+    cost = np.where(behind, CUT**2, np.minimum((gap / noise_mm) ** 2, CUT**2))
+    best = int(cost.sum(1).argmin())
+    return centres[best], float(radii[best])
+
+
+def _through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+    """Centres (K, 2) and radii (K,) of circles through three points each; not finite for points in a line."""
+    ab, ac = b - a, c - a
+    cross = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    bb, cc = (ab**2).sum(1), (ac**2).sum(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (ac[:, 1] * bb - ab[:, 1] * cc) / cross
+        y = (ab[:, 0] * cc - ac[:, 0] * bb) / cross
+    return a + np.stack([x, y], axis=1), np.hypot(x, y)
+
+
+# Boxes and cylinders on their side --------------------------------------------------------------------------
+
+
+def fit_block(points: Array, height: float, eye: Array) -> Block:
+    """The box whose side faces the points below its top lie nearest to. eye (2,): the camera's foot on the table.
+
+    Faces that the camera sees lie at the median of their points, the others where the points in plan end.
+    """
+    centre = np.median(points[:, :2], axis=0)
+    plan = points[:, :2] - centre
+    below = points[:, 2] < height - 5.0
+    side = plan[below] if below.sum() > 20 else plan
+    coarse = _best_yaw(plan, side, np.radians(np.arange(0.0, 90.0, 6.0)))
+    yaw = _best_yaw(plan, side, coarse + np.radians(np.arange(-5.0, 5.1, 1.0)))
+    local = turned(plan, yaw)
+    low, high = _seen_faces(local, height - points[:, 2], *_extent(local), turned((eye - centre)[None], yaw)[0])
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2, 0.5)
+    x, y = turned(middle[None], -yaw)[0] + centre
+    if half[0] < half[1]:
+        half, yaw = half[::-1], yaw + math.pi / 2
+    return Block(float(x), float(y), float(half[0]), float(half[1]), height, yaw % math.pi)
+
+
+def _seen_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
+    """Put faces towards the eye at the median of the points that are nearest to them, the others where the top ends."""
+    faces = np.concatenate([low, high])
+    for _ in range(2):
+        gaps = np.abs(np.concatenate([local, local], axis=1) - faces)
+        nearest = np.c_[gaps, np.abs(below)].argmin(1)
+        top = local[nearest == 4]
+        for face, seen in enumerate((*(eye < low), *(eye > high))):
+            own = local[nearest == face, face % 2]
+            if seen and len(own) >= 10:
+                faces[face] = np.median(own)
+            elif not seen and len(top) >= 100:
+                faces[face] = np.quantile(top[:, face % 2], 0.005 if face < 2 else 0.995)
+    return faces[:2], faces[2:]
+
+
+def _extent(local: Array) -> tuple[Array, Array]:
+    """Least and greatest along the axis before the last one, 1 % of the points left out on either side."""
+    count = local.shape[-2]
+    skip = count // 100
+    ordered = np.partition(local, [skip, count - 1 - skip], axis=-2)
+    return ordered[..., skip, :], ordered[..., -1 - skip, :]
+
+
+def _best_yaw(plan: Array, side: Array, yaws: Array) -> float:
+    """The yaw at which side points lie nearest to the faces of the box, by the mean distance cut off at 10 mm."""
+    c, s = np.cos(yaws), np.sin(yaws)
+    turns = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    low, high = _extent(_thinned(plan) @ turns)
+    local = _thinned(side) @ turns
+    gap = np.minimum(np.abs(local - low[:, None]), np.abs(local - high[:, None])).min(-1)
+    return float(yaws[np.minimum(gap, 10.0).mean(-1).argmin()])
+
+
+def _thinned(points: Array, most: int = 300) -> Array:
+    return points[:: max(1, len(points) // most)]
+
+
+def fit_lying(points: Array, box: Block, along_length: bool, eye: Array) -> Lying | None:
+    """A cylinder on its side, begun at the box's long or short direction; None where the steps run away.
+
+    Gauss-Newton with Tukey's weights on sqrt(v^2 + (z - r)^2) - r, where v is the distance across the axis: unknown
+    are the axis's turn and offset, and the radius. The axis lies at the height of the radius.
+    """
+    yaw = box.yaw_rad if along_length else box.yaw_rad + math.pi / 2
+    offset, radius = 0.0, box.height / 2
+    origin = np.array([box.x, box.y])
+    for _ in range(_ROUNDS):
+        along, across = turned(points[:, :2] - origin, yaw).T
+        arms = np.stack([across - offset, points[:, 2] - radius], axis=1)
+        rho = np.maximum(np.hypot(arms[:, 0], arms[:, 1]), 1e-9)
+        error = rho - radius
+        weight = _tukey(error / max(2.0, 1.4826 * float(np.median(np.abs(error)))))
+        design = np.c_[-along * arms[:, 0] / rho, -arms[:, 0] / rho, -arms[:, 1] / rho - 1.0]
+        normal = design.T @ (design * weight[:, None]) + 1e-6 * np.eye(3)
+        move = -np.linalg.solve(normal, design.T @ (weight * error))
+        yaw, offset, radius = yaw + float(move[0]), offset + float(move[1]), radius + float(move[2])
+        if not 1.0 < radius < box.height or abs(move[0]) > 0.5:
+            return None
+    low, high = _ends(points, origin, yaw, offset, radius, eye)
+    x, y = origin + turned(np.array([[(low + high) / 2, offset]]), -yaw)[0]
+    return Lying(float(x), float(y), radius, (high - low) / 2, yaw % math.pi)
+
+
+def _ends(points: Array, origin: Array, yaw: float, offset: float, radius: float, eye: Array) -> tuple[float, float]:
+    """Where the axis ends: at the flat end that the camera sees, else where the points end."""
+    along, across = turned(points[:, :2] - origin, yaw).T
+    low, high = (float(edge[0]) for edge in _extent(along[:, None]))
+    towards = float(turned((eye - origin)[None], yaw)[0, 0])
+    inner = np.hypot(across - offset, points[:, 2] - radius) < 0.7 * radius
+    flat = along[inner & (np.abs(along - (low if towards < 0 else high)) < 0.5 * radius)]
+    if len(flat) >= 10 and not low < towards < high:
+        return (float(np.median(flat)), high) if towards < 0 else (low, float(np.median(flat)))
+    return low, high

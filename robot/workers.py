@@ -1,0 +1,129 @@
+"""Attempts made by this process, or by several at once, each with a rig of its own."""
+
+import atexit
+import functools
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from typing import Self
+
+import cv2
+
+from robot.attempt import Attempt, Attempter, AttemptSettings
+from robot.errors import RobotError
+from robot.rig import Rig
+
+RigMaker = Callable[[], Rig]
+"""Builds a rig, unconnected; for several jobs picklable, as functools.partial(load_rig, "sim", seed=0) is."""
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Jobs:
+    """Makes attempts: here and now with one job, else in processes that are started afresh ("spawn").
+
+    A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` attempts
+    should be under way at a time.
+    """
+
+    def __init__(self, jobs: int, attempter: Attempter, make_rig: RigMaker) -> None:
+        self._attempter, self._pool = attempter, None
+        self.window = 1 if jobs == 1 else 2 * jobs
+        self._environment: dict[str, str | None] = {}
+        if jobs > 1:
+            self._environment = {name: os.environ.get(name) for name in _THREADS}
+            self._pool = ProcessPoolExecutor(
+                jobs,
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_begin,
+                initargs=(make_rig, attempter.seed, attempter.settings),
+            )
+
+    def submit(self, object_id: str, number: int) -> Callable[[], Attempt]:
+        """Begin an attempt; the callable waits for it. It raises the attempt's own RobotError, and a RobotError for
+        any other failure in another process."""
+        if self._pool is None:
+            return functools.partial(self._attempter.run, object_id, number)
+        os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the processes that a submission may start
+        try:
+            future = self._pool.submit(_run, object_id, number)
+        except BrokenProcessPool as error:
+            raise _died() from error
+        finally:
+            _restore(self._environment)
+        return functools.partial(_result, future, object_id, number)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Waits for the attempts that have begun; the others are not made."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _restore(environment: dict[str, str | None]) -> None:
+    for name, value in environment.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+
+
+def _result(future: Future[Attempt], object_id: str, number: int) -> Attempt:
+    try:
+        return future.result()
+    except RobotError:
+        raise
+    except BrokenProcessPool as error:
+        raise _died() from error
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise RobotError(f"attempt {number} at {object_id} broke off in a worker process: {reason}") from error
+
+
+def _died() -> RobotError:
+    return RobotError(
+        "a worker process died: it was killed, or memory ran out. What was recorded is whole; start again to go on, "
+        "with fewer jobs if memory is short"
+    )
+
+
+# In the worker ----------------------------------------------------------------------------------------------
+
+_made: list[Attempter] = []
+_make: list[Callable[[], Attempter]] = []
+
+
+def _begin(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> None:
+    """Runs first. Nothing here may fail: a pool does not say why. Ctrl-C is the parent's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    cv2.setNumThreads(1)
+    _make.append(functools.partial(_connected, make_rig, seed, settings))
+
+
+def _leave_with_parent() -> None:
+    """A parent that is killed cannot end its workers, which would wait for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
+
+
+def _connected(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Attempter:
+    rig = make_rig()
+    rig.connect()
+    atexit.register(rig.close)
+    return Attempter(rig, seed, settings)
+
+
+def _run(object_id: str, number: int) -> Attempt:
+    if not _made:
+        _made.append(_make[0]())
+    return _made[0].run(object_id, number)

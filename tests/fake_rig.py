@@ -1,0 +1,183 @@
+"""A rig of arithmetic: cylinders on a table, one-sided depth, gels with a blob where they touch. Fast and exact.
+
+An attempt is a pure function of (seed, object, number). Devices can be told to fail, so that what a collector does
+then can be tested without anybody's hardware.
+"""
+
+import math
+import zlib
+
+import numpy as np
+
+from robot.devices import Arm, Box, Camera, Frame, Gripper, GripperState, Intrinsics, Pose, TactileSensor
+from robot.errors import DeviceError
+from robot.rig import Rig
+from tests import views
+
+WORKSPACE = Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
+LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
+STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
+
+
+class World:
+    """What the devices share."""
+
+    def __init__(self, seed):
+        self.seed, self.now_s = seed, 0.0
+        self.pose, self.opening, self.force = Pose(0, 0, 300, 0), STROKE_MM, None
+        self.solid, self.grip_at, self.slips = None, None, False
+        self.calls, self.faults = [], {}
+
+    def clock(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        self.now_s += seconds
+
+    def called(self, what):
+        """Note a call, and fail if that has been asked for: `faults` maps a call to the numbers of its failures."""
+        self.calls.append(what)
+        if self.calls.count(what) in self.faults.get(what, ()):
+            raise DeviceError(f"the fake {what} was told to fail")
+
+    def chord(self):
+        """Width of the cylinder between the fingers, 0 for a miss."""
+        pose, solid = self.grip_at, self.solid
+        across = -math.sin(pose.yaw_rad) * (solid.x - pose.x_mm) + math.cos(pose.yaw_rad) * (solid.y - pose.y_mm)
+        if pose.z_mm > solid.height or abs(across) >= solid.radius:
+            return 0.0
+        return 2 * math.sqrt(solid.radius**2 - across**2)
+
+    def status(self):
+        if self.force is None:
+            return "idle"
+        if self.chord() == 0.0:
+            return "no_part"
+        return "part_lost" if self.slips and self.pose.z_mm > self.grip_at.z_mm + 1 else "holding"
+
+
+class FakeRig(Rig):
+    """Objects are named by what they are: "round-7", "wide-1" (wider than the stroke), "thin-2" (often missed)."""
+
+    can_run_jobs = True
+
+    def __init__(self, seed=0, *, fingers=("a", "b"), faults=None):
+        self.world = World(seed)
+        self.world.faults = {} if faults is None else faults
+        super().__init__(
+            FakeArm(self.world),
+            FakeGripper(self.world),
+            {finger: FakeSensor(self.world, finger) for finger in fingers},
+            FakeCamera(self.world),
+            info={"source": "fake rig", "sensor": "fake gel", "rig": "fake"},
+            clock=self.world.clock,
+            sleep=self.world.sleep,
+        )
+
+    def object_ids(self, count):
+        return [f"round-{number}" for number in range(count)]
+
+    def prepare(self, object_id, number):
+        world, kind = self.world, object_id.split("-")[0]
+        look = np.random.default_rng([1, zlib.crc32(object_id.encode())])
+        radius = {"round": look.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
+        rng = np.random.default_rng([2, world.seed, zlib.crc32(object_id.encode()), number])
+        x, y = rng.uniform(-20, 20, 2)
+        world.solid = views.Upright(radius, look.uniform(60, 140), float(x), float(y))
+        world.slips, world.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
+        world.force, world.now_s = None, 100.0 * number
+
+
+class FakeArm(Arm):
+    def __init__(self, world):
+        super().__init__("fake arm", WORKSPACE, clock=world.clock)
+        self.world = world
+
+    def _connect(self):
+        self.world.called("arm.connect")
+
+    def _close(self):
+        self.world.called("arm.close")
+
+    def _move_to(self, pose, speed_mm_s):
+        self.world.called("arm")
+        self.world.sleep(math.dist(self.world.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
+        self.world.pose = pose
+        return pose
+
+    def _pose(self):
+        return self.world.pose
+
+
+class FakeGripper(Gripper):
+    def __init__(self, world):
+        low, high = FORCE_N
+        super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=world.clock)
+        self.world = world
+
+    def _connect(self):
+        self.world.called("gripper.connect")
+
+    def _close(self):
+        self.world.called("gripper.close")
+
+    def _settings(self):
+        return {"stroke_mm": self.stroke_mm}
+
+    def _state(self):
+        world = self.world
+        status = world.status()
+        opening = world.opening if status == "idle" else world.chord()
+        return GripperState(opening, world.force or 0.0, status)
+
+    def _open(self, opening_mm):
+        self.world.called("open")
+        self.world.opening, self.world.force = opening_mm, None
+        return self._state()
+
+    def _grasp(self, force_n, speed_mm_s):
+        self.world.called("grasp")
+        self.world.grip_at, self.world.force = self.world.pose, force_n
+        self.world.sleep(self.world.opening / speed_mm_s)
+        return self._state()
+
+
+class FakeSensor(TactileSensor):
+    def __init__(self, world, finger):
+        super().__init__(f"fake gel {finger}", finger, clock=world.clock)
+        self.world = world
+
+    def _connect(self):
+        self.world.called(f"gel {self.finger}.connect")
+
+    def _close(self):
+        self.world.called(f"gel {self.finger}.close")
+
+    def _read(self):
+        world = self.world
+        world.called(f"gel {self.finger}")
+        touching = world.status() == "holding"
+        rng = np.random.default_rng([3, world.noise, ord(self.finger), touching])
+        image = np.full((24, 32, 3), 90.0) + rng.normal(0, 2, (24, 32, 3))
+        if touching:
+            size = 2 + int(world.force / 8)
+            image[12 - size : 12 + size, 16 - size : 16 + size] += [60, -40, 20]
+        return Frame(np.clip(image, 0, 255).astype(np.uint8), world.now_s)
+
+
+class FakeCamera(Camera):
+    def __init__(self, world):
+        super().__init__("fake camera", views.camera_pose(), clock=world.clock)
+        self.world = world
+
+    def _connect(self):
+        self.world.called("camera.connect")
+
+    def _close(self):
+        self.world.called("camera.close")
+
+    def _read(self, depth):
+        world = self.world
+        world.called("depth" if depth else "camera")
+        image = views.view(world.solid, seed=world.noise, lens=LENS, px=PX)
+        return type(image)(image.colour, image.depth_m if depth else None, LENS, world.now_s)

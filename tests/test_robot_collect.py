@@ -1,0 +1,487 @@
+"""Collection over the contract: what is recorded, what is asked of the devices, when it ends, and what is refused."""
+
+import functools
+import json
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.attempt import Attempter, AttemptSettings, depth_in_mm
+from robot.attempt_log import acceptance, read_attempts
+from robot.collect import CollectSettings, Progress, collect, name_of
+from robot.devices import RGBD
+from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
+from robot.gates import ContactAreaGate
+from robot.grasp import GraspSettings
+from robot.recording import RecordingWriter, read_recording
+from tests.fake_rig import FakeRig
+
+NAMES = ("round-0", "thin-1", "round-2")
+
+
+def run(out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, most=None, **options):
+    """Collect with a fake rig; returns the tallies by object."""
+    make = functools.partial(FakeRig, seed if rig_seed is None else rig_seed, faults=faults)
+    settings = CollectSettings(grasps, most, attempt or AttemptSettings())
+    tallies = collect(make, out, objects=names, seed=seed, settings=settings, **options)
+    return {each.object_id: each for each in tallies}
+
+
+def files(folder):
+    """Every file and its bytes."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def rows(folder):
+    return [json.loads(line) for line in (folder / "metadata.jsonl").read_text().splitlines()]
+
+
+# What is recorded -------------------------------------------------------------------------------------------
+
+
+def test_every_object_gets_its_accepted_grasps_and_the_rest_is_recorded_too(tmp_path):
+    tallies = run(tmp_path / "r", grasps=3)
+    recording = read_recording(tmp_path / "r")
+    assert recording.notes == ()
+    for name in NAMES:
+        grasps = [grasp for grasp in recording.grasps if grasp.object_id == name]
+        assert sum(grasp.grasped for grasp in grasps) == tallies[name].accepted == 3
+        assert len(grasps) == tallies[name].attempts - tallies[name].outcomes["no_plan"]
+        assert grasps[-1].grasped  # the last one was the last that was needed
+    rejected = [grasp for grasp in recording.grasps if not grasp.grasped]
+    assert rejected
+    assert {grasp.outcome for grasp in rejected} <= {"missed", "slipped"}
+
+
+def test_a_grasp_has_everything_that_was_measured(tmp_path):
+    run(tmp_path / "r", ["round-0"], grasps=1)
+    (row,) = [row for row in rows(tmp_path / "r") if row["grasped"]]
+    assert row["outcome"] == "held"
+    assert row["grasp_id"] == row["sequence_id"] == f"round-0-{row['grasp_id'][-4:]}"
+    assert 5 <= row["force_n"] <= 25
+    assert 0 < row["opening_mm"] <= 80
+    x, y, z, yaw = row["pose"]
+    assert abs(x) < 30
+    assert abs(y) < 30
+    assert 10 <= z <= 140
+    assert 0 <= yaw < np.pi
+    fingers = [f"touch_{finger}{moment}" for finger in "ab" for moment in ("", "_before", "_after")]
+    images = {column: row[f"{column}_file_name"] for column in ("photo", "depth", *fingers)}
+    for column, path in images.items():
+        assert path.endswith(".png" if column == "depth" else ".jpg")
+        pixels = cv2.imread(str(tmp_path / "r" / path), cv2.IMREAD_UNCHANGED)
+        assert pixels.dtype == (np.uint16 if column == "depth" else np.uint8)
+        assert pixels.shape[:2] == ((108, 128) if column in ("photo", "depth") else (24, 32))
+
+
+def test_colours_are_not_swapped(tmp_path):
+    run(tmp_path / "r", ["round-0"], grasps=1)
+    photo = cv2.imread(str(tmp_path / "r" / rows(tmp_path / "r")[0]["photo_file_name"]))[..., ::-1]
+    assert np.abs(np.median(photo.reshape(-1, 3), axis=0) - (150, 140, 120)).max() < 5  # the table's red, green, blue
+
+
+def test_depth_is_whole_millimetres_and_zero_where_unknown():
+    depth = np.array([[0.9004, np.nan, -1.0, 0.0, 70.0, np.inf]], np.float32)
+    assert depth_in_mm(depth).tolist() == [[900, 0, 0, 0, 0, 0]]
+    assert depth_in_mm(depth).dtype == np.uint16
+
+
+def test_times_count_from_the_beginning_of_the_recording(tmp_path):
+    run(tmp_path / "r")
+    ends = [
+        attempt.ended_s for attempt in read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
+    ]
+    times = [row["time_s"] for row in rows(tmp_path / "r")]
+    assert times == sorted(times)
+    assert ends == sorted(ends)
+    assert 0 < times[0] < ends[0]
+    assert times[-1] < ends[-1]
+
+
+def test_the_recording_says_how_it_was_collected(tmp_path):
+    run(tmp_path / "r", grasps=2)
+    info = json.loads((tmp_path / "r" / "recording.json").read_text())
+    assert (info["source"], info["sensor"], info["rig"], info["seed"]) == ("fake rig", "fake gel", "fake", 3)
+    assert info["background"] == "before each grasp"
+    assert info["devices"]["fake gripper"] == {"stroke_mm": 110.0}
+    assert info["collection"]["grasps"] == 2
+    assert info["collection"]["gate"].startswith("ContactAreaGate(")
+    assert info["collection"]["attempt"]["grasp"]["force_n"] == [5.0, 25.0]
+
+
+def test_every_attempt_is_logged_with_its_reason_and_acceptance_reads_it(tmp_path):
+    tallies = run(tmp_path / "r", ["round-0", "wide-1"], grasps=1)
+    assert acceptance(read_recording(tmp_path / "r")) == list(tallies.values())
+    assert tallies["wide-1"].outcomes == {"no_plan": 14}
+    assert all("wider than the stroke" in reason for reason in tallies["wide-1"].reasons)
+
+
+# When it ends -----------------------------------------------------------------------------------------------
+
+
+def test_an_object_that_cannot_be_grasped_is_given_up(tmp_path):
+    tallies = run(tmp_path / "r", ["wide-0", "none-1", "round-2"], grasps=1)
+    assert [each.accepted for each in tallies.values()] == [0, 0, 1]
+    assert tallies["wide-0"].attempts == tallies["none-1"].attempts == 4 * 1 + 10
+    assert any("nothing" in reason or "reach no lower" in reason for reason in tallies["none-1"].reasons)
+
+
+def test_the_number_of_attempts_is_a_setting(tmp_path):
+    assert run(tmp_path / "r", ["wide-0"], most=3)["wide-0"].attempts == 3
+
+
+def test_an_object_that_was_given_up_is_not_tried_again_when_the_collection_goes_on(tmp_path):
+    run(tmp_path / "r", ["wide-0"], most=3)
+    before = files(tmp_path / "r")
+    assert run(tmp_path / "r", ["wide-0"], most=3)["wide-0"].attempts == 3
+    assert files(tmp_path / "r") == before
+
+
+def test_a_finished_collection_makes_no_attempt(tmp_path):
+    run(tmp_path / "r")
+    before = files(tmp_path / "r")
+    rigs = []
+
+    def make():
+        rigs.append(FakeRig(3))
+        return rigs[-1]
+
+    collect(make, tmp_path / "r", objects=NAMES, seed=3, settings=CollectSettings(2))
+    assert not any(call in ("arm", "grasp", "depth") for call in rigs[0].world.calls)
+    assert files(tmp_path / "r") == before
+
+
+def test_more_objects_may_be_added(tmp_path):
+    run(tmp_path / "r", NAMES[:1])
+    run(tmp_path / "r", NAMES)
+    run(tmp_path / "whole", NAMES)
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+def test_progress_is_told_after_every_attempt(tmp_path):
+    told: list[Progress] = []
+    run(tmp_path / "r", ["round-0", "wide-1"], grasps=2, most=4, progress=told.append)
+    assert [each.attempts for each in told] == list(range(len(told)))
+    assert (told[0].settled, told[0].objects_done, told[0].seconds_left, told[0].accept_rate) == (0, 0, None, 0.0)
+    last = told[-1]
+    assert (last.objects, last.objects_done, last.wanted, last.settled, last.accepted) == (2, 2, 4, 4, 2)
+    assert last.accept_rate == 2 / last.attempts
+    assert last.seconds_left == 0.0
+
+
+# What is asked of the devices -------------------------------------------------------------------------------
+
+
+def calls_of(attempt, name="round-0", faults=None, seed=3):
+    rig = FakeRig(seed, faults=faults)
+    with rig:
+        result = Attempter(rig, seed, attempt).run(name, 0)
+    return result, [call for call in rig.world.calls if "." not in call]
+
+
+def test_an_attempt_asks_in_this_order():
+    _, calls = calls_of(AttemptSettings())
+    gels = ["gel a", "gel b"]
+    start, close, up = ["open", "arm", "depth", "arm", "open", "arm"], ["grasp"], ["arm"]
+    assert calls == [*start, *gels, *close, *gels, *up, *gels, "arm", "arm", "open"]
+
+
+def test_what_is_not_recorded_is_not_asked_for(tmp_path):
+    _, calls = calls_of(AttemptSettings(outputs=()))
+    assert calls.count("gel a") == 1
+    _, calls = calls_of(AttemptSettings(outputs=("after",)))
+    assert calls.count("gel a") == 2
+    run(tmp_path / "r", ["round-0"], grasps=1, attempt=AttemptSettings(outputs=("before",)))
+    assert {key for row in rows(tmp_path / "r") for key in row if key.endswith("_file_name")} == {
+        f"{column}_file_name" for column in ("photo", "touch_a", "touch_b", "touch_a_before", "touch_b_before")
+    }
+
+
+def test_no_plan_moves_nothing_but_home():
+    result, calls = calls_of(AttemptSettings(), "wide-0")
+    assert (result.outcome, result.images) == ("no_plan", {})
+    assert calls == ["open", "arm", "depth"]
+
+
+def test_the_gate_that_needs_what_is_not_recorded_says_so(tmp_path):
+    with pytest.raises(RobotConfigError, match="compares with the untouched gel"):
+        run(tmp_path / "r", attempt=AttemptSettings(outputs=("depth",)))
+
+
+def test_any_gate_decides_what_is_kept(tmp_path):
+    seen = []
+
+    def picky(touches):
+        seen.append(sorted(touches))
+        frames = touches["a"]
+        assert frames.before.shape == frames.during.shape == frames.after.shape == (24, 32, 3)
+        return 0.75 if len(seen) % 3 == 0 else 0.25
+
+    tallies = run(tmp_path / "r", ["round-0"], grasps=2, gate=picky, gate_name="picky")
+    assert seen == [["a", "b"]] * 6
+    assert tallies["round-0"].accepted == 2
+    logged = read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
+    assert [attempt.score for attempt in logged] == [0.25, 0.25, 0.75] * 2
+
+
+def test_the_jaws_are_open_and_the_object_is_put_down_inside_the_table():
+    rig = FakeRig(3)
+    with rig:
+        attempter = Attempter(rig, 3, AttemptSettings())
+        results = [attempter.run("round-0", number) for number in range(12)]
+        assert rig.gripper.state().status == "idle"
+    assert {"held", "slipped"} == {result.outcome for result in results}
+
+
+def test_an_attempt_is_a_function_of_seed_object_and_number_alone():
+    with FakeRig(3) as one, FakeRig(3) as two:
+        first, second = (Attempter(rig, 3, AttemptSettings()) for rig in (one, two))
+        for number in (0, 1, 2):
+            first.run("round-0", number)
+        second.run("thin-1", 5)
+        assert first.run("round-2", 4) == second.run("round-2", 4)
+
+
+def test_other_seeds_give_other_grasps(tmp_path):
+    run(tmp_path / "r", seed=3)
+    run(tmp_path / "s", seed=4)
+    assert {tuple(row["pose"]) for row in rows(tmp_path / "r")}.isdisjoint(
+        tuple(row["pose"]) for row in rows(tmp_path / "s")
+    )
+
+
+def test_random_numbers_are_those_of_the_triple():
+    """By hand: the force is the fifth number of the generator seeded with seed, crc32 of the name, and number."""
+    result, _ = calls_of(AttemptSettings(grasp=GraspSettings(force_n=(10.0, 20.0))))
+    rng = np.random.default_rng([3, zlib.crc32(b"round-0"), 0])
+    rng.uniform(-1, 1, 2), rng.uniform(), rng.uniform(0, np.pi)
+    assert result.fields["force_n"] == round(float(rng.uniform(10, 20)), 3)
+
+
+# Devices that fail ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("device", ["arm", "depth", "gel a", "gel b", "grasp", "open"])
+def test_an_attempt_whose_device_failed_is_made_again_and_nothing_shows(tmp_path, device):
+    run(tmp_path / "r", ["round-0"])
+    run(tmp_path / "s", ["round-0"], faults={device: {2, 5}})
+    assert files(tmp_path / "r") == files(tmp_path / "s")
+
+
+@pytest.mark.parametrize("device", ["arm", "depth", "gel b", "grasp"])
+def test_a_device_that_fails_too_often_ends_the_collection_with_the_jaws_open(tmp_path, device):
+    rigs = []
+
+    def make():
+        rigs.append(FakeRig(3, faults={device: set(range(4, 100))}))
+        return rigs[-1]
+
+    with pytest.raises(DeviceError, match=rf"at round-0 failed 3 time\(s\), last: the fake {device} was told to fail"):
+        collect(make, tmp_path / "r", objects=["round-0"], seed=3, settings=CollectSettings(5))
+    world = rigs[0].world
+    assert world.force is None
+    assert not any(each.is_connected for each in rigs[0].devices)
+    assert len(read_recording(tmp_path / "r").grasps) == len(rows(tmp_path / "r"))
+
+
+def test_after_the_device_was_mended_the_collection_goes_on(tmp_path):
+    with pytest.raises(DeviceError):
+        run(tmp_path / "r", faults={"grasp": set(range(4, 100))})
+    run(tmp_path / "r")
+    run(tmp_path / "whole")
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+def test_a_gripper_that_never_stops_moving_is_a_fault(monkeypatch):
+    monkeypatch.setattr("tests.fake_rig.World.status", lambda self: "idle" if self.force is None else "moving")
+    with pytest.raises(DeviceError, match="must be holding, no_part or part_lost after a lift; it says moving"):
+        calls_of(AttemptSettings())
+
+
+def test_a_frozen_gel_is_a_fault_and_not_a_recording(monkeypatch):
+    """A stream that stands still gives the frame from before the grasp as the frame of the grasp."""
+    from robot.devices import Frame
+    from tests.fake_rig import FakeSensor
+
+    real, kept = FakeSensor._read, {}
+
+    def frozen(self):
+        frame = kept.setdefault(self.finger, real(self))
+        return Frame(frame.pixels, frame.time_s)
+
+    monkeypatch.setattr(FakeSensor, "_read", frozen)
+    with pytest.raises(DeviceError, match="is the stream frozen"):
+        calls_of(AttemptSettings())
+
+
+def test_the_first_error_is_told_even_if_the_jaws_cannot_be_opened(tmp_path):
+    with pytest.raises(DeviceError, match="last: the fake grasp was told to fail"):
+        run(tmp_path / "r", faults={"grasp": set(range(1, 9)), "open": {3, 6, 9}})
+
+
+def test_ctrl_c_in_the_middle_leaves_open_jaws_a_closed_rig_and_a_whole_recording(tmp_path, monkeypatch):
+    from tests.fake_rig import FakeGripper
+
+    rigs, real = [], FakeGripper._grasp
+
+    def interrupted(self, force_n, speed_mm_s):
+        state = real(self, force_n, speed_mm_s)
+        if self.world.calls.count("grasp") == 3:
+            raise KeyboardInterrupt
+        return state
+
+    def make():
+        rigs.append(FakeRig(3))
+        return rigs[-1]
+
+    monkeypatch.setattr(FakeGripper, "_grasp", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        collect(make, tmp_path / "r", objects=NAMES, seed=3, settings=CollectSettings(2))
+    assert rigs[0].world.force is None
+    assert not any(device.is_connected for device in rigs[0].devices)
+    assert len(rows(tmp_path / "r")) == 2
+    monkeypatch.undo()
+    run(tmp_path / "r")
+    run(tmp_path / "whole")
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+# What is refused --------------------------------------------------------------------------------------------
+
+OTHERWISE = {
+    "another seed": ({"seed": 4}, "was collected with seed 3, not 4"),
+    "more grasps": ({"grasps": 3}, "was collected with grasps 2, not 3"),
+    "another limit": ({"most": 5}, "was collected with most attempts 18, not 5"),
+    "other forces": (
+        {"attempt": AttemptSettings(grasp=GraspSettings(force_n=(5, 30)))},
+        r"with attempt\.grasp\.force n \[5\.0, 25\.0\], not \[5, 30\]",
+    ),
+    "another gate": ({"gate": ContactAreaGate(20.0)}, "was collected with gate 'ContactAreaGate"),
+    "other objects": ({"names": ["round-9"]}, "was collected with other objects"),
+    "fewer objects": ({"names": ["round-0"]}, "was collected with other objects"),
+}
+
+
+@pytest.mark.parametrize("case", OTHERWISE)
+def test_a_recording_that_was_collected_otherwise_is_refused_and_left_alone(tmp_path, case):
+    run(tmp_path / "r")
+    before = files(tmp_path / "r")
+    options, words = OTHERWISE[case]
+    with pytest.raises(RecordingError, match=words):
+        run(tmp_path / "r", **options)
+    assert files(tmp_path / "r") == before
+
+
+def test_a_recording_of_another_version_is_refused(tmp_path):
+    run(tmp_path / "r")
+    path = tmp_path / "r" / "recording.json"
+    info = json.loads(path.read_text())
+    path.write_text(json.dumps({**info, "software_version": "0.0.1"}))
+    with pytest.raises(RecordingError, match=r"was collected with software version '0\.0\.1', not"):
+        run(tmp_path / "r")
+    path.write_text(json.dumps({**info, "schema_version": 2}))
+    with pytest.raises(RecordingError, match=r"schema_version must be one this software knows \(1\), got 2"):
+        run(tmp_path / "r")
+
+
+def test_a_recording_that_no_rig_collected_is_refused(tmp_path):
+    RecordingWriter(tmp_path / "r", {"source": "fake rig", "sensor": "fake gel"}).close()
+    with pytest.raises(RecordingError, match="was not collected by a rig"):
+        run(tmp_path / "r")
+
+
+def test_a_folder_of_other_files_is_refused(tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(RecordingError, match=r"holds other files, such as letter\.txt"):
+        run(tmp_path)
+
+
+def test_a_lost_log_is_refused(tmp_path):
+    run(tmp_path / "r")
+    (tmp_path / "r" / "attempts.jsonl").unlink()
+    with pytest.raises(RecordingError, match=r"attempts\.jsonl lacks grasp round-0-0000"):
+        run(tmp_path / "r")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"names": []}, "at least one object"),
+        ({"names": ["a", "a"]}, "different names"),
+        ({"jobs": 0}, "jobs must be at least 1"),
+        ({"grasps": 0}, "must be at least 1"),
+        ({"most": 0}, "must be at least 1"),
+        ({"attempt": AttemptSettings(grasp=GraspSettings(force_n=(1.0, 2.0)))}, "force_n must be within 5 to 80 N"),
+    ],
+)
+def test_settings_out_of_range_are_refused_before_a_folder_is_made(tmp_path, options, words):
+    with pytest.raises(RobotConfigError, match=words):
+        run(tmp_path / "r", **options)
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"outputs": ("photo",)}, {"settle_s": -1.0}, {"travel_mm_s": 0.0}, {"jpeg_quality": 101}, {"table_share": 1.1}],
+)
+def test_an_attempt_setting_out_of_range_is_refused(setting):
+    with pytest.raises(RobotConfigError, match=next(iter(setting))):
+        AttemptSettings(**setting)
+
+
+def test_a_real_rig_cannot_be_doubled(tmp_path, monkeypatch):
+    monkeypatch.setattr(FakeRig, "can_run_jobs", False)
+    with pytest.raises(RobotConfigError, match=r"there is one such rig \(FakeRig\), so jobs must be 1, got 2"):
+        run(tmp_path / "r", jobs=2)
+
+
+def test_a_full_disk_is_told_and_what_was_recorded_is_whole(tmp_path, monkeypatch):
+    from robot import recording as module
+
+    real, count = module.write_file, []
+
+    def full(path, data):
+        count.append(path)
+        if len(count) > 12:
+            raise OSError(28, "No space left on device")
+        real(path, data)
+
+    monkeypatch.setattr(module, "write_file", full)
+    with pytest.raises(StorageError, match="No space left on device; what was appended before is whole"):
+        run(tmp_path / "r")
+    monkeypatch.undo()
+    assert len(read_recording(tmp_path / "r").grasps) == 1
+    run(tmp_path / "r")
+    run(tmp_path / "whole")
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+# Names ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("object_id", ["mug", "cup 7", "größe", ".hidden", "x" * 200, "a/b"])
+def test_a_grasp_has_a_name_that_a_recording_takes(tmp_path, object_id):
+    image = np.zeros((2, 2, 3), np.uint8)
+    with RecordingWriter(tmp_path, {"source": "test", "sensor": "test"}) as writer:
+        for number in (0, 12345):
+            writer.append(name_of(object_id, number), object_id, {"photo": image, "touch_a": image})
+    assert name_of("mug", 7) == "mug-0007"
+
+
+def test_names_that_look_alike_stay_apart():
+    names = ["a b", "a_b", "a/b", "a:b", "y" * 150, "y" * 151]
+    assert len({name_of(name, 0) for name in names}) == len(names)
+
+
+def test_the_picture_of_the_camera_is_not_changed_by_what_is_made_of_it():
+    with FakeRig(3) as rig:
+        rig.prepare("round-0", 0)
+        image = rig.camera.read()
+    kept = RGBD(image.colour.copy(), image.depth_m.copy(), image.intrinsics, 0.0)
+    from robot.cylinder import fit_cylinder
+
+    fit_cylinder(image, rig.camera.extrinsics)
+    assert (image.colour == kept.colour).all()
+    np.testing.assert_array_equal(image.depth_m, kept.depth_m)

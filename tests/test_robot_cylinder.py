@@ -1,0 +1,285 @@
+"""Cylinders fitted to one-sided noisy depth pictures: where they are, and what is said when that is hard to tell.
+
+Truth is known: tests/views.py draws the pictures in closed form. Bounds on the centre's error are for 1.5 to 3 mm of
+noise at 0.9 m, with and without 10 % of outliers; the fit's own standard error must be of the errors' size.
+"""
+
+import math
+import time
+
+import numpy as np
+import pytest
+
+from robot.cloud import Rays
+from robot.cylinder import CylinderFit, fit_cylinder
+from robot.devices import RGBD, Box
+from robot.errors import PlanError
+from robot.solids import fit_circle
+from tests import views
+from tests.views import Ball, Block, Lying, Upright, view
+
+X, Y = 12.0, -7.0
+SEEDS = range(3)
+NOISY = {"noise_mm": 3.0, "outliers": 0.1}
+
+
+def fits(solid, **how):
+    return [fit_cylinder(view(solid, seed=seed, **how), views.camera_pose()) for seed in SEEDS]
+
+
+def off_centre(fit):
+    return math.hypot(fit.x_mm - X, fit.y_mm - Y)
+
+
+def naive_fit(image, pose):
+    """Least squares through everything 2 cm above the table, after the authors' recipe: percentiles, no robust loss.
+
+    Centre: median across the line of sight and 75th percentile along it; radius: root of the 95th percentile of
+    squared distances.
+    """
+    rows, columns = np.nonzero(np.isfinite(image.depth_m))
+    depth = image.depth_m[rows, columns] * 1000.0
+    lens = image.intrinsics
+    local = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], 1)
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    points = points[(points[:, 2] > 20) & (np.abs(points[:, :2]) < 250).all(1)]
+    x, y = np.median(points[:, 0]), np.percentile(points[:, 1], 75)
+    return x, y, math.sqrt(np.percentile((points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2, 95))
+
+
+# Cylinders that stand, after the table in the notes ----------------------------------------------------------
+
+STANDING = {
+    "R33 h120": (Upright(33, 120, X, Y), {}, 1.0),
+    "R33 h120, 3 mm, 10 % outliers": (Upright(33, 120, X, Y), NOISY, 3.0),
+    "R50 h200": (Upright(50, 200, X, Y), {}, 1.0),
+    "R50 h200, 3 mm, 10 % outliers": (Upright(50, 200, X, Y), NOISY, 3.0),
+    "R15 h100, 10 % outliers": (Upright(15, 100, X, Y), NOISY, 3.0),
+    "R33 h20 (tuna can)": (Upright(33, 20, X, Y), {}, 1.5),
+    "R33 h20, 3 mm, 10 % outliers": (Upright(33, 20, X, Y), NOISY, 3.0),
+}
+
+
+@pytest.mark.parametrize("name", STANDING)
+def test_a_standing_cylinder_is_found(name):
+    solid, how, bound = STANDING[name]
+    for fit in fits(solid, **how):
+        assert off_centre(fit) < bound
+        assert off_centre(fit) < 3 * fit.error_mm
+        assert fit.error_mm < 4.0
+        assert fit.radius_mm == pytest.approx(solid.radius, abs=2.5)
+        assert fit.height_mm == pytest.approx(solid.height, abs=2.0)
+        assert (fit.method, fit.orientation) == ("circle", "upright")
+        assert fit.arc_deg > 90
+
+
+def test_the_naive_fit_fails_on_the_same_pictures():
+    pose = views.camera_pose()
+    clean = naive_fit(view(Upright(33, 120, X, Y)), pose)
+    assert math.hypot(clean[0] - X, clean[1] - Y) > 5  # the far side is not seen
+    wild = naive_fit(view(Upright(33, 120, X, Y), **NOISY), pose)
+    assert wild[2] > 33 + 50  # and outliers blow the radius up
+
+
+def test_the_fit_does_not_depend_on_when_it_is_made():
+    image = view(Upright(33, 120, X, Y), **NOISY)
+    assert fit_cylinder(image, views.camera_pose()) == fit_cylinder(image, views.camera_pose())
+
+
+def test_where_the_camera_believes_to_stand_moves_the_fit_as_much():
+    image, moved = view(Upright(33, 120, X, Y)), views.camera_pose()
+    moved[:2, 3] += (8.0, -5.0)
+    fit = fit_cylinder(image, moved)
+    assert math.hypot(fit.x_mm - X - 8, fit.y_mm - Y + 5) < 1.0
+    assert fit.notes == ()
+
+
+# Other shapes ------------------------------------------------------------------------------------------------
+
+BOXES = {
+    "a flat packet": Block(180, 50, 220, X, Y, 0.2),
+    "a packet seen from its side": Block(180, 50, 220, X, Y, 1.5),
+    "a cube on edge": Block(60, 60, 60, X, Y, math.pi / 4),
+    "a box": Block(90, 50, 60, X, Y, 0.5),
+    "a box seen from its front": Block(90, 50, 60, X, Y, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize("how", [{}, {"outliers": 0.1}])
+def test_a_box_becomes_its_inscribed_cylinder(name, how):
+    box = BOXES[name]
+    for fit in fits(box, **how):
+        assert fit.method == "box"
+        assert off_centre(fit) < 4.0
+        assert off_centre(fit) < 3 * fit.error_mm
+        assert fit.radius_mm == pytest.approx(min(box.length, box.width) / 2, abs=4.0)
+        assert fit.height_mm == pytest.approx(box.height, abs=3.0)
+        turn = (fit.yaw_rad - box.yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
+        assert abs(turn) < math.radians(6)
+
+
+def test_without_a_bound_a_circle_through_a_plane_is_huge():
+    """Why the radius is bounded by twice the footprint."""
+    rng = np.random.default_rng(0)
+    face = np.c_[rng.uniform(-90, 90, 400), rng.normal(0, 1.5, 400)]
+    assert fit_circle(face, 1.5, np.array([0.0, 1.0]), 1e9).radius > 500
+    bounded = fit_circle(face, 1.5, np.array([0.0, 1.0]), 180.0)
+    assert bounded is None or bounded.radius < 180
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, 1.5])
+@pytest.mark.parametrize("how", [{}, NOISY])
+def test_a_lying_cylinder_is_told_from_a_standing_one_and_from_a_box(yaw, how):
+    for fit in fits(Lying(25, 120, X, Y, yaw), **how):
+        assert (fit.method, fit.orientation) == ("lying", "lying")
+        assert off_centre(fit) < 3.5
+        assert off_centre(fit) < 3 * fit.error_mm
+        assert fit.radius_mm == pytest.approx(25, abs=2)
+        assert fit.height_mm == pytest.approx(50, abs=4)
+        assert fit.half_mm[0] == pytest.approx(60, abs=5)
+        assert abs((fit.yaw_rad - yaw + math.pi / 2) % math.pi - math.pi / 2) < math.radians(5)
+
+
+def test_a_ball_is_round():
+    for fit in fits(Ball(35, X, Y)):
+        assert off_centre(fit) < 3.0
+        assert fit.is_round
+
+
+def test_too_few_points_on_the_side_end_in_the_enclosing_circle_and_a_note():
+    for fit in fits(Upright(25, 8, X, Y)):
+        assert fit.method == "enclosing circle"
+        assert off_centre(fit) < 4.0
+        assert fit.radius_mm == pytest.approx(25, abs=3)
+        assert "points on its side: the smallest circle" in fit.notes[0]
+
+
+def test_a_short_arc_is_no_circle_and_the_error_says_so():
+    """Only a strip of the side has depth, 26 degrees of it, and nothing of the top."""
+    image, pose = view(Upright(60, 150, X, Y)), views.camera_pose()
+    height = image.depth_m * 1000 * Rays.of(image, pose).along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
+    strip = np.zeros(image.depth_m.shape, bool)
+    strip[:, 255:266] = True
+    depth = np.where((height > 5) & ~(strip & (height < 140)), np.nan, image.depth_m).astype(np.float32)
+    plain = np.full_like(image.colour, 128)  # an outline is not to be had either
+    fit = fit_cylinder(RGBD(plain, depth, image.intrinsics, 0.0), pose)
+    assert fit.method in ("box", "enclosing circle")
+    assert "its top is not seen" in fit.notes[0] or "the smallest circle" in fit.notes[0]
+    assert fit.error_mm >= 3.0
+
+
+# Pictures that are hard --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solid", [Upright(33, 120, X, Y), Upright(20, 60, X, Y), Upright(45, 180, X, Y)])
+def test_glass_is_placed_by_its_outline_in_the_colour_picture(solid):
+    fit = fit_cylinder(view(missing=[solid]), views.camera_pose())
+    assert fit.method == "silhouette"
+    assert off_centre(fit) < 5.0
+    assert off_centre(fit) < 3 * fit.error_mm
+    assert fit.radius_mm == pytest.approx(solid.radius, rel=0.1)
+    assert fit.height_mm == pytest.approx(solid.height, rel=0.1)
+    assert "outline in the colour picture" in fit.notes[0]
+
+
+def test_an_empty_table_is_a_clear_error():
+    with pytest.raises(PlanError, match="nothing stands on the table, by depth and by colour"):
+        fit_cylinder(view(outliers=0.1), views.camera_pose())
+
+
+def test_a_picture_without_depth_is_a_clear_error():
+    image = view(Upright(33, 120))
+    with pytest.raises(PlanError, match="needs a picture with depth"):
+        fit_cylinder(RGBD(image.colour, None, image.intrinsics, 0.0), views.camera_pose())
+    blind = RGBD(image.colour, np.full_like(image.depth_m, np.nan), image.intrinsics, 0.0)
+    with pytest.raises(PlanError, match="neither depth nor colour shows the table"):
+        fit_cylinder(blind, views.camera_pose())
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.inf, -np.inf])
+def test_depths_that_are_none_are_unknown(value):
+    """The authors' Kinect says 0 where it knows nothing."""
+    image = view(Upright(33, 120, X, Y))
+    holes = image.depth_m.copy()
+    holes[np.random.default_rng(0).uniform(size=holes.shape) < 0.05] = value
+    with np.errstate(all="raise"):
+        fit = fit_cylinder(RGBD(image.colour, holes, image.intrinsics, 0.0), views.camera_pose())
+    assert off_centre(fit) < 1.0
+
+
+def test_an_object_at_the_border_is_noted_or_refused():
+    pose = views.camera_pose()
+    noted = refused = 0
+    for x in range(580, 700, 20):
+        try:
+            fit = fit_cylinder(view(Upright(33, 120, x, 0)), pose)
+        except PlanError as error:
+            refused += "border" in str(error)
+            continue
+        if fit.notes:
+            noted += 1
+            assert "touches the border" in fit.notes[0]
+            assert math.hypot(fit.x_mm - x, fit.y_mm) < 5.0
+    assert noted
+    assert refused
+
+
+def test_what_stands_outside_the_region_is_not_looked_at():
+    region = Box((-100.0, -100.0, 0.0), (100.0, 100.0, 500.0))
+    image = view(Upright(20, 80, X, Y), Upright(45, 200, 250, 0))
+    assert off_centre(fit_cylinder(image, views.camera_pose(), region)) < 1.0
+    assert fit_cylinder(image, views.camera_pose()).x_mm == pytest.approx(250, abs=2)
+
+
+def test_a_table_that_is_not_where_the_calibration_says_is_found_and_noted():
+    pose = views.camera_pose()
+    pose[2, 3] += 20.0
+    fit = fit_cylinder(view(Upright(33, 120, X, Y)), pose)
+    assert "the table is 20 mm high" in fit.notes[0]
+    assert fit.height_mm == pytest.approx(120, abs=2)
+
+
+def test_a_table_that_is_hardly_seen_is_taken_from_the_calibration():
+    image, pose = view(Upright(60, 150, X, Y)), views.camera_pose()
+    rays = Rays.of(image, pose)
+    height = image.depth_m * 1000 * rays.along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
+    depth = np.where(height < 45, np.nan, image.depth_m).astype(np.float32)
+    fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
+    assert fit.notes[0].startswith("hardly any table is seen: z = 0")
+    assert off_centre(fit) < 1.0
+
+
+def test_a_fit_takes_milliseconds():
+    """No bound decides: the benchmark `cylinder` prints the time. This only keeps a mistake of 50 times out."""
+    image, pose = view(Upright(33, 120, X, Y), **NOISY), views.camera_pose()
+    start = time.process_time()
+    fit_cylinder(image, pose)
+    assert time.process_time() - start < 1.0
+
+
+# Width -------------------------------------------------------------------------------------------------------
+
+
+def width_by_points(fit, yaw, finger):
+    """Plain: the farthest point of the footprint, along the closing direction, within the finger's strip."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    most = 0.0
+    for u in np.linspace(-fit.half_mm[0], fit.half_mm[0], 401):
+        for v in np.linspace(-fit.half_mm[1], fit.half_mm[1], 201):
+            x = u * math.cos(fit.yaw_rad) - v * math.sin(fit.yaw_rad)
+            y = u * math.sin(fit.yaw_rad) + v * math.cos(fit.yaw_rad)
+            if abs(-s * x + c * y) <= finger / 2:
+                most = max(most, c * x + s * y)
+    return 2 * most
+
+
+@pytest.mark.parametrize("yaw", [0.3, 0.8, 1.2, 2.0, 3.0])
+def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw):
+    fit = CylinderFit(0, 0, 100, 10, 1, "box", (75.0, 10.0), 0.3)
+    assert fit.width_mm(yaw, 25.0) == pytest.approx(width_by_points(fit, yaw, 25.0), abs=1.0)
+
+
+def test_a_round_thing_is_as_wide_from_all_sides():
+    fit = CylinderFit(0, 0, 100, 30, 1, "circle", (30.0, 30.0))
+    assert {fit.width_mm(yaw, 25.0) for yaw in (0.0, 1.0, 2.0)} == {60.0}

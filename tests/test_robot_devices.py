@@ -1,0 +1,242 @@
+"""The contract of devices: what the base classes refuse before a driver sees it, and what they do not let out."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robot.devices import RGBD, Box, Camera, Device, Frame, GripperState, Intrinsics, Pose, TactileSensor
+from robot.errors import DeviceError, RobotConfigError
+from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, World
+
+
+class Plug(Device):
+    """Counts, and fails when told to."""
+
+    def __init__(self, connects=True, closes=True):
+        super().__init__("plug")
+        self.connects, self.closes, self.calls = connects, closes, []
+
+    def _connect(self):
+        self.calls.append("connect")
+        if not self.connects:
+            raise OSError(110, "Connection timed out")
+
+    def _close(self):
+        self.calls.append("close")
+        if not self.closes:
+            raise OSError(5, "Input/output error")
+
+    def _settings(self):
+        return {"port": 1000}
+
+
+class Gel(TactileSensor):
+    """Gives the frame it was given."""
+
+    def __init__(self, frame, now=100.0):
+        super().__init__("gel", "a", clock=lambda: now)
+        self.frame = frame
+
+    def _connect(self): ...
+    def _close(self): ...
+    def _read(self):
+        return self.frame
+
+
+class Eye(Camera):
+    """Gives the picture it was given, and notes what was asked."""
+
+    def __init__(self, image, extrinsics=None):
+        super().__init__("eye", np.eye(4) if extrinsics is None else extrinsics, clock=lambda: image.time_s)
+        self.image, self.asked = image, []
+
+    def _connect(self): ...
+    def _close(self): ...
+    def _read(self, depth):
+        self.asked.append(depth)
+        return self.image
+
+
+def picture(depth=True, shape=(4, 6)):
+    depth_m = np.full(shape, 0.9, np.float32) if depth else None
+    return RGBD(np.zeros((4, 6, 3), np.uint8), depth_m, Intrinsics(1, 1, 0, 0), 3.0)
+
+
+# Connecting -------------------------------------------------------------------------------------------------
+
+
+def test_a_device_is_connected_once_and_closed_once():
+    plug = Plug()
+    with plug:
+        plug.connect()
+        assert plug.is_connected
+        assert plug.settings() == {"port": 1000}
+    plug.close()
+    assert plug.calls == ["connect", "close"]
+    assert not plug.is_connected
+
+
+def test_a_device_that_fails_to_connect_is_cleaned_up_and_can_be_tried_again():
+    plug = Plug(connects=False)
+    with pytest.raises(DeviceError, match="plug cannot be connected: Connection timed out"):
+        plug.connect()
+    assert plug.calls == ["connect", "close"]
+    plug.close()
+    plug.connects = True
+    plug.connect()
+    assert plug.is_connected
+
+
+def test_what_fails_after_a_failed_connection_does_not_hide_why():
+    with pytest.raises(DeviceError, match="Connection timed out"):
+        Plug(connects=False, closes=False).connect()
+
+
+def test_a_device_that_fails_to_close_says_so_once_and_counts_as_closed():
+    plug = Plug(closes=False)
+    plug.connect()
+    with pytest.raises(DeviceError, match="plug cannot be closed: Input/output error"):
+        plug.close()
+    plug.close()
+    assert not plug.is_connected
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: Plug().settings(),
+        lambda: FakeArm(World(0)).move_to(Pose(0, 0, 100, 0), 10),
+        lambda: FakeArm(World(0)).pose(),
+        lambda: FakeGripper(World(0)).state(),
+        lambda: FakeGripper(World(0)).open(10),
+        lambda: FakeGripper(World(0)).grasp(10),
+        lambda: Gel(None).read(),
+        lambda: Eye(picture()).read(),
+    ],
+)
+def test_no_device_can_be_used_before_it_is_connected(use):
+    with pytest.raises(DeviceError, match="must be connected before it is used"):
+        use()
+
+
+def test_no_device_can_be_used_after_it_is_closed():
+    gripper = FakeGripper(World(0))
+    with gripper:
+        gripper.state()
+    with pytest.raises(DeviceError, match="must be connected"):
+        gripper.state()
+
+
+# Arm and gripper --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [Pose(151, 0, 100, 0), Pose(0, -151, 100, 0), Pose(0, 0, 7.9, 0), Pose(0, 0, math.nan, 0), Pose(0, 0, 9, math.inf)],
+)
+def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
+    with FakeArm(World(0)) as arm:
+        with pytest.raises(DeviceError, match="must be in the workspace"):
+            arm.move_to(pose, 100)
+        assert "arm" not in arm.world.calls
+        arm.move_to(Pose(150, -150, 8, 0), 100)  # its faces belong to it
+        assert arm.pose() == Pose(150, -150, 8, 0)
+
+
+@pytest.mark.parametrize("speed", [0, -1, math.nan, math.inf, 1001])
+def test_an_impossible_speed_never_reaches_the_arm(speed):
+    with FakeArm(World(0)) as arm, pytest.raises(DeviceError, match="speed must be"):
+        arm.move_to(Pose(0, 0, 100, 0), speed)
+
+
+@pytest.mark.parametrize("force", [FORCE_N[0] - 0.01, FORCE_N[1] + 0.01, 0, -5, math.nan, math.inf])
+def test_a_force_out_of_range_never_reaches_the_gripper(force):
+    with FakeGripper(World(0)) as gripper:
+        with pytest.raises(DeviceError, match="fake gripper: force must be from 5 to 80 N, got"):
+            gripper.grasp(force)
+        assert "grasp" not in gripper.world.calls
+
+
+@pytest.mark.parametrize("opening", [-0.1, STROKE_MM + 0.1, math.nan])
+def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
+    with FakeGripper(World(0)) as gripper:
+        with pytest.raises(DeviceError, match="opening must be from 0 to 110 mm"):
+            gripper.open(opening)
+        assert "open" not in gripper.world.calls
+        assert gripper.open(STROKE_MM) == GripperState(STROKE_MM, 0.0, "idle")
+
+
+def test_a_gripper_says_only_what_the_contract_knows():
+    with pytest.raises(DeviceError, match="must be one of idle, moving, holding, no_part, part_lost, got 'lost'"):
+        GripperState(1.0, 0.0, "lost")
+    with pytest.raises(DeviceError, match="finite"):
+        GripperState(math.nan, 0.0, "idle")
+
+
+@pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0), (1, 1))])
+def test_a_box_has_a_volume(corners):
+    with pytest.raises(RobotConfigError, match="lower < upper"):
+        Box(*corners)
+
+
+def test_the_workspace_of_the_fake_arm_is_what_these_tests_think():
+    assert Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0)) == WORKSPACE
+
+
+# Frames -----------------------------------------------------------------------------------------------------
+
+
+def frame(age=0.0, now=100.0, pixels=None):
+    return Frame(np.zeros((2, 3, 3), np.uint8) if pixels is None else pixels, now - age)
+
+
+@pytest.mark.parametrize("age", [0.0, 0.5, -0.04])
+def test_a_fresh_frame_is_given(age):
+    with Gel(frame(age)) as gel:
+        assert gel.read().time_s == 100.0 - age
+
+
+@pytest.mark.parametrize("age", [0.51, 1e6, -0.06, math.nan])
+def test_a_stale_frame_is_refused_and_so_is_one_of_the_future(age):
+    with Gel(frame(age)) as gel, pytest.raises(DeviceError, match=r"gel: the frame must be at most 0\.5 s old"):
+        gel.read()
+
+
+def test_how_old_a_frame_may_be_is_the_callers_choice():
+    with Gel(frame(0.3)) as gel:
+        gel.read(max_age_s=0.3 + 1e-9)
+        with pytest.raises(DeviceError, match=r"at most 0\.2 s old"):
+            gel.read(max_age_s=0.2)
+
+
+@pytest.mark.parametrize(
+    "pixels",
+    [np.zeros((2, 3), np.uint8), np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 3)), np.zeros((0, 3, 3), np.uint8)],
+)
+def test_a_frame_is_colour_of_eight_bits(pixels):
+    with Gel(frame(pixels=pixels)) as gel, pytest.raises(DeviceError, match="must be H x W x 3 uint8"):
+        gel.read()
+
+
+def test_depth_is_neither_asked_nor_given_when_it_is_not_wanted():
+    with Eye(picture()) as eye:
+        assert eye.read(depth=False).depth_m is None
+        assert eye.read().depth_m.shape == (4, 6)
+        assert eye.asked == [False, True]
+
+
+@pytest.mark.parametrize("image", [picture(depth=False), picture(shape=(4, 5))])
+def test_depth_that_is_wanted_is_there_and_fits_the_colour(image):
+    with Eye(image) as eye:
+        eye.read(depth=False)
+        with pytest.raises(DeviceError, match="depth must be float32 of the colour's"):
+            eye.read()
+
+
+def test_extrinsics_are_a_rigid_motion():
+    skewed, mirrored, short = np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(3)
+    skewed[0, 1] = 0.1
+    for wrong in (skewed, mirrored, short, np.full((4, 4), np.nan)):
+        with pytest.raises(RobotConfigError, match="extrinsics must"):
+            Eye(picture(), wrong)

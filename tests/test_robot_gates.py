@@ -1,0 +1,96 @@
+"""The gate on the area of contact, and what any gate may answer."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robot.errors import RobotConfigError, RobotError
+from robot.gates import ContactAreaGate, GraspFrames, difference, judge
+
+SHAPE = (60, 80, 3)
+
+
+def gel(seed=0, level=100.0, noise=2.0):
+    """An untouched gel with sensor noise."""
+    values = level + np.random.default_rng(seed).normal(0, noise, SHAPE)
+    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
+
+
+def pressed(seed=1, side=20, change=(40, -30, 10), level=100.0):
+    """The same gel with a square of side `side` px that changed its colour."""
+    values = gel(seed, level).astype(float)
+    values[20 : 20 + side, 20 : 20 + side] += change
+    return np.clip(values, 0, 255).astype(np.uint8)
+
+
+GATE = ContactAreaGate()
+
+
+def test_an_untouched_gel_is_no_grasp_and_a_pressed_one_is():
+    assert GATE({"a": GraspFrames(gel(0), gel(1))}) is False
+    assert GATE({"a": GraspFrames(gel(0), pressed())}) is True
+
+
+def test_the_share_is_that_of_the_changed_area():
+    share = GATE.shares({"a": GraspFrames(gel(0, noise=0), pressed(1, 20))})["a"]
+    assert 20**2 <= share * 60 * 80 <= 24**2  # a blur of 5 px moves the edge by 2 px at most
+
+
+def test_a_darker_gel_is_contact_as_much_as_a_lighter_one():
+    up = GATE.shares({"a": GraspFrames(gel(0), pressed(1, change=(30, 30, 30)))})
+    down = GATE.shares({"a": GraspFrames(gel(0), pressed(1, change=(-30, -30, -30)))})
+    assert up["a"] == pytest.approx(down["a"], abs=0.01)
+
+
+def test_uint8_subtraction_makes_contact_of_noise():
+    """The naive difference wraps round: half of the untouched pixels change by about 255 levels."""
+    before, after = gel(0), gel(1)
+    assert ((after - before) > GATE.noise_levels).mean() > 0.4
+    assert (np.abs(difference(after, before)) > GATE.noise_levels).mean() < 0.02
+    assert (difference(np.full(SHAPE, 99, np.uint8), np.full(SHAPE, 100, np.uint8)) == -1.0).all()
+
+
+def test_any_finger_is_enough_unless_every_one_is_asked_for():
+    one = {"a": GraspFrames(gel(0), gel(1)), "b": GraspFrames(gel(2), pressed(3))}
+    assert GATE(one)
+    assert not ContactAreaGate(every_finger=True)(one)
+    assert ContactAreaGate(every_finger=True)({"b": one["b"]})
+
+
+def test_what_slipped_after_the_lift_is_no_grasp():
+    slipped = {"a": GraspFrames(gel(0), pressed(1), gel(2))}
+    assert not GATE(slipped)
+    assert GATE({"a": GraspFrames(gel(0), pressed(1), pressed(2))})
+
+
+@pytest.mark.parametrize("level", [0.0, 255.0])
+def test_a_saturated_gel_is_no_contact(level):
+    assert not GATE({"a": GraspFrames(gel(0, level), gel(1, level))})
+
+
+def test_a_gate_without_the_untouched_gel_says_what_it_needs():
+    with pytest.raises(RobotConfigError, match=r"compares with the untouched gel.*finger a has none"):
+        GATE({"a": GraspFrames(None, gel())})
+
+
+@pytest.mark.parametrize(
+    "setting", [{"noise_levels": 0}, {"noise_levels": 255}, {"least_share": 0}, {"least_share": 1.1}, {"blur_px": 0}]
+)
+def test_a_setting_out_of_range_is_refused(setting):
+    with pytest.raises(RobotConfigError, match=next(iter(setting))):
+        ContactAreaGate(**setting)
+
+
+@pytest.mark.parametrize(
+    ("answer", "decision"),
+    [(True, True), (False, False), (0.5, True), (0.49, False), (np.float32(0.9), True), (1, True)],
+)
+def test_a_gate_answers_yes_no_or_a_probability(answer, decision):
+    assert judge(lambda touches: answer, {}) == (decision, pytest.approx(float(answer)))
+
+
+@pytest.mark.parametrize("answer", [math.nan, -0.1, 1.1, 17.0])
+def test_a_logit_is_no_answer(answer):
+    with pytest.raises(RobotError, match="true, false or a probability"):
+        judge(lambda touches: answer, {})

@@ -1,0 +1,156 @@
+"""Plans: drawn as the paper says, within what the object and the rig allow, or refused with the reason."""
+
+import contextlib
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from robot.cylinder import CylinderFit
+from robot.devices import Box
+from robot.errors import PlanError, RobotConfigError
+from robot.grasp import GraspSettings, plan_grasp
+from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
+
+FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))
+STROKE = 110.0
+
+
+def plan(seed=0, fit=FIT, settings=None, workspace=WORKSPACE, stroke=STROKE):
+    return plan_grasp(fit, settings or GraspSettings(), workspace, stroke, np.random.default_rng(seed))
+
+
+def plans(count=2000, **changes):
+    return [plan(seed, **changes) for seed in range(count)]
+
+
+def farthest_from_uniform(values, low, high):
+    """Kolmogorov's distance between these values and a uniform distribution, by a plain loop."""
+    ordered = sorted((value - low) / (high - low) for value in values)
+    count = len(ordered)
+    return max(max(abs(value - k / count), abs(value - (k + 1) / count)) for k, value in enumerate(ordered))
+
+
+KOLMOGOROV = 1.95
+"""Of n uniform values, n^(1/2) times the distance stays below this in 999 of 1000 cases; the seeds are fixed."""
+
+
+def test_yaw_force_and_height_are_uniform():
+    drawn = plans()
+    bound = KOLMOGOROV / math.sqrt(len(drawn))
+    assert farthest_from_uniform([p.pose.yaw_rad for p in drawn], 0, math.pi) < bound
+    assert farthest_from_uniform([p.force_n for p in drawn], 5, 25) < bound
+    assert farthest_from_uniform([p.pose.z_mm for p in drawn], 10, 85) < bound  # floor, and 15 mm below the top
+    assert farthest_from_uniform([p.pose.x_mm for p in drawn], 11, 13) < bound
+    assert farthest_from_uniform([p.pose.y_mm for p in drawn], -8, -6) < bound
+
+
+def test_a_rounded_draw_is_not_uniform_and_the_same_test_says_so():
+    """A yaw drawn as a whole number of radians takes 3 values of a half turn."""
+    whole = [int(np.random.default_rng(seed).integers(0, 3)) for seed in range(2000)]
+    assert farthest_from_uniform(whole, 0, math.pi) > 0.3
+
+
+def test_yaw_stays_within_the_half_turn_and_draws_are_independent():
+    drawn = np.array([[*p.pose.as_tuple(), p.force_n] for p in plans()])
+    assert drawn[:, 3].min() >= 0
+    assert drawn[:, 3].max() < math.pi
+    correlation = np.corrcoef(drawn.T) - np.eye(5)
+    assert np.abs(correlation).max() < 4 / math.sqrt(len(drawn))  # 4 standard errors
+
+
+def test_the_same_generator_gives_the_same_plan():
+    assert plan(3) == plan(3)
+    assert plan(3) != plan(4)
+
+
+def test_a_plan_comes_from_straight_above_with_open_jaws():
+    for each in plans(20):
+        assert each.above == dataclasses.replace(each.pose, z_mm=each.pose.z_mm + 180)
+        assert each.opening_mm == STROKE
+
+
+def test_fingers_do_not_reach_lower_than_they_are_long():
+    tall = dataclasses.replace(FIT, height_mm=250.0)
+    assert min(p.pose.z_mm for p in plans(200, fit=tall)) >= 250 - 110
+
+
+@pytest.mark.parametrize(("height", "expected"), [(10.0, 10.0), (20.0, 10.0), (25.0, 10.0)])
+def test_a_low_object_is_grasped_at_the_floor(height, expected):
+    """The authors' interval is upside down below 25 mm: its lower end lies above its upper one."""
+    low = dataclasses.replace(FIT, height_mm=height)
+    assert {p.pose.z_mm for p in plans(20, fit=low)} == {expected}
+
+
+def test_the_floor_of_the_workspace_counts_as_well():
+    workspace = Box((-150.0, -150.0, 30.0), (150.0, 150.0, 500.0))
+    assert min(p.pose.z_mm for p in plans(200, workspace=workspace)) >= 30
+
+
+REFUSED = {
+    "lower than the fingers reach": ({"height_mm": 9.9}, {}, "10 mm high, and the fingers reach no lower than 10 mm"),
+    "wider than the stroke": ({"radius_mm": 50.1}, {}, "wider than the stroke: .* must open 110 mm, and they open 110"),
+    "a smaller stroke": ({}, {"stroke": 60.0}, "wider than the stroke"),
+    "beside the workspace": ({"x_mm": 152.0}, {}, "out of the workspace"),
+    "too high for the arm": ({"height_mm": 495.0}, {}, "too high: 495 mm, and the arm rises to 500 mm"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_grasped_is_refused_with_the_reason(case):
+    fit, options, reason = REFUSED[case]
+    with pytest.raises(PlanError, match=reason):
+        plan(fit=dataclasses.replace(FIT, **fit), **options)
+
+
+def test_a_long_box_is_refused_along_its_length_and_grasped_across():
+    box = dataclasses.replace(FIT, method="box", half_mm=(80.0, 15.0), radius_mm=15.0)
+    yaws = []
+    for seed in range(300):
+        with contextlib.suppress(PlanError):
+            yaws.append(plan(seed, fit=box).pose.yaw_rad)
+    assert 0.5 < len(yaws) / 300 < 0.9
+    assert all(abs(yaw - math.pi / 2) < 1.3 for yaw in yaws)  # across it is pi / 2
+
+
+def test_a_refused_plan_does_not_change_what_the_next_draws():
+    rng, other = np.random.default_rng(0), np.random.default_rng(0)
+    with pytest.raises(PlanError):
+        plan_grasp(FIT, GraspSettings(), WORKSPACE, 10.0, rng)
+    plan_grasp(FIT, GraspSettings(), WORKSPACE, STROKE, other)
+    assert rng.uniform() == other.uniform()
+
+
+# Settings ---------------------------------------------------------------------------------------------------
+
+WRONG = {
+    "force_n": [(0.0, 5.0), (10.0, 5.0), (5.0, math.inf), (math.nan, 5.0)],
+    "jitter_mm": [-1.0, math.nan, math.inf],
+    "floor_mm": [-1.0],
+    "reach_mm": [0.0],
+    "lift_mm": [0.0],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
+def test_a_setting_out_of_range_is_refused(name, value):
+    with pytest.raises(RobotConfigError, match=name):
+        GraspSettings(**{name: value})
+
+
+def test_settings_come_from_plain_values():
+    assert GraspSettings.from_dict({"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
+    with pytest.raises(RobotConfigError, match="no setting 'jitter'; known: force_n, jitter_mm"):
+        GraspSettings.from_dict({"jitter": 3})
+    for wrong in ({"force_n": [1, 2, 3]}, {"force_n": ["a", "b"]}, {"lift_mm": "high"}):
+        with pytest.raises(RobotConfigError, match="must be numbers"):
+            GraspSettings.from_dict(wrong)
+
+
+def test_forces_that_the_gripper_cannot_give_are_refused_before_anything_moves():
+    arm, gripper = FakeArm(World(0)), FakeGripper(World(0))
+    GraspSettings().check(arm, gripper)
+    for force in ((4.0, 25.0), (5.0, 81.0)):
+        with pytest.raises(RobotConfigError, match="force_n must be within 5 to 80 N, the range of fake gripper"):
+            GraspSettings(force_n=force).check(arm, gripper)

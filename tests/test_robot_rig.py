@@ -1,0 +1,145 @@
+"""A rig connects all or nothing, always closes, and is built from its name or a TOML file."""
+
+import pytest
+
+from robot import rig as module
+from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.rig import Rig, load_rig
+from tests.fake_rig import FakeRig
+
+ORDER = ["arm", "gripper", "gel a", "gel b", "camera"]
+
+
+def events(rig, what):
+    return [call.removesuffix(f".{what}") for call in rig.world.calls if call.endswith(f".{what}")]
+
+
+def test_all_devices_are_connected_in_order_and_closed_in_reverse():
+    with FakeRig() as rig:
+        assert events(rig, "connect") == ORDER
+        assert all(device.is_connected for device in rig.devices)
+    assert events(rig, "close") == ORDER[::-1]
+
+
+@pytest.mark.parametrize("number", range(len(ORDER)))
+def test_where_one_device_fails_none_stays_connected(number):
+    rig = FakeRig(faults={f"{ORDER[number]}.connect": {1}})
+    with pytest.raises(DeviceError, match="told to fail"):
+        rig.connect()
+    assert not any(device.is_connected for device in rig.devices)
+    assert events(rig, "close") == ORDER[: number + 1][::-1]  # the one that failed cleans up after itself
+    rig.connect()
+    assert all(device.is_connected for device in rig.devices)
+
+
+def test_a_failed_connection_reports_its_first_error():
+    rig = FakeRig(faults={"camera.connect": {1}, "arm.close": {1}})
+    with pytest.raises(DeviceError, match=r"camera\.connect"):
+        rig.connect()
+
+
+def test_closing_goes_on_when_one_device_fails():
+    rig = FakeRig(faults={"gel b.close": {1}, "arm.close": {1}})
+    rig.connect()
+    with pytest.raises(DeviceError, match=r"gel b\.close"):  # the first that failed
+        rig.close()
+    assert not any(device.is_connected for device in rig.devices)
+    assert events(rig, "close") == ORDER[::-1]
+    rig.close()
+
+
+def test_closing_twice_and_before_connecting_does_nothing():
+    rig = FakeRig()
+    rig.close()
+    with rig:
+        pass
+    rig.close()
+    assert events(rig, "close") == ORDER[::-1]
+
+
+def test_a_failure_to_close_does_not_hide_what_went_wrong_before():
+    with pytest.raises(ZeroDivisionError) as caught, FakeRig(faults={"arm.close": {1}}):
+        _ = 1 / 0
+    assert "while the rig was closed: the fake arm.close was told to fail" in caught.value.__notes__[0]
+
+
+def test_settings_are_read_back_from_every_device():
+    with FakeRig() as rig:
+        assert rig.settings()["fake gripper"] == {"stroke_mm": 110.0}
+        assert set(rig.settings()) == {device.name for device in rig.devices}
+
+
+def test_a_person_is_asked_when_the_object_changes_and_only_then():
+    asked = []
+    fake = FakeRig()
+    rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=asked.append)
+    for object_id, number in [("mug", 0), ("mug", 1), ("cup", 0), ("mug", 2)]:
+        rig.prepare(object_id, number)
+    assert [text.split()[1] for text in asked] == ["mug", "cup", "mug"]
+    assert rig.object_ids(2) == ["object-0001", "object-0002"]
+
+
+def test_fingers_are_in_order_however_they_were_given():
+    assert list(FakeRig(fingers=("b", "a")).sensors) == ["a", "b"]
+
+
+# By name ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    monkeypatch.setitem(module.RIGS, "fake", "tests.fake_rig:FakeRig")
+
+
+def test_a_rig_is_built_by_its_name_and_says_how(fake):
+    rig = load_rig("fake", seed=7, fingers=["a"])
+    assert isinstance(rig, FakeRig)
+    assert rig.world.seed == 7
+    assert list(rig.sensors) == ["a"]
+    assert rig.info["rig_settings"] == {"fingers": ["a"]}
+    assert load_rig(rig.info["rig"], seed=7, **rig.info["rig_settings"]).info == rig.info
+    assert not rig.arm.is_connected
+
+
+def test_a_rig_is_built_from_a_toml_file(fake, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('rig = "fake"\n[fake]\nfingers = ["b"]\n')
+    rig = load_rig(str(path), seed=1)
+    assert list(rig.sensors) == ["b"]
+    assert list(load_rig(str(path), seed=1, fingers=["a"]).sensors) == ["a"]  # what is said last counts
+    path.write_text('rig = "fake"\n')
+    assert list(load_rig(str(path), seed=1).sensors) == ["a", "b"]
+
+
+def test_an_unknown_rig_lists_the_known_ones(fake):
+    with pytest.raises(UnknownName, match=r"no rig is called 'sawyer'; known: fake, sim, or give a \.toml file"):
+        load_rig("sawyer", seed=0)
+
+
+def test_an_unknown_setting_lists_the_known_ones(fake):
+    with pytest.raises(RobotConfigError, match="FakeRig has no setting 'finger'; it knows faults, fingers"):
+        load_rig("fake", seed=0, finger="a")
+
+
+BAD_FILES = {
+    "rig = ": "is not TOML",
+    "[fake]": "must say which rig it is for",
+    "rig = 3": "must say which rig it is for",
+    'rig = "fake"\nspeed = 3': "unknown key 'speed'; known: rig, and the table \\[fake\\]",
+    'rig = "fake"\nfake = 3': "fake must be a table",
+    'rig = "none"': "no rig is called 'none'",
+    'rig = "fake"\n[fake]\ncolour = 3': "has no setting 'colour'",
+}
+
+
+@pytest.mark.parametrize("text", sorted(BAD_FILES))
+def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    with pytest.raises((RobotConfigError, UnknownName), match=BAD_FILES[text]):
+        load_rig(str(path), seed=0)
+
+
+def test_a_file_that_is_not_there_is_named(fake):
+    with pytest.raises(RobotConfigError, match=r"nowhere\.toml cannot be read"):
+        load_rig("nowhere.toml", seed=0)

@@ -1,0 +1,160 @@
+"""What every rig does, whatever it is made of: one suite over a table of rigs. A driver's rig is a row here."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from robot.devices import STATUSES, Pose
+from robot.errors import DeviceError
+from robot.rig import Rig, load_rig
+from tests.fake_rig import FakeRig
+
+RIGS = {"fake": lambda: FakeRig(5), "sim": lambda: load_rig("sim", seed=5)}
+
+
+@pytest.fixture(params=sorted(RIGS))
+def rig(request):
+    """A connected rig with its first object on the table."""
+    with RIGS[request.param]() as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        yield rig
+
+
+@pytest.fixture(params=sorted(RIGS))
+def unconnected(request):
+    return RIGS[request.param]()
+
+
+def middle(rig, share=0.5):
+    lower, upper = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
+    x, y, z = (lower + share * (upper - lower)).tolist()
+    return Pose(x, y, z, 0.3)
+
+
+def test_it_is_a_rig_that_says_what_a_recording_must_know(unconnected: Rig):
+    assert {"source", "sensor"} <= set(unconnected.info)
+    assert set(unconnected.sensors) <= {"a", "b"}
+    assert unconnected.sensors
+    names = unconnected.object_ids(5)
+    assert len(set(names)) == 5
+    assert unconnected.object_ids(3) == names[:3]
+
+
+def test_it_connects_closes_twice_and_connects_again(unconnected: Rig):
+    unconnected.close()
+    for _ in range(2):
+        unconnected.connect()
+        assert all(device.is_connected for device in unconnected.devices)
+        unconnected.close()
+        unconnected.close()
+        assert not any(device.is_connected for device in unconnected.devices)
+
+
+def test_no_device_works_before_it_is_connected(unconnected: Rig):
+    uses = [
+        unconnected.arm.pose,
+        unconnected.gripper.state,
+        unconnected.camera.read,
+        *(sensor.read for sensor in unconnected.sensors.values()),
+        *(device.settings for device in unconnected.devices),
+    ]
+    for use in uses:
+        with pytest.raises(DeviceError, match="must be connected"):
+            use()
+
+
+def test_the_arm_goes_where_it_is_told_and_nowhere_else(rig: Rig):
+    target = middle(rig)
+    reached = rig.arm.move_to(target, 100.0)
+    assert math.dist(reached.as_tuple(), target.as_tuple()) < 1.0
+    assert math.dist(rig.arm.pose().as_tuple(), target.as_tuple()) < 1.0
+    for axis in ("x_mm", "y_mm", "z_mm"):
+        with pytest.raises(DeviceError, match="workspace"):
+            rig.arm.move_to(dataclasses.replace(target, **{axis: 1e5}), 100.0)
+    assert math.dist(rig.arm.pose().as_tuple(), target.as_tuple()) < 1.0
+
+
+def test_the_gripper_opens_and_refuses_what_it_cannot_do(rig: Rig):
+    gripper = rig.gripper
+    assert 0 < gripper.min_force_n < gripper.max_force_n
+    state = gripper.open(gripper.stroke_mm)
+    assert state.opening_mm == pytest.approx(gripper.stroke_mm, abs=1.0)
+    assert state.status == "idle"
+    for force in (0.9 * gripper.min_force_n, 1.1 * gripper.max_force_n, math.nan):
+        with pytest.raises(DeviceError, match="force"):
+            gripper.grasp(force)
+    for opening in (-1.0, gripper.stroke_mm + 1.0):
+        with pytest.raises(DeviceError, match="opening"):
+            gripper.open(opening)
+    assert gripper.state() == state
+
+
+def test_closing_on_nothing_is_no_part_and_opening_ends_it(rig: Rig):
+    rig.arm.move_to(middle(rig, 0.95), 100.0)
+    rig.gripper.open(rig.gripper.stroke_mm)
+    assert rig.gripper.grasp(rig.gripper.min_force_n).status == "no_part"
+    assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
+
+
+def test_states_are_of_the_contract(rig: Rig):
+    assert rig.gripper.state().status in STATUSES
+
+
+def test_gels_are_seen_in_colour_and_fresh(rig: Rig):
+    for finger, sensor in rig.sensors.items():
+        frame = sensor.read()
+        assert sensor.finger == finger
+        assert frame.pixels.dtype == np.uint8
+        assert frame.pixels.shape[2] == 3
+        assert abs(rig.clock() - frame.time_s) < 0.5
+        assert frame.pixels.std() > 0
+
+
+def test_the_camera_sees_colour_and_depth_of_one_size_from_above_the_table(rig: Rig):
+    image = rig.camera.read()
+    assert image.colour.shape[:2] == image.depth_m.shape
+    assert np.nanmedian(image.depth_m) > 0.1
+    assert rig.camera.read(depth=False).depth_m is None
+    assert rig.camera.extrinsics[2, 3] > 0
+    columns = image.depth_m.shape[1]
+    ray = np.array([(columns / 2 - image.intrinsics.cx) / image.intrinsics.fx, 0, 1.0])
+    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it looks down
+
+
+def test_depth_and_extrinsics_put_the_table_near_zero(rig: Rig):
+    image = rig.camera.read()
+    rows, columns = np.nonzero(np.isfinite(image.depth_m))
+    depth, lens = image.depth_m[rows, columns] * 1000.0, image.intrinsics
+    local = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], 1)
+    height = (local @ rig.camera.extrinsics[:3, :3].T + rig.camera.extrinsics[:3, 3])[:, 2]
+    assert abs(np.median(height[height < 20])) < 10
+
+
+def test_time_passes_while_it_sleeps(rig: Rig):
+    before = rig.clock()
+    rig.sleep(0.01)
+    assert rig.clock() >= before + 0.01
+
+
+def test_settings_are_plain_and_of_every_device(rig: Rig):
+    import json
+
+    assert set(json.loads(json.dumps(rig.settings()))) == {device.name for device in rig.devices}
+
+
+def test_a_rig_that_can_be_doubled_prepares_from_seed_object_and_number_alone(unconnected: Rig):
+    if not unconnected.can_run_jobs:
+        pytest.skip("there is one such rig")
+    names = unconnected.object_ids(2)
+    with unconnected as rig:
+        rig.prepare(names[0], 3)
+        first = rig.camera.read()
+        rig.prepare(names[1], 1)
+        other = rig.camera.read()
+        rig.prepare(names[0], 3)
+        again = rig.camera.read()
+    assert (first.colour == again.colour).all()
+    np.testing.assert_array_equal(first.depth_m, again.depth_m)
+    assert (first.colour != other.colour).any()

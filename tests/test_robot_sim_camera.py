@@ -1,0 +1,130 @@
+"""The camera sees what stands on the table, where geometry says it must."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from robot.errors import SceneError
+from robot.sim import camera as cameras
+from robot.sim.camera import Camera, Lighting, Placement, look
+from robot.sim.objects import draw_object
+
+POST = draw_object(0, 0, family="cylinder", relief="smooth")
+HEIGHT_MM = float(POST.body.upper[2])
+CAMERA = Camera()
+LIGHT = Lighting.draw(np.random.default_rng(3))
+
+
+def project(camera, point):
+    """Pixel (x, y) of a point of the rig frame, by the pinhole equation."""
+    local = np.linalg.inv(camera.to_rig) @ [*point, 1.0]
+    return camera.focal_px * local[:2] / local[2] + (camera.px - 1) / 2
+
+
+def test_the_axes_are_right_down_and_forward():
+    right, down, forward = CAMERA.to_rig[:3, :3].T
+    np.testing.assert_allclose(right, [1, 0, 0], atol=1e-12)
+    assert forward[1] > 0 > forward[2]
+    assert down[2] < 0
+    np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-12)
+
+
+def test_each_ray_goes_through_the_centre_of_its_pixel():
+    index = 37 * CAMERA.px + 201
+    x, y = project(CAMERA, np.asarray(CAMERA.position_mm) + 500 * CAMERA.rays[index])
+    assert (x, y) == pytest.approx((201, 37), abs=1e-6)
+
+
+def test_the_object_is_seen_where_it_stands():
+    view = look(POST, Placement(30.0, -10.0, 0.4), CAMERA)
+    middle = project(CAMERA, (30.0, -10.0, HEIGHT_MM / 2)).round().astype(int)
+    mask = view.is_object.reshape(CAMERA.px, CAMERA.px)
+    assert mask[middle[1], middle[0]]
+    rows, columns = np.nonzero(mask)
+    assert columns.mean() == pytest.approx(middle[0], abs=2)
+    above = project(CAMERA, (30.0, -10.0, HEIGHT_MM + 15)).round().astype(int)
+    assert not mask[above[1], above[0]]
+
+
+def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
+    view = look(POST, Placement(), CAMERA)
+    depth = cameras.depth(view, 1)
+    row, column = 250, 10
+    assert not view.is_object[row * CAMERA.px + column]
+    point = view.points[row * CAMERA.px + column]
+    assert point[2] == pytest.approx(0, abs=1e-9)
+    expected_m = (np.linalg.inv(CAMERA.to_rig) @ [*point, 1])[2] / 1000
+    block = depth[row - 3 : row + 4, column - 3 : column + 4]
+    assert np.nanmedian(block) == pytest.approx(expected_m, abs=0.004)
+
+
+def test_depth_has_holes_flying_pixels_and_whole_millimetres():
+    view = look(POST, Placement(), CAMERA)
+    depth = cameras.depth(view, 1)
+    assert depth.dtype == np.float32
+    known = depth[np.isfinite(depth)] * 1000.0
+    np.testing.assert_allclose(known, np.round(known), atol=1e-3)
+    assert 0.001 < np.isnan(depth).mean() < 0.2
+    exact = (view.distance_mm * (CAMERA.rays @ CAMERA.to_rig[:3, 2])).reshape(depth.shape)
+    away = np.abs(depth * 1000.0 - exact)
+    assert np.nanmedian(away) < 2
+    assert np.nanmax(away) > 10  # pixels that fly between the object and what is behind it
+
+
+def test_the_shadow_darkens_the_table_on_the_side_away_from_the_lamp():
+    light = dataclasses.replace(LIGHT, direction=(0.8, 0.0, 0.6))
+    view = look(POST, Placement(), CAMERA)
+    with_shadow, without = (cameras.photo(view, light, 1, shadow).astype(float) for shadow in (True, False))
+    darker = (without - with_shadow).mean(axis=2).reshape(-1)
+    rim_mm = float(POST.body.upper[0])
+    table = ~view.is_object & (np.abs(view.points[:, 1]) < 5)
+    behind = table & (view.points[:, 0] < -rim_mm - 3) & (view.points[:, 0] > -rim_mm - 10)
+    before = table & (view.points[:, 0] > rim_mm + 3) & (view.points[:, 0] < rim_mm + 10)
+    assert darker[behind].mean() > 20
+    assert abs(darker[before].mean()) < 1
+
+
+def test_the_side_towards_the_lamp_is_brighter():
+    light = dataclasses.replace(LIGHT, direction=(0.8, -0.3, math.sqrt(1 - 0.73)))
+    view = look(POST, Placement(), CAMERA)
+    photo = cameras.photo(view, light, 1).astype(float).mean(axis=2).reshape(-1)
+    side = view.is_object & (view.points[:, 2] < HEIGHT_MM - 5)
+    assert photo[side & (view.points[:, 0] > 0)].mean() > photo[side & (view.points[:, 0] < 0)].mean() + 10
+
+
+def test_relief_that_is_large_enough_for_the_pixels_shows():
+    """Ribs shade the wall in rows or columns; a smooth wall of the same shape, colour and light has none."""
+    ribbed, smooth = (draw_object(0, 0, family="cylinder", relief=relief) for relief in ("ribs", "smooth"))
+    smooth = dataclasses.replace(smooth, looks=ribbed.looks, material=ribbed.material)
+    roughness = []
+    for obj in (ribbed, smooth):
+        view = look(obj, Placement(), CAMERA)
+        photo = cameras.photo(view, LIGHT, 1).astype(float).mean(axis=2)
+        mask = view.is_object.reshape(photo.shape)
+        rows = slice(*np.quantile(np.nonzero(mask)[0], [0.4, 0.8]).astype(int))
+        columns = slice(*np.quantile(np.nonzero(mask)[1], [0.3, 0.7]).astype(int))
+        patch = photo[rows, columns]
+        roughness.append(max(np.abs(np.diff(patch, 2, axis=axis)).mean() for axis in (0, 1)))
+    assert roughness[0] > 1.5 * roughness[1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"px": 0},
+        {"focal_px": 0.0},
+        {"position_mm": (0.0, -500.0, -10.0)},
+        {"position_mm": (0.0, 0.0, 500.0)},
+        {"position_mm": (0.0, math.nan, 500.0)},
+    ],
+)
+def test_a_camera_that_cannot_be_is_refused(settings):
+    with pytest.raises(SceneError):
+        Camera(**settings)
+
+
+def test_a_camera_that_sees_past_the_table_is_refused():
+    with pytest.raises(SceneError, match="nothing but the table"):
+        look(POST, Placement(), Camera(position_mm=(0.0, -560.0, 80.0)))

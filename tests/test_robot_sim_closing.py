@@ -1,0 +1,210 @@
+"""Jaws that close on an object: closed forms, order of the method, and where an explicit method blows up."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robot.errors import RobotConfigError, SceneError
+from robot.sim.closing import ForceLaw, Jaws, LinearLaw, Motion, TabulatedLaw, close, pressed_law, settle
+from robot.sim.contact import Layer, press
+from robot.sim.frontier import spring_closing
+from robot.sim.hard_cases import naive_close
+
+
+def on_springs(stiffness_n_mm, force_n=20.0, clearance=(0.0, 0.0), **jaws):
+    law = LinearLaw(stiffness_n_mm)
+    return Motion(Jaws(force_n, **jaws), (law, law), clearance)
+
+
+# Motion ----------------------------------------------------------------------------------------------------
+
+
+def test_jaws_on_a_spring_move_as_the_damped_oscillator_does():
+    motion = on_springs(100.0)
+    times, states = close(motion, 0.05, 1e-4)
+    exact = spring_closing(motion.jaws, 100.0, times)
+    assert states[:, 0] == pytest.approx(exact, abs=4e-4 * 0.2)
+    assert states[:, 1] == pytest.approx(states[:, 0])
+    assert states[:, 2] == pytest.approx(0.0)
+
+
+def test_the_error_falls_with_the_square_of_the_step():
+    motion = on_springs(100.0)
+    errors = []
+    for step in (4e-4, 2e-4, 1e-4):
+        times, states = close(motion, 0.02, step)
+        errors.append(np.abs(states[:, 0] - spring_closing(motion.jaws, 100.0, times)).max())
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    assert math.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_free_jaws_reach_the_speed_at_which_damping_carries_the_force():
+    motion = on_springs(1.0, force_n=5.0, clearance=(1e6, 1e6), jaw_damping_n_s_mm=0.1)
+    _, states = close(motion, 1.0, 1e-2)
+    assert states[-1, 3] == pytest.approx(5.0 / 0.1)
+    assert motion.contact_forces(states[-1]) == (0.0, 0.0)
+
+
+def test_an_object_off_the_middle_is_pushed_until_both_fingers_hold_it():
+    motion = on_springs(10.0, clearance=(1.0, 3.0))
+    _, states = close(motion, 2.0, 1e-2)
+    assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-6)
+    assert states[-1, 2] > 0.0  # finger a came first and pushed it away
+    assert states[-1, 0] + states[-1, 1] == pytest.approx(4.0 + 2.0 * 2.0, rel=1e-6)
+
+
+def test_the_jacobian_is_the_slope_of_the_rate():
+    curve = TabulatedLaw([0.5, 1.0, 2.0], [1.0, 4.0, 20.0])
+    motion = Motion(Jaws(3.0), (curve, LinearLaw(7.0)), (0.1, -0.2))
+    state = np.array([0.9, 0.4, 0.1, 5.0, -3.0, 1.0])
+    _, jacobian = motion.rate(state)
+    for column, unit in enumerate(np.eye(6)):
+        slope = (motion.rate(state + 1e-6 * unit)[0] - motion.rate(state - 1e-6 * unit)[0]) / 2e-6
+        assert jacobian[:, column] == pytest.approx(slope, rel=1e-6, abs=1e-5)  # a difference of numbers of 1e4
+
+
+# Stiffness -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9])
+def test_every_stiffness_ends_at_the_commanded_force_in_steps_of_ten_milliseconds(stiffness_n_m):
+    motion = on_springs(stiffness_n_m * 1e-3, clearance=(2.0, 1.0))
+    _, states = close(motion, 1.0, 1e-2)
+    assert np.isfinite(states).all()
+    assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-4)
+
+
+def test_a_very_soft_contact_ends_there_too_but_later():
+    motion = on_springs(0.1, clearance=(2.0, 1.0))
+    _, states = close(motion, 10.0, 1e-2)
+    assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_explicit_steps_blow_up_where_implicit_ones_ten_times_longer_do_not():
+    motion = on_springs(1e6, clearance=(2.0, 1.0))
+    assert not np.isfinite(naive_close(motion, 1.0, 1e-3)).all()
+    _, states = close(motion, 1.0, 1e-2)
+    assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-4)
+
+
+def test_explicit_steps_are_right_where_they_are_short_enough():
+    motion = on_springs(100.0)
+    assert naive_close(motion, 0.01, 2e-6)[0] == pytest.approx(close(motion, 0.01, 1e-4)[1][-1, 0], rel=2e-3)
+
+
+def test_a_fast_oscillation_dies_out_within_long_steps():
+    # 1e9 N/m, started 1 um too deep at both fingers: a thousand newton too much, gone after ten steps of 10 ms.
+    motion = on_springs(1e6)
+    start = np.array([1e-3 + 2e-5, 1e-3 + 2e-5, 0.0, 0.0, 0.0, 0.0])
+    _, states = close(motion, 0.1, 1e-2, start)
+    assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-2)
+
+
+# Rest ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stiffness_n_mm", [1e-1, 1.0, 1e3, 1e6])
+def test_at_rest_each_finger_carries_the_force(stiffness_n_mm):
+    assert settle(on_springs(stiffness_n_mm)) == pytest.approx((20.0 / stiffness_n_mm,) * 2, rel=1e-12)
+
+
+def test_different_fingers_go_to_different_depths_under_the_same_force():
+    motion = Motion(Jaws(20.0), (LinearLaw(10.0), LinearLaw(1e6)))
+    assert settle(motion) == pytest.approx((2.0, 2e-5), rel=1e-12)
+
+
+def test_without_a_force_nothing_is_pressed():
+    motion = on_springs(10.0, force_n=0.0)
+    assert settle(motion) == (0.0, 0.0)
+    assert not close(motion, 0.1, 1e-2)[1].any()
+
+
+def test_the_motion_ends_where_rest_is():
+    gap = (np.arange(-20.0, 21.0)[:, None] ** 2 + np.arange(-20.0, 21.0) ** 2) * 0.15**2 / 8.0
+    law = pressed_law(gap, 0.15, Layer(0.2, 0.48, 2.0), 0.8)
+    motion = Motion(Jaws(1.0), (law, law), (0.5, 0.5))
+    depths = settle(motion)
+    _, states = close(motion, 3.0, 1e-2)
+    assert states[-1, 0] - 0.5 == pytest.approx(depths[0], rel=1e-4)
+
+
+# Force laws ------------------------------------------------------------------------------------------------
+
+
+def test_a_pressed_law_is_the_solver_s_force_at_each_depth_of_its_table_and_near_between():
+    gap = (np.arange(-20.0, 21.0)[:, None] ** 2 + np.arange(-20.0, 21.0) ** 2) * 0.15**2 / 8.0 + 3.0
+    layer = Layer(0.2, 0.48, 2.0)
+    law = pressed_law(gap, 0.15, layer, 0.8)
+    for depth, tolerance in ((0.4, 1e-9), (0.8, 1e-9), (0.45, 1e-2)):
+        force = press(gap, 0.15, layer, depth_mm=3.0 + depth).force_n
+        assert law(depth)[0] == pytest.approx(force, rel=tolerance)
+
+
+def test_a_table_rises_from_zero_and_goes_on_straight():
+    law = TabulatedLaw([1.0, 2.0, 4.0], [1.0, 4.0, 16.0])
+    assert law(-1.0) == (0.0, 0.0)
+    assert law(0.0) == (0.0, 0.0)
+    assert law(2.0)[0] == pytest.approx(4.0)
+    force, slope = law(4.0)
+    assert force == pytest.approx(16.0)
+    assert law(6.0) == pytest.approx((16.0 + 2.0 * slope, slope))
+    assert law.depth_at(16.0 + 2.0 * slope) == pytest.approx(6.0)
+
+
+def test_a_lost_number_is_not_taken_for_no_contact():
+    assert math.isnan(LinearLaw(1.0)(math.nan)[0])
+
+
+def test_a_finger_that_never_pushes_back_enough_is_refused():
+    class Weak(ForceLaw):
+        def _force(self, depth_mm):
+            return 1.0 - math.exp(-depth_mm), math.exp(-depth_mm)
+
+    weak = Weak()
+    with pytest.raises(SceneError, match=r"must be able to push with 2\.0 N, got at most 1\.0 N"):
+        settle(Motion(Jaws(2.0), (weak, weak)))
+
+
+def test_a_law_that_jumps_is_taken_in_shorter_steps():
+    class Jump(ForceLaw):
+        def _force(self, depth_mm):
+            return (10.0, 0.0) if depth_mm > 1.0 else (0.0, 0.0)
+
+    _, states = close(Motion(Jaws(5.0), (Jump(), Jump())), 0.3, 1e-2)
+    assert states[-1, :2] == pytest.approx([1.0, 1.0], abs=0.05)  # it chatters at the jump
+
+
+def test_a_law_without_a_number_is_refused():
+    class Lost(ForceLaw):
+        def _force(self, depth_mm):
+            return math.nan, 1.0
+
+    with pytest.raises(SceneError, match=r"motion must be solvable, got stuck at .* s; use a smoother force law"):
+        close(Motion(Jaws(5.0), (Lost(), Lost())), 1.0, 1e-2)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: LinearLaw(0.0), RobotConfigError, "above 0 N/mm and finite, got 0.0"),
+        (lambda: LinearLaw(math.nan), RobotConfigError, "above 0 N/mm and finite, got nan"),
+        (lambda: TabulatedLaw([1.0, 1.0], [1.0, 2.0]), RobotConfigError, "must rise"),
+        (lambda: TabulatedLaw([1.0, 2.0], [2.0, 1.0]), RobotConfigError, "must rise"),
+        (lambda: TabulatedLaw([1.0, 2.0], [1.0]), RobotConfigError, "must rise"),
+        (lambda: TabulatedLaw([], []), RobotConfigError, "must rise"),
+        (lambda: TabulatedLaw([1.0], [math.inf]), RobotConfigError, "must rise"),
+        (lambda: Jaws(-1.0), RobotConfigError, "force_n must be finite and not negative, got -1.0"),
+        (lambda: Jaws(1.0, jaw_mass_kg=0.0), RobotConfigError, "jaw_mass_kg must be above 0 and finite, got 0.0"),
+        (lambda: Jaws(1.0, object_mass_kg=math.nan), RobotConfigError, "object_mass_kg must be above 0"),
+        (lambda: Jaws(1.0, jaw_damping_n_s_mm=-1.0), RobotConfigError, "jaw_damping_n_s_mm must be finite and not"),
+        (lambda: on_springs(1.0, clearance=(math.nan, 0.0)), SceneError, "clearances must be finite"),
+        (lambda: close(on_springs(1.0), 1.0, 0.0), RobotConfigError, "step must be in \\(0, duration\\], got 0.0 s"),
+        (lambda: close(on_springs(1.0), 1.0, math.nan), RobotConfigError, "step must be in"),
+        (lambda: close(on_springs(1.0), 1.0, 2.0), RobotConfigError, "got 2.0 s of 1.0 s"),
+    ],
+)
+def test_wrong_input_is_refused_with_what_to_do(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

@@ -1,0 +1,418 @@
+"""From the shape of a gel to its picture: surfaces, LEDs, fitted optics, flaws, markers, noise."""
+
+import json
+import math
+import pickle
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.errors import BadRobotInput, RobotConfigError, SceneError, UnknownName
+from robot.sim import fitted_optics, gel, optics
+from robot.sim.contact import Layer
+from robot.sim.fitted_optics import FittedOptics, Limits, fitted_names, load_fitted
+from robot.sim.gel import OPTICS, GelSensor, Noise, draw_sensor
+from robot.sim.gel_marks import Flaws, Markers, flaw_maps, marker_positions
+from robot.sim.optics import Bar, LedOptics, cast_shadows, led_rays
+from robot.sim.surface import Field, Surface, resized
+
+LAYER = Layer(0.3, 0.48, 3.0)
+SMALL = Field(24, 32, 0.5)
+SILENT = Noise(0.0, 0.0)
+
+
+def small_sensor(**changes):
+    settings = {"rows": 24, "cols": 32, "pixel_mm": 0.5, "noise": SILENT, "blur_px": 0.0}
+    return GelSensor(LAYER, **{**settings, **changes})
+
+
+def dome(field=SMALL, radius_mm=6.0, depth_mm=1.0):
+    x, y = field.positions()
+    return np.maximum(0, depth_mm - (x * x + y * y) / (2 * radius_mm))
+
+
+# Surfaces --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("grid", [(24, 32), (12, 16), (48, 64), (30, 20)])
+def test_the_slopes_of_a_plane_are_its_slopes_whatever_the_grid(grid):
+    field = Field(grid[0], grid[1], 1.0)
+    x, y = field.positions()
+    across, down = SMALL.size_mm[1] / grid[1], SMALL.size_mm[0] / grid[0]
+    slope_x, slope_y = Surface(0.1 * x * across - 0.2 * y * down, SMALL).slopes
+    assert slope_x.shape == slope_y.shape == (24, 32)
+    np.testing.assert_allclose(slope_x, 0.1, atol=1e-5)
+    np.testing.assert_allclose(slope_y, -0.2, atol=1e-5)
+
+
+def test_slopes_are_taken_before_they_are_interpolated_because_heights_interpolated_ripple():
+    field, coarse = Field(240, 320, 0.05), Field(60, 80, 0.2)
+    x, y = (axis.astype(np.float64) for axis in coarse.positions())
+    fine_x, _ = field.positions()
+    bowl = (x * x + y * y) / 8
+    inside = (slice(20, -20), slice(20, -20))
+    ours = Surface(bowl, field).slopes[0]
+    naive = np.gradient(cv2.resize(bowl, (320, 240), interpolation=cv2.INTER_CUBIC), 0.05, axis=1)
+    truth = np.broadcast_to(fine_x / 4, ours.shape)
+    assert np.abs(ours - truth)[inside].max() < 3e-3  # cv2's cubic kernel does not quite keep a straight line
+    assert np.abs(naive - truth)[inside].max() > 5 * np.abs(ours - truth)[inside].max()
+
+
+def test_a_finer_grid_is_averaged_and_an_equal_one_kept():
+    fine = np.arange(16, dtype=np.float32).reshape(4, 4)
+    np.testing.assert_allclose(resized(fine, (2, 2)), [[2.5, 4.5], [10.5, 12.5]])
+    assert resized(fine, (4, 4)) is fine
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (np.full((4, 4), np.nan), "finite, got 16"),
+        (np.array([[0.0, np.inf]]), "finite, got 1"),
+        (np.zeros(5), r"shape \(5,\)"),
+        (np.zeros((2, 2, 3)), r"shape \(2, 2, 3\)"),
+        (np.zeros((0, 4)), r"shape \(0, 4\)"),
+        (np.array([["a"]]), "map of numbers"),
+        (np.zeros((2, 2), complex), "map of numbers"),
+    ],
+)
+def test_what_is_no_displacement_is_refused(wrong, says):
+    with pytest.raises(SceneError, match=says):
+        small_sensor().render(wrong, 0)
+
+
+HARD = {
+    "one point": np.ones((1, 1)),
+    "one row": np.arange(7.0)[None],
+    "one column": np.arange(7.0)[:, None],
+    "a cliff of slope 1e6": np.where(np.arange(32) > 16, 5e5, 0.0) * np.ones((24, 1)),
+    "beyond every number": np.where(np.arange(32) > 16, 1e300, -1e300) * np.ones((24, 1)),
+    "too small for float32": np.full((24, 32), 1e-300),
+    "integers": np.eye(24, 32, dtype=np.int64),
+    "more points than pixels": np.random.default_rng(0).random((300, 301)),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("kind", ["led", *fitted_names()])
+def test_hard_surfaces_give_pictures(name, kind):
+    sensor = replace(draw_sensor(0, "a", optics=kind), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
+    clean = sensor._clean(Surface(HARD[name], sensor.field))
+    assert np.isfinite(clean).all()
+    assert clean.min() > -2000
+    assert clean.max() < 2000
+    picture = sensor.render(HARD[name], 0)
+    assert picture.shape == (24, 32, 3)
+    assert picture.dtype == np.uint8
+
+
+def test_the_naive_normal_of_a_cliff_is_no_number():
+    slope = np.float32(1e25)
+    with np.errstate(over="ignore"):
+        assert not np.isfinite(1 + slope * slope)
+    assert Surface(HARD["beyond every number"], SMALL).slopes[0].max() == 1e3
+
+
+# LEDs ------------------------------------------------------------------------------------------------------
+
+
+def by_two_loops(bar, field, slope_x, slope_y):
+    """w / w_flat of the docstring, point by point."""
+    out = np.empty((field.rows, field.cols))
+    xs, ys = field.positions()
+    for row in range(field.rows):
+        for col in range(field.cols):
+            normal = np.array([-slope_x[row, col], -slope_y[row, col], 1.0])
+            normal /= math.sqrt(normal @ normal)
+            lit = flat = 0.0
+            for led in bar.positions():
+                away = led - np.array([xs[0, col], ys[row, 0], 0.0])
+                distance = math.sqrt(away @ away)
+                axis = -led / math.sqrt(led @ led)
+                strength = max(0.0, -axis @ away / distance) ** bar.order / distance**2
+                lit += strength * max(0.0, normal @ away / distance)
+                flat += strength * away[2] / distance
+            out[row, col] = lit / flat
+    return out
+
+
+@pytest.mark.parametrize("points", [1, 4])
+def test_light_of_a_bar_is_the_near_field_formula(points):
+    field = Field(5, 6, 3.0)
+    rng = np.random.default_rng(0)
+    slope_x, slope_y = rng.normal(0, 1.5, (2, 5, 6)).astype(np.float32)
+    bar = Bar(math.radians(30), points=points, order=1.7)
+    light = optics._relative_light(led_rays(bar, field), (slope_x, slope_y))
+    np.testing.assert_allclose(light, by_two_loops(bar, field, slope_x, slope_y), rtol=1e-4, atol=1e-5)
+    assert (light == 0).any() or points > 1
+
+
+def test_leds_stand_where_they_are_said_to():
+    above = Bar(math.radians(90), distance_mm=10, height_mm=4, length_mm=6, points=3)
+    np.testing.assert_allclose(above.positions(), [[-3, -10, 4], [0, -10, 4], [3, -10, 4]], atol=1e-12)
+    right = Bar(0.0, distance_mm=10, height_mm=4, points=1)
+    np.testing.assert_allclose(right.positions(), [[10, 0, 4]], atol=1e-12)
+
+
+def test_the_side_of_a_bump_that_faces_a_bar_has_its_colour():
+    sensor = small_sensor(optics=LedOptics(shadow=0.0))
+    change = sensor.render(dome(), 0).astype(int) - sensor.background(0)
+    rows, cols = np.indices((24, 32))
+    x, y = cols - 15.5, rows - 11.5
+    for channel, bar in enumerate(sensor.optics.bars):
+        towards = x * math.cos(bar.angle_rad) - y * math.sin(bar.angle_rad)
+        near = (np.hypot(x, y) < 6) & (np.abs(towards) > 3)
+        assert change[near & (towards > 0), channel].mean() > 10
+        assert change[near & (towards < 0), channel].mean() < -10
+
+
+def test_a_bump_throws_a_shadow_away_from_the_bar_and_a_flat_gel_none():
+    field = Field(80, 80, 0.1)
+    bump = np.zeros((80, 80))
+    bump[36:44, 36:44] = 1.0
+    (shade,) = cast_shadows(Surface(bump, field), (Bar(0.0, height_mm=4.0),))
+    assert shade[40, 26] > 0.3
+    assert shade[40, 60] < 0.01
+    assert 0 <= shade.min() <= shade.max() <= 1
+    assert not cast_shadows(Surface(np.zeros((4, 4)), field), (Bar(0.0),))[0].any()
+
+
+def test_shadows_are_not_computed_where_nothing_asks_for_them(monkeypatch):
+    calls = []
+    monkeypatch.setattr(optics, "cast_shadows", lambda *given: calls.append(given) or cast_shadows(*given))
+    small_sensor(optics=LedOptics(shadow=0.0)).render(dome(), 0)
+    small_sensor().background(0)
+    assert not calls
+    small_sensor().render(dome(), 0)
+    assert len(calls) == 1
+
+
+# Sensors ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", OPTICS)
+def test_a_flat_gel_shows_the_backdrop_and_render_of_nothing_is_the_background(kind):
+    sensor = replace(draw_sensor(1, "a", optics=kind), flaws=None, blur_px=0.0, tint=(1.0, 1.0, 1.0), exposure=1.0)
+    quiet = replace(sensor, noise=SILENT)
+    backdrop = np.clip(np.rint(quiet.optics.backdrop(quiet.field)), 0, 255)
+    assert np.abs(quiet.background(0) - backdrop).max() <= 1  # a tie may round either way
+    np.testing.assert_allclose(
+        quiet._clean(Surface(np.zeros((3, 4)), quiet.field)), quiet.optics.backdrop(quiet.field), atol=1e-3
+    )
+    for flat in (np.zeros((240, 320)), np.zeros((1, 1)), np.zeros((7, 9), np.float32)):
+        np.testing.assert_array_equal(sensor.render(flat, 5), sensor.background(5))
+
+
+def test_a_gel_pushed_in_evenly_looks_untouched():
+    sensor = small_sensor()
+    np.testing.assert_array_equal(sensor.render(np.full((24, 32), 0.7), 0), sensor.background(0))
+
+
+def test_the_seed_of_a_picture_makes_its_noise_and_nothing_else():
+    sensor = draw_sensor(2, "a")
+    press = dome(Field(120, 160, 0.1268))
+    one, again, other = (sensor.render(press, seed).astype(float) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, again)
+    difference = one - other
+    assert 0.5 < difference.std() / math.sqrt(2) < 2.5
+    assert abs(difference.mean()) < 0.05
+    assert abs(np.corrcoef(one[..., 0].ravel() - other[..., 0].ravel(), press_like(one))[0, 1]) < 0.05
+
+
+def press_like(picture):
+    return cv2.GaussianBlur(picture[..., 0], (0, 0), 3).ravel()
+
+
+def test_noise_has_the_variance_that_is_written_down():
+    sensor = GelSensor(LAYER, noise=Noise(1.5, 0.02))
+    many = np.stack([sensor.background(seed) for seed in range(60)]).astype(float)
+    clean = gel._untouched(sensor)
+    wanted = 1.5**2 + 0.02 * clean + 1 / 12  # rounding adds a twelfth
+    assert np.mean(many.var(axis=0)) == pytest.approx(wanted.mean(), rel=0.05)
+
+
+def test_sensors_are_drawn_alike_from_the_same_seed_and_differ_by_seed_and_finger():
+    assert draw_sensor(4, "a") == draw_sensor(4, "a")
+    assert len({draw_sensor(seed, finger) for seed in range(5) for finger in "ab"}) == 10
+    again = pickle.loads(pickle.dumps(draw_sensor(4, "b")))  # noqa: S301
+    np.testing.assert_array_equal(again.background(1), draw_sensor(4, "b").background(1))
+
+
+def test_drawn_gels_lie_in_their_ranges_and_their_pictures_stay_off_the_ends():
+    for seed in range(12):
+        sensor = draw_sensor(seed, "a")
+        assert 0.2 <= sensor.layer.modulus_mpa <= 0.8
+        assert 0.45 <= sensor.layer.poisson <= 0.49
+        assert 2 <= sensor.layer.thickness_mm <= 4
+        background = sensor.background(0)
+        assert np.mean((background <= 5) | (background >= 250)) < 0.01
+        assert 60 < background.mean() < 170
+
+
+def test_the_field_is_that_of_a_mini():
+    sensor = draw_sensor(0, "a")
+    assert sensor.field_mm == pytest.approx((15.2, 20.3), abs=0.05)
+    assert sensor.background(0).shape == (240, 320, 3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"rows": 0}, "1 to 2\\^26 pixels"),
+        ({"pixel_mm": math.nan}, "pixel_mm"),
+        ({"exposure": 0.0}, "exposure"),
+        ({"tint": (1.0, math.inf, 1.0)}, "tint"),
+        ({"blur_px": -1.0}, "blur_px"),
+        ({"noise": Noise(-1.0, 0.0)}, "noise"),
+    ],
+)
+def test_settings_of_a_sensor_out_of_range_are_refused(wrong, says):
+    with pytest.raises(RobotConfigError, match=says):
+        small_sensor(**wrong)
+
+
+def test_other_wrong_settings_are_refused():
+    with pytest.raises(RobotConfigError, match="modulus"):
+        GelSensor(Layer(-0.3))
+    with pytest.raises(RobotConfigError, match="LEDs"):
+        Bar(0.0, height_mm=0.0)
+    with pytest.raises(RobotConfigError, match="ambient"):
+        LedOptics(ambient=1.5)
+    with pytest.raises(RobotConfigError, match="mix"):
+        LedOptics(mix=((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(RobotConfigError, match="dots"):
+        Markers(radius_mm=1.0)
+    with pytest.raises(RobotConfigError, match="finger"):
+        draw_sensor(0, "")
+
+
+def test_an_unknown_optics_lists_the_known_ones():
+    with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, led"):
+        draw_sensor(0, "a", optics="lamp")
+    with pytest.raises(UnknownName, match="known are gelsight, gelsight_mini"):
+        load_fitted("../gelsight")
+
+
+# Flaws and markers -----------------------------------------------------------------------------------------
+
+
+def test_flaws_stay_in_place_and_do_not_move_with_the_size_of_the_picture():
+    flaws = Flaws(3, specks=5, hairs=2, grains=4, texture=0.0)
+    fine, coarse = (flaw_maps(flaws, field) for field in (Field(480, 640, 0.03), Field(240, 320, 0.06)))
+    np.testing.assert_allclose(resized(fine.darkening, (240, 320)), coarse.darkening, atol=0.25)
+    assert coarse.darkening.min() < 0.95
+    assert 0 < np.abs(coarse.slope_x).max() < 0.5
+    clean = flaw_maps(Flaws(3, 0, 0, 0, 0.0), SMALL)
+    assert (clean.darkening == 1).all()
+    assert not clean.slope_x.any()
+
+
+def test_markers_rest_on_a_grid_and_a_press_spreads_them():
+    field, markers = Field(240, 320, 0.0634), Markers(pitch_mm=2.0)
+    rest = marker_positions(markers, Surface(np.zeros((1, 1)), field))
+    assert len(rest) == 7 * 10
+    np.testing.assert_allclose(rest.mean(axis=0), 0, atol=1e-5)
+    moved = marker_positions(markers, Surface(dome(field, 3.0, 0.8), field)) - rest
+    outwards = (moved * rest).sum(axis=1) / np.linalg.norm(rest, axis=1)
+    near = np.linalg.norm(rest, axis=1) < 3
+    assert (outwards[near] > 0.02).all()
+    assert np.abs(moved[np.linalg.norm(rest, axis=1) > 7]).max() < 0.01
+    assert np.abs(moved).max() < 0.5
+
+
+def test_markers_are_off_by_default_and_dark_where_they_are():
+    sensor = draw_sensor(0, "a")
+    assert sensor.markers is None
+    printed = replace(sensor, markers=Markers())
+    assert printed.background(0).mean() < sensor.background(0).mean() - 2
+    x, y = marker_positions(Markers(), Surface(np.zeros((1, 1)), sensor.field))[0]
+    place = round(y / 0.0634 + 119.5), round(x / 0.0634 + 159.5)
+    assert printed.background(0)[place].mean() < 0.5 * sensor.background(0)[place].mean()
+
+
+# Fitted optics ---------------------------------------------------------------------------------------------
+
+
+def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
+    rng = np.random.default_rng(seed)
+    count = fitted_optics.feature_count(degree, len(reaches)) * places
+    free = {
+        "steepest": 1.0,
+        "left": -1,
+        "right": 1,
+        "top": -1,
+        "bottom": 1,
+        "lowest": (-9.0,) * 3,
+        "highest": (9.0,) * 3,
+    }
+    rows = tuple(map(tuple, rng.normal(0, 20, (count, 3)).tolist()))
+    return FittedOptics(
+        degree,
+        places,
+        reaches,
+        rows,
+        1,
+        ((100.0, 90.0, 80.0), (5.0, 0.0, 0.0), (0.0, 5.0, 0.0)),
+        Limits(**{**free, **limits}),
+    )
+
+
+def test_fitted_colours_are_the_sum_that_is_written_down():
+    model, surface = fitted(reaches=()), Surface(dome(), SMALL)
+    picture = model.colours(surface, surface.slopes)
+    weights = np.array(model.weights).reshape(5, 3, 3)
+    for row, col in ((3, 4), (12, 20), (20, 9)):
+        slope = np.array([surface.slopes[0][row, col], surface.slopes[1][row, col]], float)
+        nx, ny = -slope / math.sqrt(1 + slope @ slope)
+        x, y = (2 * col - 31) / 32, (2 * row - 23) / 24
+        wanted = np.array([100 + 5 * x, 90 + 5 * y, 80])
+        for feature, one in zip((nx, ny, nx * nx, nx * ny, ny * ny), weights, strict=True):
+            for place, weight in zip((1, x, y), one, strict=True):
+                wanted = wanted + feature * place * weight
+        np.testing.assert_allclose(picture[row, col], wanted, atol=0.01)
+
+
+def test_fitted_colours_are_held_at_what_the_presses_showed():
+    steep = Surface(10 * dome(), SMALL)
+    limit = fitted(reaches=(), steepest=0.3)
+    nx, ny = limit._tilts(steep.slopes)
+    assert np.hypot(nx, ny).max() == pytest.approx(0.3, rel=1e-5)
+    gentle = Surface(0.1 * dome(), SMALL)
+    free = fitted(reaches=())
+    np.testing.assert_allclose(limit.colours(gentle, gentle.slopes), free.colours(gentle, gentle.slopes), atol=1e-3)
+    held = fitted(highest=(0.2, 9.0, 9.0))
+    assert held._neighbourhood(steep)[0].max() <= 0.3  # cubic interpolation overshoots a little
+    assert fitted()._neighbourhood(steep)[0].max() > 1
+
+
+def test_places_outside_those_pressed_take_the_nearest_ones_weights():
+    model = fitted(degree=1, places=3, reaches=(), left=-0.2, right=0.2, top=-0.2, bottom=0.2)
+    tilted = Surface(0.2 * np.broadcast_to(SMALL.positions()[0], (24, 32)), SMALL)
+    change = model.colours(tilted, tilted.slopes) - model.backdrop(SMALL)
+    np.testing.assert_allclose(change[0, 0], change[5, 8], atol=1e-3)
+    assert np.abs(change[12, 16] - change[5, 8]).max() > 0.05
+
+
+def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
+    model = fitted()
+    content = json.loads(json.dumps({"format": 1, "model": fitted_optics.optics_to_json(model)}))
+    again = fitted_optics.optics_from_json(content)
+    np.testing.assert_allclose(again.weights, model.weights, rtol=1e-5)
+    assert again.limits == model.limits
+    with pytest.raises(BadRobotInput, match="format 1"):
+        fitted_optics.optics_from_json({**content, "format": 2})
+    with pytest.raises(BadRobotInput, match="limits"):
+        fitted_optics.optics_from_json({"format": 1, "model": {}})
+    with pytest.raises(BadRobotInput, match="weights and flat"):
+        replace(model, degree=3)
+
+
+@pytest.mark.parametrize("name", fitted_names())
+def test_the_shipped_fits_name_their_source_and_licence_and_stay_small(name):
+    content = fitted_optics.fitted_document(name)
+    assert "taxim" in content["source"]
+    assert "MIT" in content["source"]
+    assert len(json.dumps(content)) < 12_000
+    load_fitted(name)

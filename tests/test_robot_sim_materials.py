@@ -1,0 +1,86 @@
+"""Materials: the table, its spread, and paint that knows nothing of either."""
+
+import numpy as np
+import pytest
+
+from robot.errors import RobotConfigError, UnknownName
+from robot.sim.looks import Label, Looks, Paint, draw_looks
+from robot.sim.materials import MATERIALS, Material, draw_material
+
+
+def drawn(name=None, count=200):
+    return [draw_material(np.random.default_rng(seed), name) for seed in range(count)]
+
+
+def test_the_table_spans_foam_to_steel():
+    stiffness = [material.modulus_mpa for material in MATERIALS.values()]
+    assert len(MATERIALS) >= 8
+    assert min(stiffness) < 0.05
+    assert max(stiffness) >= 1e5
+    assert all(MATERIALS[name].name == name for name in MATERIALS)
+
+
+def test_every_object_draws_its_own_numbers_within_bounds():
+    found = drawn()
+    assert len({material.density_kg_m3 for material in found}) == len(found)
+    assert {material.name for material in found} == set(MATERIALS)
+    for material in found:
+        assert 0.01 <= material.modulus_mpa <= 2.2e5
+        assert 0.3 <= material.friction <= 1.2
+
+
+def test_the_jitter_stays_near_the_table():
+    for name, typical in MATERIALS.items():
+        ratio = np.median([material.modulus_mpa for material in drawn(name)]) / typical.modulus_mpa
+        assert 0.85 < ratio < 1.18
+        assert {material.poisson for material in drawn(name)} == {typical.poisson}
+
+
+def test_an_unknown_material_lists_the_known_ones():
+    with pytest.raises(UnknownName, match=r"silicone-foam.*'jelly'"):
+        draw_material(np.random.default_rng(0), "jelly")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("modulus_mpa", 0), ("poisson", 0.6), ("friction", -1), ("gloss", 2), ("roughness", np.nan)]
+)
+def test_impossible_numbers_are_refused(field, value):
+    numbers = dict(modulus_mpa=1, poisson=0.3, density_kg_m3=1000, friction=0.5, gloss=0.5, roughness=0.5)
+    with pytest.raises(RobotConfigError, match=field):
+        Material("x", **{**numbers, field: value})
+
+
+# Looks -----------------------------------------------------------------------------------------------------
+
+
+def test_albedo_is_between_0_and_1_and_the_same_again():
+    points = np.random.default_rng(1).uniform(-60, 120, (500, 3))
+    for seed in range(30):
+        looks = draw_looks(np.random.default_rng(seed))
+        found = looks.albedo(points)
+        assert found.shape == (500, 3)
+        assert found.min() >= 0
+        assert found.max() <= 1
+        np.testing.assert_array_equal(found, draw_looks(np.random.default_rng(seed)).albedo(points))
+
+
+def test_colours_are_spread_evenly_over_hue_and_lightness():
+    colours = np.array([draw_looks(np.random.default_rng(seed)).colour for seed in range(1500)])
+    lightness = (colours.max(axis=1) + colours.min(axis=1)) / 2
+    counts = np.histogram(lightness, 7, (0.15, 0.85))[0]
+    assert counts.min() > 0.7 * 1500 / 7
+    strongest = np.bincount(colours.argmax(axis=1), minlength=3)
+    assert strongest.min() > 0.28 * 1500
+
+
+def test_paint_covers_where_its_field_is_high():
+    paint = Paint((1, 1, 1), ((np.pi / 20, 0, 0),), (0.0,), 0.0, 0.01)
+    found = Looks((0, 0, 0), paint=paint).albedo(np.array([[10.0, 0, 0], [30, 0, 0], [50, 5, 5]]))
+    np.testing.assert_array_equal(found[:, 0], [1, 0, 1])
+
+
+def test_a_label_is_a_rectangle_on_one_side_with_lines_of_print():
+    label = Label((1, 1, 1), (0, 0, 0), angle_rad=0.0, half_angle_rad=0.5, bottom_mm=20, top_mm=40, line_mm=5)
+    looks = Looks((0.5, 0.5, 0.5), label=label)
+    found = looks.albedo(np.array([[0.0, -30, 19], [0, -30, 21], [0, -30, 24], [0, 30, 24], [30, 0, 24]]))
+    np.testing.assert_array_equal(found[:, 0], [0.5, 0, 1, 0.5, 0.5])

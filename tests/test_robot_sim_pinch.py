@@ -1,0 +1,143 @@
+"""What two closing fingers meet, and whether they hold it: against analytic bodies whose answer is known."""
+
+import dataclasses
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from robot.devices import Pose
+from robot.errors import SceneError
+from robot.sim.body import Body
+from robot.sim.camera import Placement
+from robot.sim.gel import draw_sensor
+from robot.sim.objects import draw_object
+from robot.sim.pinch import GRAVITY_M_S2, Hand, Pinch
+
+SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}
+ANY = draw_object(0, 0)
+
+
+class Slanted(Body):
+    """A solid between the planes x = -10 + z' tan(left) and x = 10 - z' tan(right), z' = z - 50, for |y| < 40."""
+
+    def __init__(self, left_rad=0.0, right_rad=0.0, half_y_mm=40.0):
+        self.slopes = math.tan(left_rad), math.tan(right_rad)
+        self.lower, self.upper = np.array([-80.0, -half_y_mm, 0.0]), np.array([80.0, half_y_mm, 100.0])
+
+    def _cast(self, rays):
+        """Only from outside and across, which is how fingers look: at a plane n.p = c, t = (c - n.o) / n.d."""
+        distance = np.full(len(rays.origins), np.inf)
+        for sign, slope in zip((-1.0, 1.0), self.slopes, strict=True):
+            normal = np.array([sign, 0.0, slope])
+            speed = rays.directions @ normal
+            towards = speed < -1e-9
+            reach = (10.0 + 50.0 * slope - rays.origins @ normal) / np.where(towards, speed, -1.0)
+            there = rays.origins + reach[:, None] * rays.directions
+            inside = (np.abs(there[:, 1]) <= self.upper[1]) & (there[:, 2] >= 0) & (there[:, 2] <= 100) & (reach >= 0)
+            distance = np.where(towards & inside, np.minimum(distance, reach), distance)
+        return distance
+
+    def _normals(self, points, step_mm):
+        raise NotImplementedError
+
+    def volumes_mm3(self, shell_mm):
+        return 1e5, 1e4
+
+
+def thing(body, *, friction=0.6, modulus_mpa=1e4, density_kg_m3=1000.0):
+    """An object of 1e5 mm3: at 1000 kg/m3 it weighs 0.1 kg."""
+    material = dataclasses.replace(
+        ANY.material, friction=friction, modulus_mpa=modulus_mpa, density_kg_m3=density_kg_m3, poisson=0.3
+    )
+    return dataclasses.replace(ANY, body=body, material=material)
+
+
+def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=Placement(), opening_mm=110.0, z_mm=50.0, y_mm=0.0):
+    return Pinch(
+        obj=obj,
+        placement=placement,
+        pose=Pose(0.0, y_mm, z_mm, yaw),
+        force_n=force_n,
+        opening_mm=opening_mm,
+        sensors=SENSORS if sensors is None else sensors,
+        hand=Hand(),
+        seed=1,
+        passes=Counter(),
+    )
+
+
+def test_flat_sides_end_square_to_the_fingers_but_for_a_few_degrees():
+    block = thing(Slanted())
+    for degrees in (-25, -7, 0, 7, 25):
+        turned = pinch(block, yaw=math.radians(degrees)).turned
+        assert math.degrees(turned.yaw_rad) == pytest.approx(degrees, abs=2 + 0.5)
+
+
+def test_the_jaws_end_at_the_width_less_both_approaches():
+    made = pinch(thing(Slanted()))
+    approach = made.contact("a").approach_mm + made.contact("b").approach_mm
+    angle = made.turned.yaw_rad
+    pad = SENSORS["a"].field_mm[1] * (1 - 1 / 160)
+    width = 20 / math.cos(angle) + pad * abs(math.tan(angle))
+    assert made.closed_mm == pytest.approx(width - approach, abs=0.02)
+
+
+def test_a_bare_finger_does_not_give_way():
+    made = pinch(thing(Slanted()), sensors={"a": SENSORS["a"]})
+    assert made.closed_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)
+    assert made.passes["contact"] == 1
+    assert made.slip is None
+
+
+def test_a_foam_is_not_squeezed_to_nothing():
+    assert pinch(thing(Slanted(), modulus_mpa=0.01), force_n=25.0).closed_mm >= 0.2 * 20
+
+
+def test_a_stiffer_object_touches_less_of_the_gel():
+    ball = draw_object(0, 0, family="egg", relief="smooth")
+    areas = []
+    for modulus in (0.1, 1.0, 1e5):
+        made = dataclasses.replace(ball, material=dataclasses.replace(ball.material, modulus_mpa=modulus, poisson=0.3))
+        areas.append(pinch(made, z_mm=0.5 * ball.body.upper[2], force_n=5.0).contact("a").area_mm2)
+    assert areas[0] > areas[1] > areas[2]
+
+
+@pytest.mark.parametrize(("factor", "held"), [(1.05, True), (0.95, False)])
+def test_friction_must_carry_the_weight_and_a_half(factor, held):
+    friction, mass_kg = 0.5, 0.1
+    force = factor * Hand().safety * mass_kg * GRAVITY_M_S2 / (2 * friction)
+    made = pinch(thing(Slanted(), friction=friction), force_n=force)
+    assert made.slip == (None if held else "the object is too heavy for the friction")
+
+
+@pytest.mark.parametrize(("degrees", "held"), [(10, True), (25, False)])
+def test_a_wedge_steeper_than_the_friction_cone_is_squeezed_out(degrees, held):
+    """Friction 0.3 holds up to atan(0.3) = 16.7 degrees."""
+    wedge = thing(Slanted(math.radians(degrees), math.radians(degrees)), friction=0.3)
+    made = pinch(wedge, force_n=4.0)
+    assert (made.slip is None) == held
+
+
+def test_contacts_that_are_far_apart_along_the_fingers_slip():
+    """A plate leaning by 50 degrees: a touches it low, b high."""
+    made = pinch(thing(Slanted(math.radians(50), math.radians(-50)), friction=0.3))
+    assert made.slip in ("the fingers press past each other", "the side is too steep")
+
+
+def test_an_object_beside_the_fingers_is_missed():
+    made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
+    assert made.missed == "the object is not between the fingers"
+    assert made.passes["contact"] == 0
+
+
+def test_a_finger_lands_on_an_object_that_stands_beside_the_middle():
+    made = pinch(thing(Slanted()), placement=Placement(x_mm=50.0))
+    assert made.missed == "a finger comes down on the object"
+
+
+@pytest.mark.parametrize("opening_mm", [0.0, -1.0, 111.0, math.nan])
+def test_an_opening_beyond_the_stroke_is_refused(opening_mm):
+    with pytest.raises(SceneError, match="opening_mm"):
+        pinch(thing(Slanted()), opening_mm=opening_mm)

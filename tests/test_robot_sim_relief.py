@@ -1,0 +1,124 @@
+"""Relief families on an unrolled wall: range, seam, pitch, direction, edges."""
+
+import numpy as np
+import pytest
+
+from robot.errors import RobotConfigError, UnknownName
+from robot.sim.relief import RELIEFS, Relief, Sheet, draw_relief
+
+SHEET = Sheet(120.0, 60.0, 401, 800)
+WORN = [name for name in RELIEFS if name != "smooth"]
+
+
+def height(name, sheet=SHEET, **settings):
+    return Relief(name, **{"amplitude_mm": 1.0, "pitch_mm": 6.0, "seed": 3, **settings}).height(sheet)
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_heights_lie_between_0_and_the_amplitude_and_use_most_of_it(name):
+    found = height(name, amplitude_mm=0.8)
+    assert found.shape == (401, 800)
+    assert found.dtype == np.float32
+    assert found.min() >= 0
+    assert found.max() <= 0.8 + 1e-6
+    assert np.ptp(found) > 0.4
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_relief_meets_itself_at_the_seam(name):
+    for settings in ({}, {"angle_rad": 0.6, "aspect": 1.7, "sharpness": 0.8}):
+        found = height(name, **settings)
+        across = np.abs(np.diff(found, axis=1)).max()
+        assert np.abs(found[:, 0] - found[:, -1]).max() <= 1.3 * across + 1e-3, settings
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_the_same_relief_is_the_same_again_and_another_seed_or_pitch_is_not(name):
+    np.testing.assert_array_equal(height(name), height(name))
+    assert np.abs(height(name) - height(name, pitch_mm=9.0, seed=4)).max() > 0.1
+
+
+def test_engraving_goes_in():
+    np.testing.assert_array_equal(height("glyphs", engraved=True), -height("glyphs"))
+
+
+def test_a_smooth_object_has_no_relief():
+    assert height("smooth", amplitude_mm=0.0) is None
+
+
+def test_ribs_repeat_after_their_pitch_in_their_direction():
+    found = height("ribs", pitch_mm=6.0, angle_rad=0.0)
+    np.testing.assert_allclose(found[:, 0], found[:, 40], atol=1e-4)  # 40 nodes of 0.15 mm are 6 mm
+    assert np.ptp(found, axis=0).max() < 1e-4
+    upright = height("ribs", pitch_mm=6.0, angle_rad=np.pi / 2)
+    np.testing.assert_allclose(upright[0], upright[40], atol=1e-4)
+    assert np.ptp(upright, axis=1).max() < 1e-4
+
+
+def test_a_whole_number_of_waves_goes_round_even_if_the_pitch_does_not_fit():
+    found = height("ribs", pitch_mm=7.0, angle_rad=0.0)[200]
+    assert np.abs(np.fft.rfft(found))[1:].argmax() + 1 == 17  # 120 / 7 is 17.1
+
+
+def test_sharp_ribs_have_flat_tops_and_round_ones_have_not():
+    flat = [np.mean(height("ribs", sharpness=sharpness) > 0.95) for sharpness in (0.0, 1.0)]
+    assert flat[0] < 0.2
+    assert flat[1] > 0.3
+
+
+def test_a_scatter_gives_the_distance_to_its_nearest_point():
+    sheet = Sheet(40.0, 30.0, 61, 80)
+    found = sheet.scatter(np.random.default_rng(0), 8.0, jitter=0.3)
+    rows, columns = np.nonzero(found == 0)
+    i, j = np.meshgrid(np.arange(61), np.arange(80), indexing="ij")
+    sides = np.minimum(np.abs(j[..., None] - columns), 80 - np.abs(j[..., None] - columns)) * 0.5
+    slow = np.hypot(sides, (i[..., None] - rows) * 0.5).min(axis=-1)
+    # Points beyond the upper and lower ends count in the scatter, and cannot be seen here.
+    middle = slice(16, 45)
+    assert np.mean(np.abs(found - slow)[middle] < 0.05) > 0.9
+
+
+def test_glyphs_can_be_read_from_outside():
+    """An L on an unrolled wall has its foot to the right of its stem, and at the bottom."""
+    sheet = Sheet(30.0, 16.0, 161, 300)
+
+    class Only:
+        def choice(self, letters, count):
+            return ["L"] * count
+
+    image = RELIEFS["glyphs"](Relief("glyphs", 1.0, 10.0), sheet, Only())
+    rows = image.mean(axis=1)
+    inked = np.flatnonzero(rows > 0.02)
+    assert rows[inked[0] : inked[0] + 12].max() > 1.8 * rows[inked[0] + 40 : inked[0] + 60].max()
+    stem = image[inked[0] + 50] > 0.5
+    foot = image[inked[0] + 4] > 0.5
+    start = np.flatnonzero(stem)[0]
+    assert foot[start + 25]
+    assert not stem[start + 25]
+
+
+def test_unknown_names_and_impossible_settings_are_refused():
+    with pytest.raises(UnknownName, match="knurl"):
+        draw_relief("fur", np.random.default_rng(0), 2.0)
+    with pytest.raises(UnknownName, match="got 'fur'"):
+        Relief("fur", 1.0, 5.0)
+    for settings in ({"amplitude_mm": -1}, {"amplitude_mm": 7}, {"pitch_mm": 0}, {"aspect": 0.5}, {"pitch_mm": np.nan}):
+        with pytest.raises(RobotConfigError, match="relief must have"):
+            Relief("ribs", **{"amplitude_mm": 1.0, "pitch_mm": 5.0, **settings})
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_drawn_reliefs_keep_to_the_shape_and_to_what_a_gel_can_follow(name):
+    for seed in range(40):
+        relief = draw_relief(name, np.random.default_rng(seed), 1.2)
+        assert 0.1 <= relief.amplitude_mm <= 1.2
+        assert 1.5 <= relief.pitch_mm <= 14
+        assert relief.amplitude_mm <= 0.46 * relief.pitch_mm
+
+
+def test_most_drawn_amplitudes_lie_between_a_third_and_2_mm():
+    drawn = [
+        draw_relief(name, np.random.default_rng([seed]), 6.0).amplitude_mm for name in WORN for seed in range(60)
+    ]
+    assert np.mean([0.3 <= amplitude <= 2 for amplitude in drawn]) > 0.6
+    assert max(drawn) > 2.5

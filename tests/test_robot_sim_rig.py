@@ -1,0 +1,147 @@
+"""The simulated rig is a rig: its devices say what the scene holds, and an attempt depends on nothing but its name."""
+
+import math
+
+import numpy as np
+import pytest
+
+from robot.devices import Pose
+from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.rig import load_rig
+from robot.sim.rig import STROKE_MM, SimRig
+
+
+@pytest.fixture
+def rig():
+    with SimRig(4, families=["cylinder"]) as made:
+        yield made
+
+
+def pinch(rig, z_mm=None, force_n=12.0, yaw=0.3, beside_mm=0.0):
+    """Close over the object on the table; returns what the gripper says."""
+    placement, obj = rig.world.scene.placement, rig.world.scene.obj
+    z_mm = max(10.0, 0.5 * obj.body.upper[2]) if z_mm is None else z_mm
+    rig.gripper.open(STROKE_MM)
+    rig.arm.move_to(Pose(placement.x_mm + beside_mm, placement.y_mm, z_mm, yaw), 100.0)
+    return rig.gripper.grasp(force_n)
+
+
+def lift(rig):
+    pose = rig.arm.pose()
+    rig.arm.move_to(Pose(pose.x_mm, pose.y_mm, pose.z_mm + 100, pose.yaw_rad), 100.0)
+    return rig.gripper.state()
+
+
+def test_the_jaws_stop_at_the_objects_width_less_what_the_gels_give(rig):
+    rig.prepare(rig.object_ids(1)[0], 0)
+    state = pinch(rig)
+    width = 2 * float(rig.world.scene.obj.body.upper[0])
+    assert state.status == "holding"
+    assert width - 8 < state.opening_mm < width + 0.1
+
+
+def test_closing_on_nothing_ends_with_no_part_and_untouched_gels(rig):
+    rig.prepare(rig.object_ids(1)[0], 0)
+    before = rig.sensors["a"].read().pixels.astype(float)
+    assert pinch(rig, beside_mm=100.0).status == "no_part"
+    assert np.abs(rig.sensors["a"].read().pixels - before).mean() < 3
+    assert lift(rig).status == "no_part"
+
+
+def test_a_held_object_shows_in_both_gels_before_and_after_the_lift(rig):
+    rig.prepare(rig.object_ids(1)[0], 0)
+    before = {finger: sensor.read().pixels.astype(float) for finger, sensor in rig.sensors.items()}
+    pinch(rig)
+    during = {finger: sensor.read().pixels for finger, sensor in rig.sensors.items()}
+    assert lift(rig).status == "holding"
+    for finger, sensor in rig.sensors.items():
+        assert np.abs(during[finger] - before[finger]).mean() > 3
+        assert np.abs(sensor.read().pixels - before[finger]).mean() > 3
+    rig.gripper.open(STROKE_MM)
+    assert np.abs(rig.sensors["a"].read().pixels - before["a"]).mean() < 3
+
+
+def test_a_heavy_slippery_object_is_lost_in_the_lift_and_leaves_an_untouched_gel(rig):
+    import dataclasses
+
+    rig.prepare(rig.object_ids(1)[0], 0)
+    before = rig.sensors["a"].read().pixels.astype(float)
+    scene = rig.world.scene
+    slippery = dataclasses.replace(scene.obj.material, friction=0.01)
+    rig.world.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=slippery))
+    assert pinch(rig).status == "holding"
+    assert lift(rig).status == "part_lost"
+    assert np.abs(rig.sensors["a"].read().pixels - before).mean() < 3
+
+
+def test_an_attempt_depends_on_seed_object_and_number_alone(rig):
+    first, second = rig.object_ids(2)
+    rig.prepare(first, 3)
+    wanted = rig.camera.read()
+    rig.prepare(second, 0)
+    rig.camera.read()
+    rig.prepare(first, 3)
+    again = rig.camera.read()
+    np.testing.assert_array_equal(wanted.colour, again.colour)
+    np.testing.assert_array_equal(wanted.depth_m, again.depth_m)
+    rig.prepare(first, 4)
+    assert not np.array_equal(wanted.colour, rig.camera.read().colour)
+
+
+def test_without_depth_no_depth_is_computed(rig):
+    rig.prepare(rig.object_ids(1)[0], 0)
+    assert rig.camera.read(depth=False).depth_m is None
+    assert rig.world.scene.passes["depth"] == 0
+
+
+def test_the_camera_believes_itself_five_to_ten_millimetres_from_where_it_is():
+    for seed in range(20):
+        rig = SimRig(seed)
+        error = rig.camera.extrinsics[:3, 3] - rig.camera._camera.to_rig[:3, 3]
+        assert 5 <= np.linalg.norm(error) <= 10
+
+
+def test_localisation_can_be_perfect():
+    rig = SimRig(0, localisation_mm=(0.0, 0.0))
+    np.testing.assert_array_equal(rig.camera.extrinsics, rig.camera._camera.to_rig)
+
+
+def test_one_finger_is_enough():
+    with SimRig(0, fingers=["b"]) as rig:
+        assert list(rig.sensors) == ["b"]
+        rig.prepare(rig.object_ids(1)[0], 0)
+        pinch(rig)
+        assert rig.sensors["b"].read().pixels.shape == (240, 320, 3)
+        assert rig.world.scene.passes["contact"] == 1
+
+
+def test_devices_say_when_nothing_stands_on_the_table(rig):
+    with pytest.raises(DeviceError, match="call prepare"):
+        rig.camera.read()
+
+
+def test_an_object_of_another_world_is_refused(rig):
+    with pytest.raises(RobotConfigError, match="has no 'bottle"):
+        rig.prepare("bottle-ribs-0009-00001", 0)
+    with pytest.raises(RobotConfigError, match="has no 'mug'"):
+        rig.prepare("mug", 0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        ({"fingers": []}, RobotConfigError),
+        ({"fingers": ["a", "c"]}, RobotConfigError),
+        ({"families": ["teapot"]}, RobotConfigError),
+        ({"optics": "neon"}, UnknownName),
+        ({"contact_grid": [10, 10]}, RobotConfigError),
+        ({"contact_grid": [0, 0]}, RobotConfigError),
+        ({"contact_tolerance": 0.0}, RobotConfigError),
+        ({"localisation_mm": [3.0, 1.0]}, RobotConfigError),
+        ({"localisation_mm": [0.0, math.inf]}, RobotConfigError),
+        ({"colour": "red"}, RobotConfigError),
+    ],
+)
+def test_settings_that_no_rig_has_are_refused(settings, error):
+    with pytest.raises(error):
+        load_rig("sim", seed=0, **settings)

@@ -1,0 +1,172 @@
+"""A scene computes what its outputs need, and nothing else; what it computes is right where it can be known by hand."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from robot.devices import Pose
+from robot.errors import SceneError
+from robot.sim.camera import Placement
+from robot.sim.gel import draw_sensor
+from robot.sim.objects import draw_object
+from robot.sim.scene import Grip, Scene
+
+SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}
+BOTTLE = draw_object(0, 0, family="cylinder", relief="ribs")
+MIDDLE_MM = min(60.0, 0.5 * BOTTLE.body.upper[2])
+GRIP = Grip(Pose(0.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+ALL = {
+    "photo",
+    "depth",
+    *(f"touch_{finger}{moment}" for finger in "ab" for moment in ("", "_before", "_after")),
+}
+
+
+def scene(outputs, **changes):
+    given = {"obj": BOTTLE, "sensors": SENSORS, "grip": GRIP, "seed": 5, "outputs": frozenset(outputs)} | changes
+    return Scene(**given)
+
+
+def work(outputs, **changes):
+    """What was done for these outputs, by name and number."""
+    made = scene(outputs, **changes)
+    images = made.run()
+    assert set(images) == set(outputs)
+    return dict(made.passes)
+
+
+def test_a_whole_scene_does_each_thing_once_for_each_finger():
+    assert work(ALL) == {
+        "view": 1,
+        "photo": 1,
+        "shadow": 1,
+        "depth": 1,
+        "turn": 1,
+        "wall": 2,
+        "contact": 2,
+        "gel": 4,
+        "background": 2,
+    }
+
+
+def test_nothing_is_done_when_nothing_is_wanted():
+    assert work(()) == {}
+
+
+def test_the_photo_alone_needs_neither_depth_nor_touch():
+    assert work(["photo"]) == {"view": 1, "photo": 1, "shadow": 1}
+    assert work(["photo"], shadow=False) == {"view": 1, "photo": 1}
+
+
+def test_the_depth_alone_needs_no_shading():
+    assert work(["depth"]) == {"view": 1, "depth": 1}
+
+
+def test_photo_and_depth_share_the_look_at_the_object():
+    assert work(["photo", "depth"])["view"] == 1
+
+
+def test_touch_alone_needs_no_camera():
+    assert not set(work(["touch_a", "touch_b"])) & {"view", "photo", "depth", "shadow"}
+
+
+def test_an_untouched_gel_needs_no_contact_and_no_grip():
+    assert work(["touch_a_before"], grip=None) == {"background": 1}
+
+
+def test_a_sensor_on_one_finger_solves_one_contact():
+    done = work(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
+    assert done["contact"] == done["wall"] == done["feel"] == 1
+
+
+def test_one_finger_wanted_of_two_solves_one_contact_until_the_lift_asks_for_the_other():
+    assert work(["touch_a"])["contact"] == 1
+    assert work(["touch_a", "touch_a_after"])["contact"] == 2
+
+
+def test_a_missed_grasp_solves_no_contact():
+    beside = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+    done = work(["touch_a", "touch_b", "touch_a_after"], grip=beside)
+    assert "contact" not in done
+    assert "gel" not in done
+
+
+def test_a_finger_that_comes_down_on_the_object_is_a_miss_that_says_so():
+    narrow = dataclasses.replace(GRIP, opening_mm=0.5 * float(BOTTLE.body.upper[0]))
+    pinch = scene([], grip=narrow).pinch
+    assert pinch.missed == pinch.slip == "a finger comes down on the object"
+    assert pinch.closed_mm == 0
+
+
+def test_a_missed_gel_shows_what_an_untouched_one_shows():
+    beside = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+    images = scene(["touch_a", "touch_a_before"], grip=beside).run()
+    difference = images["touch_a"].astype(float) - images["touch_a_before"].astype(float)
+    assert abs(difference.mean()) < 0.3
+    assert np.abs(difference).max() < 25
+
+
+def test_the_same_seed_makes_the_same_pictures_and_another_one_does_not():
+    first, again, other = scene(ALL).run(), scene(ALL).run(), scene(ALL, seed=6).run()
+    for name in ALL:
+        np.testing.assert_array_equal(first[name], again[name])
+        assert not np.array_equal(first[name], other[name], equal_nan=True)
+
+
+def test_asking_in_another_order_or_alone_changes_no_pixel():
+    whole = scene(ALL).run()
+    for name in sorted(ALL, reverse=True):
+        np.testing.assert_array_equal(scene([name]).run()[name], whole[name])
+
+
+def test_more_force_touches_more():
+    areas = [scene([], grip=dataclasses.replace(GRIP, force_n=force)).pinch.contact("a").area_mm2 for force in (2, 8, 32)]
+    assert areas[0] < areas[1] < areas[2]
+
+
+def test_both_gels_carry_the_clamping_force():
+    pinch = scene([]).pinch
+    for finger in "ab":
+        contact = pinch.contact(finger)
+        pixel_area = (SENSORS[finger].field_mm[1] / contact.pressure_mpa.shape[1]) ** 2
+        assert contact.pressure_mpa.sum() * pixel_area == pytest.approx(12.0, rel=0.02)
+
+
+def test_turning_hand_and_object_together_changes_nothing_that_the_gels_feel():
+    turned = math.radians(70)
+    c, s = math.cos(turned), math.sin(turned)
+    here = scene([], placement=Placement(4.0, -3.0, 0.2), grip=Grip(Pose(2.0, 1.0, MIDDLE_MM, 0.3), 12.0))
+    pose = Pose(2 * c - 1 * s, 2 * s + 1 * c, MIDDLE_MM, 0.3 + turned)
+    there = scene([], placement=Placement(4 * c + 3 * s, 4 * s - 3 * c, 0.2 + turned), grip=Grip(pose, 12.0))
+    np.testing.assert_allclose(here.pinch.gap("a"), there.pinch.gap("a"), atol=2e-3)
+
+
+def test_turning_the_hand_half_round_swaps_the_fingers():
+    pose = Pose(2.0, 1.0, MIDDLE_MM, 0.3 + math.pi)
+    here = scene([], grip=Grip(Pose(2.0, 1.0, MIDDLE_MM, 0.3), 12.0)).pinch
+    there = scene([], grip=Grip(pose, 12.0)).pinch
+    np.testing.assert_allclose(here.gap("a"), there.gap("b"), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"outputs": {"sound"}}, "outputs are photo, depth"),
+        ({"outputs": {"touch_c"}}, "needs a sensor on finger c"),
+        ({"outputs": {"touch_b"}, "sensors": {"a": SENSORS["a"]}}, "needs a sensor on finger b"),
+        ({"outputs": {"touch_a"}, "grip": None}, "needs a grip"),
+        ({"outputs": {"touch_a_after"}, "grip": None}, "needs a grip"),
+        ({"sensors": {"c": SENSORS["a"]}}, "fingers a and b"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused_at_once(changes, words):
+    with pytest.raises(SceneError, match=words):
+        scene(changes.pop("outputs", ()), **changes)
+
+
+@pytest.mark.parametrize("force_n", [0.0, -3.0, math.nan, math.inf])
+def test_an_impossible_force_is_refused(force_n):
+    with pytest.raises(SceneError, match="force_n must be positive and finite"):
+        scene(["touch_a"], grip=dataclasses.replace(GRIP, force_n=force_n)).run()

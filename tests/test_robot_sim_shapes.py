@@ -1,0 +1,201 @@
+"""Shapes: distances by hand, the bound that sphere tracing rests on, sizes a gripper can hold, unrolled walls."""
+
+import numpy as np
+import pytest
+
+from robot.sim.shapes import SHAPES
+from robot.sim.shapes.base import Cylindrical, arctan2, rounded, smooth_min
+from robot.sim.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
+from robot.sim.shapes.revolution import Ball, Cone, Drum, Revolution, Rod
+from robot.sim.shapes.solids import Bar, Bars, Brush, Comb, Ring, Superquadric, TwoSided
+
+
+def draw(family, seed):
+    return SHAPES[family](np.random.default_rng(seed))
+
+
+def distance(shape, *points):
+    return shape.distance(np.array(points, float))
+
+
+def can(radius=20.0, height=80.0, rim=0.0):
+    return Revolution((Drum(radius, 0, height, rim_mm=rim),), height)
+
+
+# Distances by hand -----------------------------------------------------------------------------------------
+
+
+def test_a_point_10_mm_outside_a_cylinder_is_10_mm_away():
+    found = distance(can(), [30, 0, 40], [0, -30, 40], [0, 0, 90], [0, 0, -10], [15, 0, 40], [0, 0, 75])
+    np.testing.assert_allclose(found, [10, 10, 10, 10, -5, -5], atol=1e-5)  # float32 of some 100 mm
+
+
+def test_beside_an_edge_the_distance_is_to_the_edge():
+    np.testing.assert_allclose(distance(can(), [23, 0, 84]), [5], atol=1e-5)
+    # A rim of 2 mm leaves the arc round (18, 78).
+    np.testing.assert_allclose(distance(can(rim=2), [23, 0, 90]), [13 - 2], atol=1e-5)
+
+
+def test_distances_from_a_box_are_those_of_its_faces_and_rounded_edges():
+    shape = Extrusion(RoundedRectangle(20, 10, 4), 50, rim_mm=0)
+    found = distance(shape, [25, 0, 25], [0, 16, 25], [0, 0, 57], [16 + 6, 6 + 8, 25], [0, 0, 25])
+    np.testing.assert_allclose(found, [5, 6, 7, 10 - 4, -10], atol=1e-5)
+
+
+def test_distances_from_a_hexagon_are_those_of_its_faces_and_corners():
+    shape = Extrusion(Polygon(6, 20, 3), 50, rim_mm=0)
+    corner = 17 / np.cos(np.pi / 6) + 3
+    found = distance(shape, [0, -25, 25], [0, 27, 25], [-corner - 4, 0, 25], [0, 0, 25])
+    np.testing.assert_allclose(found, [5, 7, 4, -20], atol=1e-5)
+    np.testing.assert_allclose(shape.upper[0], corner)
+
+
+def test_distances_from_a_ball_a_cone_a_ring_and_a_link():
+    np.testing.assert_allclose(distance(Revolution((Ball(15, 15),), 30), [0, -20, 15], [9, 12, 15]), [5, 0], atol=1e-5)
+    cone = Revolution((Cone(20, 10, 0, 40),), 40)
+    # Half way up the radius is 15; the side leans by 1 in 4.
+    np.testing.assert_allclose(distance(cone, [16, 0, 20]), [1 / np.hypot(1, 0.25)], atol=1e-5)
+    ring = Ring(20, 5, stretch_mm=30)
+    found = distance(ring, [30, 0, ring.middle_mm], [20, 8, ring.middle_mm + 15], [0, 0, ring.middle_mm])
+    np.testing.assert_allclose(found, [5, 3, 15], atol=1e-5)
+
+
+def test_the_distance_from_an_ellipsoid_is_exact_for_a_ball_and_never_too_large():
+    ball = Superquadric((20, 20, 20))
+    np.testing.assert_allclose(distance(ball, [0, -31, ball.middle_mm]), [11], atol=1e-5)
+    long = Superquadric((20, 20, 60))
+    assert 0 < distance(long, [0, 0, long.upper[2] + 10])[0] <= 10
+
+
+def test_slots_and_bristles_are_where_their_pitch_says():
+    slab = Bar((0, 0), (30, 5), 0, 60, 0.5)
+    comb = Comb(slab, pitch_mm=10, gap_mm=4, slot_mm=20, lying=False)
+    inside = distance(comb, [0, 0, 40], [5, 0, 40], [10, 0, 40], [0, 0, 15], [29, 0, 40])
+    np.testing.assert_allclose(inside, [2, -3, 2, -5, -1], atol=1e-5)
+    brush = Brush(Bar((0, 0), (21, 11), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
+    np.testing.assert_allclose(distance(brush, [0, 0, 50], [8, 8, 50], [4, 0, 50]), [-2, -2, 2], atol=1e-5)
+
+
+def test_an_even_number_of_bristles_stands_astride_the_middle():
+    brush = Brush(Bar((0, 0), (14, 6.5), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
+    assert (distance(brush, [4, 4, 50], [-4, -4, 50], [12, 4, 50]) < 0).all()
+    assert distance(brush, [0, 4, 50])[0] > 0
+
+
+def test_a_union_of_bars_is_the_nearer_one():
+    shape = Bars((Bar((0, 5), (20, 2), 0, 40, 0.5), Bar((0, -5), (2, 8), 0, 40, 0.5)))
+    np.testing.assert_allclose(distance(shape, [10, -5, 20], [10, 10, 20]), [8, 3], atol=1e-5)
+
+
+# What sphere tracing needs ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", SHAPES)
+def test_no_distance_grows_faster_than_its_point_moves(family):
+    for seed in range(4):
+        shape, rng = draw(family, seed), np.random.default_rng([seed, 1])
+        size = shape.upper - shape.lower
+        p = rng.uniform(shape.lower - 0.4 * size, shape.upper + 0.4 * size, (4000, 3))
+        q = p + rng.standard_normal((4000, 3)) * np.exp(rng.uniform(np.log(0.05), np.log(60), (4000, 1)))
+        change, moved = np.abs(shape.distance(p) - shape.distance(q)), np.linalg.norm(p - q, axis=1)
+        # float32 coordinates of some 200 mm are known to 2e-5 mm, and a distance sums a few of them.
+        assert (change <= moved * (1 + 1e-4) + 3e-4).all(), (seed, (change - moved).max())
+
+
+@pytest.mark.parametrize("family", SHAPES)
+def test_a_shape_stands_on_the_table_within_its_bounds(family):
+    for seed in range(4):
+        shape, rng = draw(family, seed), np.random.default_rng([seed, 2])
+        size = shape.upper - shape.lower
+        p = rng.uniform(shape.lower - 0.3 * size, shape.upper + 0.3 * size, (20000, 3))
+        found = shape.distance(p)
+        outside = ((p < shape.lower) | (p > shape.upper)).any(axis=1)
+        assert (found[outside] > -1e-3).all()
+        assert (found[~outside] < 0).any()
+        foot = rng.uniform(shape.lower, shape.upper, (20000, 3)) * [1, 1, 0] + [0, 0, 0.3]
+        assert (shape.distance(foot) < 0).any()
+
+
+@pytest.mark.parametrize("family", SHAPES)
+def test_sizes_fit_the_gripper_and_the_table(family):
+    for seed in range(60):
+        shape = draw(family, seed)
+        width, depth, height = shape.upper - shape.lower
+        relief = 2 * shape.relief_limit_mm
+        assert shape.relief_limit_mm >= 0.1
+        assert 8 <= min(width, depth)
+        assert min(width, depth) + relief <= 95 + 1e-9
+        assert max(width, depth) <= 112
+        assert 25 <= height <= 200
+
+
+def test_instances_of_a_family_differ():
+    for family in SHAPES:
+        sizes = {tuple(np.round(draw(family, seed).upper, 3)) for seed in range(20)}
+        assert len(sizes) == 20, family
+
+
+# Walls -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("outline", [RoundedRectangle(20, 12, 5), RoundedRectangle(20, 12, 12), Polygon(5, 18, 4)])
+def test_arc_length_comes_back_from_its_point(outline):
+    s = np.linspace(0, outline.length_mm, 400, endpoint=False) + 0.03
+    points, normals = outline.place(s)
+    x, y = (points + 0.5 * normals).astype(np.float32).T
+    np.testing.assert_allclose(outline.locate(x, y), s, atol=2e-4)
+    np.testing.assert_allclose(outline.distance(x, y), 0.5, atol=1e-4)
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    np.testing.assert_allclose(steps, outline.length_mm / 400, rtol=0.01)
+
+
+def test_charts_look_at_the_places_that_they_name():
+    s, t = np.meshgrid(np.linspace(1, 100, 30), np.linspace(5, 45, 9))
+    twisted = Extrusion(Polygon(4, 18, 4), 50, twist_rad=1.0, taper=0.3)
+    for chart in (Cylindrical(20, 50), twisted.chart, TwoSided(30, 50, 8)):
+        origins, directions = chart.rays(s.ravel(), t.ravel())
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+        found = chart.locate(*np.ascontiguousarray((origins + 0.5 * directions).T, np.float32))
+        np.testing.assert_allclose(found, [s.ravel(), t.ravel()], atol=1e-3)
+
+
+def test_maps_run_to_the_right_when_seen_from_the_front():
+    x, y, z = np.array([[-3, 3], [-20, -20], [10, 10]], np.float32)
+    for chart in (Cylindrical(20, 50), Extrusion(RoundedRectangle(30, 20, 5), 50).chart, TwoSided(30, 50, 20)):
+        left, right = chart.locate(x, y, z)[0]
+        assert 5 < right - left < 7
+
+
+def test_a_thread_climbs_one_pitch_in_a_turn():
+    rod = Rod(10, 80, pitch_mm=6, depth_mm=2, starts=1, foot=Drum(15, 0, 8))
+    around = rod.chart.width_mm
+    t = np.linspace(20, 60, 400)
+    height = rod.macro(np.array([0, 0.25 * around]), t)
+    np.testing.assert_allclose(rod.macro(np.array([0.0]), t + 6)[:, 0], height[:, 0], atol=1e-5)
+    np.testing.assert_allclose(rod.macro(np.array([0.0]), t - 1.5)[:, 0], height[:, 1], atol=1e-5)
+    assert height.min() == pytest.approx(-2)
+    assert height.max() == pytest.approx(0)
+
+
+# Helpers ---------------------------------------------------------------------------------------------------
+
+
+def test_the_polynomial_arctangent_is_an_arctangent():
+    rng = np.random.default_rng(0)
+    x, y = np.concatenate([rng.standard_normal((2, 5000)), [[0, 0, 0, 1, -1, 1e-20], [0, 1, -1, 0, 0, 1e-20]]], axis=1)
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    # 1e-6 rad is 5e-5 mm on the widest object.
+    np.testing.assert_allclose(arctan2(y, x), np.arctan2(y, x, dtype=float), atol=1e-6)
+
+
+def test_a_smooth_minimum_is_at_most_a_quarter_of_its_blend_below_the_sharp_one():
+    a, b = np.meshgrid(np.linspace(-9, 9, 50, dtype=np.float32), np.linspace(-9, 9, 50, dtype=np.float32))
+    below = np.minimum(a, b) - smooth_min(a, b, 4)
+    assert below.min() >= 0
+    assert below.max() == pytest.approx(1)
+    np.testing.assert_array_equal(smooth_min(a, b, 0), np.minimum(a, b))
+
+
+def test_a_rounded_corner_keeps_its_faces():
+    a, b = np.array([3, -8, -1], np.float32), np.array([-9, -2, -1], np.float32)
+    np.testing.assert_allclose(rounded(a, b, 2), [3, -2, np.hypot(1, 1) - 2], atol=1e-6)
