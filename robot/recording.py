@@ -4,6 +4,7 @@
                       else the writer wants to say
     metadata.jsonl    one JSON object a line for each grasp
     images/           PNG or JPEG files
+    attempts.jsonl    where a rig collected it: every attempt, those without a grasp included (robot.attempt_log)
 
 A line holds grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (what the success gate
 decided; training leaves out false), outcome (what the gripper felt: held, missed, slipped), sequence_id, time_s.

@@ -63,9 +63,15 @@ class Rig:
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Have this object on the table for attempt `number`: asks a person when the object changes."""
+        """Have this object on the table for attempt `number`: asks a person when the object changes.
+
+        Raises RobotConfigError where nobody can answer.
+        """
         if object_id != self._on_table:
-            self.ask(f"Put {object_id} on the table, alone, and press Enter.")
+            try:
+                self.ask(f"Put {object_id} on the table, alone, and press Enter.")
+            except EOFError as error:
+                raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
             self._on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:

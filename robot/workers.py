@@ -28,13 +28,15 @@ class Jobs:
     """Makes attempts: here and now with one job, else in processes that are started afresh ("spawn").
 
     A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` attempts
-    should be under way at a time.
+    should be under way at a time. With one job, too, OpenCV works in one thread while this is open: some of its
+    filters give other last digits in several, and a recording must be the same whatever the jobs.
     """
 
     def __init__(self, jobs: int, attempter: Attempter, make_rig: RigMaker) -> None:
         self._attempter, self._pool = attempter, None
         self.window = 1 if jobs == 1 else 2 * jobs
         self._environment: dict[str, str | None] = {}
+        self._threads = cv2.getNumThreads()
         if jobs > 1:
             self._environment = {name: os.environ.get(name) for name in _THREADS}
             self._pool = ProcessPoolExecutor(
@@ -59,10 +61,12 @@ class Jobs:
         return functools.partial(_result, future, object_id, number)
 
     def __enter__(self) -> Self:
+        cv2.setNumThreads(1)
         return self
 
     def __exit__(self, *_: object) -> None:
         """Waits for the attempts that have begun; the others are not made."""
+        cv2.setNumThreads(self._threads)
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
 

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import build, common, rerank, step
+from tests.benchmarks import build, common, cylinder, rerank, step
 from tests.conftest import TINY
 
 SMALLEST = {
@@ -31,6 +31,15 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
         assert str(line).startswith(f"{name}, small: ")
         assert all(value > 0 for value in line.figures.values())
         json.dumps(line.figures, allow_nan=False)
+
+
+def test_the_table_of_cylinders_has_a_line_a_case():
+    lines = list(cylinder.measure(count=1))
+    assert [line.tower for line in lines] == [*cylinder.CASES, "R33 h120 of glass"]
+    for line in lines:
+        json.dumps(line.figures, allow_nan=False)
+        assert line.figures["worst_mm"] < 6.0
+    assert str(lines[0]).startswith("cylinder, R33 h120: centre 0.")
 
 
 def test_the_arms_take_turns_and_the_first_round_is_not_measured(monkeypatch):

@@ -98,8 +98,16 @@ HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "P
 
 
 def test_robot_imports_without_torch():
-    done = run_blocked("import robot, robot.recording, robot.importers, robot.importers.billets", ("torch", "faiss"))
+    code = "import robot, robot.recording, robot.importers, robot.importers.billets, robot.collect, robot.rig"
+    done = run_blocked(code, ("torch", "faiss"))
     assert done.returncode == 0, done.stderr
+
+
+def test_the_collector_knows_the_contract_and_no_rig():
+    """A rig is imported when it is asked for by name."""
+    code = "import sys, robot.collect, robot.rig; print([name for name in sys.modules if name.startswith('robot.sim')])"
+    done = run_blocked(code, ("torch", "faiss", "scipy", "trimesh"))
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
 def test_indexes_import_with_numpy_alone():
@@ -108,7 +116,9 @@ def test_indexes_import_with_numpy_alone():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["collect"], ["import"], ["check"], ["train"], ["build-index"], ["query"]])
+@pytest.mark.parametrize(
+    "command", [[], ["demo"], ["collect"], ["import"], ["check"], ["train"], ["build-index"], ["query"]]
+)
 def test_help_loads_nothing_heavy(command):
     code = f"from retrieval.cli import main\nmain({[*command, '--help']!r})"
     done = run_blocked(code, HEAVY)

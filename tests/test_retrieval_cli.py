@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from retrieval import defaults
-from retrieval.cli import main
+from retrieval.cli import COMMANDS, main
 
 
 @pytest.fixture
@@ -81,6 +81,12 @@ WRONG_USE = {
     "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
     "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
     "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
+    "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: sim"),
+    "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
+    "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
+    "no objects": (["collect", "--objects", "0", "--out", "rec"], "at least one object"),
+    "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
+    "not an empty folder": (["collect", "--out", "catalog"], "catalog holds other files"),
     "nothing to check": (["check", "nowhere"], "nowhere"),
     "bad split": (["check", "catalog", "--split", "text.png"], "not a JSON file"),
     "no split file": (["check", "catalog", "--split", "none.json"], "none.json"),
@@ -142,6 +148,77 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 
 
+@pytest.fixture
+def fake_rig(monkeypatch):
+    """A rig that `collect` finds by the name of fake."""
+    from robot.rig import RIGS
+
+    monkeypatch.setitem(RIGS, "fake", "tests.fake_rig:FakeRig")
+
+
+COLLECT = ["collect", "--rig", "fake", "--objects", "2", "--grasps", "2", "--seed", "3", "--out", "rec"]
+
+
+def test_a_recording_is_collected_and_its_acceptance_printed(workplace, fake_rig, capsys):
+    assert main(COLLECT) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = said.err.splitlines()
+    assert "accepted  of  held  missed  slipped  no_plan" in said.err
+    assert any(line.startswith("round-0") for line in lines)
+    assert lines[-1] == "rec: 4 accepted grasps of 2 objects"
+    assert "2 of 2 objects" in said.err
+    assert main(COLLECT) == 0  # nothing is left to do
+
+
+def test_what_was_collected_with_other_options_is_not_gone_on_with(workplace, fake_rig, capsys):
+    main(COLLECT)
+    capsys.readouterr()
+    assert main([*COLLECT, "--seed", "4"]) == 2
+    assert "rec was collected with seed 3, not 4" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_collecting_says_how_to_go_on(workplace, fake_rig, capsys, monkeypatch):
+    from tests.fake_rig import FakeGripper
+
+    def interrupted(self, force_n, speed_mm_s):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FakeGripper, "_grasp", interrupted)
+    assert main(COLLECT) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "what was collected is whole in rec; the same command goes on with it",
+        "retrieve collect: stopped by Ctrl-C",
+    ]
+    monkeypatch.undo()
+
+
+def test_collecting_nothing_is_a_failure_that_says_where_to_look(workplace, fake_rig, capsys, monkeypatch):
+    monkeypatch.setattr("tests.fake_rig.FakeRig.object_ids", lambda self, count: ["wide-0"])
+    assert main(COLLECT) == 1
+    assert "no grasp was accepted; rec/attempts.jsonl says why" in capsys.readouterr().err
+
+
+def test_a_gate_is_trained_and_decides_what_is_kept(workplace, fake_rig, capsys):
+    more = ["--objects", "8", "--grasps", "4"]
+    assert main([*COLLECT, *more]) == 0
+    gate = ["train", "rec", "--task", "grasp-success", "--out", "gate.safetensors"]
+    assert main([*gate, "--iterations", "3"]) == 0
+    assert "accuracy" in capsys.readouterr().err
+    assert main([*COLLECT[:-1], "gated", "--gate", "gate.safetensors"]) in (0, 1)
+    info = json.loads(Path("gated/recording.json").read_text())
+    assert info["collection"]["gate"].startswith("learned, sha256 ")
+    assert main([*COLLECT[:-1], "gated"]) == 2
+    assert "was collected with gate 'learned" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--config", "paper"], ["--resume"], ["--split", "s.json"], ["--init", "random"]])
+def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
+    assert main(["train", "rec", "--task", "grasp-success", "--out", "g.safetensors", *option]) == 2
+    assert f"{option[0]} is of matchers" in capsys.readouterr().err
+
+
 def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
     main(["build-index", "catalog/", "--model", str(model)])
     query = [sys.executable, "-m", "retrieval.cli", "query", "--gelsight", "a.png", "b.png", "--index", "index"]
@@ -169,7 +246,7 @@ def test_ctrl_c_that_comes_out_as_another_error_is_still_ctrl_c(monkeypatch, cap
             raise RecursionError from None
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr("retrieval.cli.run_check", interrupted)
+    monkeypatch.setitem(COMMANDS, "check", interrupted)
     assert main(["check", "recording"]) == 1
     assert capsys.readouterr().err == "retrieve check: stopped by Ctrl-C\n"
     assert signal.getsignal(signal.SIGINT) is before

@@ -21,6 +21,12 @@ from tests.fake_rig import FakeRig
 NAMES = ("round-0", "thin-1", "round-2")
 
 
+@pytest.fixture(autouse=True)
+def unsynced(monkeypatch):
+    """Waiting for the disk takes most of the time here; what a crash leaves is tested elsewhere."""
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+
+
 def run(out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, most=None, **options):
     """Collect with a fake rig; returns the tallies by object."""
     make = functools.partial(FakeRig, seed if rig_seed is None else rig_seed, faults=faults)

@@ -8,11 +8,13 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import pytest
 
 from robot.collect import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, RobotError, StorageError
 from robot.recording import read_recording
+from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.test_robot_collect import files
 from tests.test_robot_recording_crash import Failing
@@ -49,6 +51,12 @@ def whole(tmp_path_factory):
     return files(out)
 
 
+@pytest.fixture(autouse=True)
+def unsynced(monkeypatch):
+    """Waiting for the disk takes most of the time here; the processes that are killed do wait."""
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+
+
 # Killed -----------------------------------------------------------------------------------------------------
 
 CHILD = """
@@ -76,7 +84,7 @@ def killed(out, syncs):
     return done.returncode != 0
 
 
-@pytest.mark.parametrize("syncs", [1, 3, 12, 13, 14, 40])
+@pytest.mark.parametrize("syncs", [1, 3, 13, 14])
 def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
     assert killed(tmp_path / "r", syncs)
     if syncs > 2:
@@ -87,7 +95,7 @@ def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
 
 def test_a_collection_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path, whole):
     kills = 0
-    while killed(tmp_path / "r", 37):
+    while killed(tmp_path / "r", 41):
         kills += 1
         assert kills < 20
     assert kills > 1
@@ -113,6 +121,13 @@ def test_a_failure_at_any_step_of_an_attempt_can_be_gone_on_from(tmp_path, monke
 def test_two_jobs_give_the_same_bytes_as_one(tmp_path, whole):
     run(tmp_path / "r", jobs=2)
     assert files(tmp_path / "r") == whole
+
+
+def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path):
+    make, settings = functools.partial(load_rig, "sim", seed=0), CollectSettings(grasps=1)
+    for jobs in (1, 2):
+        collect(make, tmp_path / str(jobs), objects=2, seed=0, settings=settings, jobs=jobs)
+    assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
 def test_two_jobs_go_on_with_what_one_began(tmp_path, whole):
@@ -144,6 +159,15 @@ def test_a_worker_that_dies_is_told_and_the_collection_can_go_on(tmp_path, whole
         run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "die"))
     run(tmp_path / "r", jobs=2)
     assert files(tmp_path / "r") == whole
+
+
+def test_opencv_works_in_one_thread_while_attempts_are_made_and_only_then(tmp_path, monkeypatch):
+    """GaussianBlur and others differ in their last digits with the number of threads."""
+    monkeypatch.setattr(cv2, "getNumThreads", lambda: 5)
+    told = []
+    monkeypatch.setattr(cv2, "setNumThreads", told.append)
+    run(tmp_path / "r", names=["round-0"])
+    assert told == [1, 5]
 
 
 def test_threads_are_limited_only_in_the_workers(tmp_path, monkeypatch):

@@ -35,7 +35,7 @@ def naive_fit(image, pose):
     """Least squares through everything 2 cm above the table, after the authors' recipe: percentiles, no robust loss.
 
     Centre: median across the line of sight and 75th percentile along it; radius: root of the 95th percentile of
-    squared distances.
+    squared distances. Not a number where nothing is that high.
     """
     rows, columns = np.nonzero(np.isfinite(image.depth_m))
     depth = image.depth_m[rows, columns] * 1000.0
@@ -43,6 +43,8 @@ def naive_fit(image, pose):
     local = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], 1)
     points = local @ pose[:3, :3].T + pose[:3, 3]
     points = points[(points[:, 2] > 20) & (np.abs(points[:, :2]) < 250).all(1)]
+    if len(points) == 0:
+        return math.nan, math.nan, math.nan
     x, y = np.median(points[:, 0]), np.percentile(points[:, 1], 75)
     return x, y, math.sqrt(np.percentile((points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2, 95))
 

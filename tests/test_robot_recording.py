@@ -62,6 +62,7 @@ def test_what_was_appended_is_read_back(tmp_path):
             opening_mm=31,
             pose=np.array([1.0, 2.0, 3.0, 0.5]),
             grasped=np.True_,
+            outcome="slipped",
             sequence_id="tuesday",
             time_s=0.25,
         )
@@ -80,6 +81,7 @@ def test_what_was_appended_is_read_back(tmp_path):
         opening_mm=31.0,
         pose=(1.0, 2.0, 3.0, 0.5),
         grasped=True,
+        outcome="slipped",
         sequence_id="tuesday",
         time_s=0.25,
     )
@@ -182,6 +184,8 @@ BAD_LINES = {
     json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "time_s must be a finite number, got inf",
     json.dumps({**ROW, "time_s": 10**400}): "time_s must be a finite number",
     json.dumps({**ROW, "grasped": 1}): "grasped must be true or false, got 1",
+    json.dumps({**ROW, "outcome": "lost"}): "outcome must be one of held, missed, slipped, no_plan, got 'lost'",
+    json.dumps({**ROW, "outcome": ["held"]}): "outcome must be one of",
     json.dumps({**ROW, "pose": 5}): "pose must be a list of numbers",
     json.dumps({**ROW, "pose": "123"}): "pose must be a list of numbers",
     json.dumps({**ROW, "pose": [1, "2"]}): "pose must be a finite number, got '2'",

@@ -79,6 +79,16 @@ def test_a_person_is_asked_when_the_object_changes_and_only_then():
     assert rig.object_ids(2) == ["object-0001", "object-0002"]
 
 
+def test_a_rig_whose_objects_nobody_changes_says_so():
+    def nobody(text):
+        raise EOFError
+
+    fake = FakeRig()
+    rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=nobody)
+    with pytest.raises(RobotConfigError, match="run it in a terminal"):
+        rig.prepare("mug", 0)
+
+
 def test_fingers_are_in_order_however_they_were_given():
     assert list(FakeRig(fingers=("b", "a")).sensors) == ["a", "b"]
 

@@ -1,6 +1,5 @@
-"""From the shape of a gel to its picture: surfaces, LEDs, fitted optics, flaws, markers, noise."""
+"""From the shape of a gel to its picture: surfaces, LEDs, flaws, markers, noise."""
 
-import json
 import math
 import pickle
 from dataclasses import replace
@@ -9,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.errors import BadRobotInput, RobotConfigError, SceneError, UnknownName
-from robot.sim import fitted_optics, gel, optics
+from robot.errors import RobotConfigError, SceneError, UnknownName
+from robot.sim import gel, optics
 from robot.sim.contact import Layer
-from robot.sim.fitted_optics import FittedOptics, Limits, fitted_names, load_fitted
+from robot.sim.fitted_optics import fitted_names, load_fitted
 from robot.sim.gel import OPTICS, GelSensor, Noise, draw_sensor
 from robot.sim.gel_marks import Flaws, Markers, flaw_maps, marker_positions
 from robot.sim.optics import Bar, LedOptics, cast_shadows, led_rays
@@ -330,89 +329,3 @@ def test_markers_are_off_by_default_and_dark_where_they_are():
     x, y = marker_positions(Markers(), Surface(np.zeros((1, 1)), sensor.field))[0]
     place = round(y / 0.0634 + 119.5), round(x / 0.0634 + 159.5)
     assert printed.background(0)[place].mean() < 0.5 * sensor.background(0)[place].mean()
-
-
-# Fitted optics ---------------------------------------------------------------------------------------------
-
-
-def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
-    rng = np.random.default_rng(seed)
-    count = fitted_optics.feature_count(degree, len(reaches)) * places
-    free = {
-        "steepest": 1.0,
-        "left": -1,
-        "right": 1,
-        "top": -1,
-        "bottom": 1,
-        "lowest": (-9.0,) * 3,
-        "highest": (9.0,) * 3,
-    }
-    rows = tuple(map(tuple, rng.normal(0, 20, (count, 3)).tolist()))
-    return FittedOptics(
-        degree,
-        places,
-        reaches,
-        rows,
-        1,
-        ((100.0, 90.0, 80.0), (5.0, 0.0, 0.0), (0.0, 5.0, 0.0)),
-        Limits(**{**free, **limits}),
-    )
-
-
-def test_fitted_colours_are_the_sum_that_is_written_down():
-    model, surface = fitted(reaches=()), Surface(dome(), SMALL)
-    picture = model.colours(surface, surface.slopes)
-    weights = np.array(model.weights).reshape(5, 3, 3)
-    for row, col in ((3, 4), (12, 20), (20, 9)):
-        slope = np.array([surface.slopes[0][row, col], surface.slopes[1][row, col]], float)
-        nx, ny = -slope / math.sqrt(1 + slope @ slope)
-        x, y = (2 * col - 31) / 32, (2 * row - 23) / 24
-        wanted = np.array([100 + 5 * x, 90 + 5 * y, 80])
-        for feature, one in zip((nx, ny, nx * nx, nx * ny, ny * ny), weights, strict=True):
-            for place, weight in zip((1, x, y), one, strict=True):
-                wanted = wanted + feature * place * weight
-        np.testing.assert_allclose(picture[row, col], wanted, atol=0.01)
-
-
-def test_fitted_colours_are_held_at_what_the_presses_showed():
-    steep = Surface(10 * dome(), SMALL)
-    limit = fitted(reaches=(), steepest=0.3)
-    nx, ny = limit._tilts(steep.slopes)
-    assert np.hypot(nx, ny).max() == pytest.approx(0.3, rel=1e-5)
-    gentle = Surface(0.1 * dome(), SMALL)
-    free = fitted(reaches=())
-    np.testing.assert_allclose(limit.colours(gentle, gentle.slopes), free.colours(gentle, gentle.slopes), atol=1e-3)
-    held = fitted(highest=(0.2, 9.0, 9.0))
-    assert held._neighbourhood(steep)[0].max() <= 0.3  # cubic interpolation overshoots a little
-    assert fitted()._neighbourhood(steep)[0].max() > 1
-
-
-def test_places_outside_those_pressed_take_the_nearest_ones_weights():
-    model = fitted(degree=1, places=3, reaches=(), left=-0.2, right=0.2, top=-0.2, bottom=0.2)
-    tilted = Surface(0.2 * np.broadcast_to(SMALL.positions()[0], (24, 32)), SMALL)
-    change = model.colours(tilted, tilted.slopes) - model.backdrop(SMALL)
-    np.testing.assert_allclose(change[0, 0], change[5, 8], atol=1e-3)
-    assert np.abs(change[12, 16] - change[5, 8]).max() > 0.05
-
-
-def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
-    model = fitted()
-    content = json.loads(json.dumps({"format": 1, "model": fitted_optics.optics_to_json(model)}))
-    again = fitted_optics.optics_from_json(content)
-    np.testing.assert_allclose(again.weights, model.weights, rtol=1e-5)
-    assert again.limits == model.limits
-    with pytest.raises(BadRobotInput, match="format 1"):
-        fitted_optics.optics_from_json({**content, "format": 2})
-    with pytest.raises(BadRobotInput, match="limits"):
-        fitted_optics.optics_from_json({"format": 1, "model": {}})
-    with pytest.raises(BadRobotInput, match="weights and flat"):
-        replace(model, degree=3)
-
-
-@pytest.mark.parametrize("name", fitted_names())
-def test_the_shipped_fits_name_their_source_and_licence_and_stay_small(name):
-    content = fitted_optics.fitted_document(name)
-    assert "taxim" in content["source"]
-    assert "MIT" in content["source"]
-    assert len(json.dumps(content)) < 12_000
-    load_fitted(name)

@@ -45,7 +45,7 @@ def test_an_unknown_material_lists_the_known_ones():
     ("field", "value"), [("modulus_mpa", 0), ("poisson", 0.6), ("friction", -1), ("gloss", 2), ("roughness", np.nan)]
 )
 def test_impossible_numbers_are_refused(field, value):
-    numbers = dict(modulus_mpa=1, poisson=0.3, density_kg_m3=1000, friction=0.5, gloss=0.5, roughness=0.5)
+    numbers = {"modulus_mpa": 1, "poisson": 0.3, "density_kg_m3": 1000, "friction": 0.5, "gloss": 0.5, "roughness": 1}
     with pytest.raises(RobotConfigError, match=field):
         Material("x", **{**numbers, field: value})
 

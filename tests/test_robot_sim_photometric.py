@@ -349,7 +349,7 @@ def test_the_shipped_fit_is_what_the_presses_give(name, packs):
 
 
 # What the table of `python -m robot.sim.photometric` shows, with some room: PSNR in dB and SSIM of held-out presses.
-HELD_OUT = {"gelsight": (36.0, 0.974), "gelsight_mini": (35.0, 0.970)}
+HELD_OUT = {"gelsight": (36.0, 0.974), "gelsight_mini": (33.0, 0.968)}
 
 
 @real

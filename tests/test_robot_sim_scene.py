@@ -43,7 +43,7 @@ def test_a_whole_scene_does_each_thing_once_for_each_finger():
         "photo": 1,
         "shadow": 1,
         "depth": 1,
-        "turn": 1,
+        "turn": 2,
         "wall": 2,
         "contact": 2,
         "gel": 4,

@@ -187,7 +187,7 @@ class SdfBody(Body):
                 far = np.minimum(far, (near + t)[crossed].min() + np.float32(rays.beyond_mm) - near)
             stride = np.float32(_stride(rays.step_mm, number))
             forward = np.maximum(gap, f / bound) + (gap > 0) * stride
-            # Outside the shell f is not known: 0 asks for a bisection.
+            # Outside the shell f is not known: 0 asks for it to be worked out.
             last = np.stack([t + np.maximum(gap, 0), np.where(gap > 0, 0, f)])
             t = t + np.maximum(stride, forward)
             keep = np.flatnonzero(~crossed & (last[0] <= far))
@@ -210,9 +210,12 @@ class SdfBody(Body):
         return f
 
     def _refine(self, lines: Floats, brackets: Floats, step_mm: float) -> Floats:
-        """Close in on the zero between a point outside and one inside, by secants or, blindly, by halves."""
+        """Close in on the zero between a point outside and one inside, by false position."""
         high, f_high, low, f_low = brackets
-        f_low = np.where(f_low > 0, f_low, -f_high)
+        blind = np.flatnonzero(f_low == 0)
+        if len(blind):
+            x, y, z = lines[:3, blind] + low[blind] * lines[3:, blind]
+            f_low[blind] = self.field(x, y, z, step_mm)
         for _ in range(2):
             middle = low + _zero_between(f_low, f_high) * (high - low)
             x, y, z = lines[:3] + middle * lines[3:]

@@ -53,9 +53,9 @@ class Camera:
     """A pinhole camera of square pixels that looks at `target_mm` with the rig's z upward in its picture."""
 
     px: int = 256
-    focal_px: float = 760.0
+    focal_px: float = 860.0
     position_mm: tuple[float, float, float] = (0.0, -560.0, 390.0)
-    target_mm: tuple[float, float, float] = (0.0, 0.0, 85.0)
+    target_mm: tuple[float, float, float] = (0.0, 0.0, 80.0)
 
     def __post_init__(self) -> None:
         """Raises SceneError for a camera below the table, or one that looks along the vertical or nowhere."""

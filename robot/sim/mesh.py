@@ -60,10 +60,17 @@ class Mesh:
 
     @cached_property
     def corner_normals(self) -> Vectors:
-        """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own beside a crease."""
+        """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own beside a crease.
+
+        Faces count by their angle at the vertex (Thuermer and Wuethrich 1998), so that how a flat side was cut
+        into triangles does not matter.
+        """
         total = np.zeros_like(self.vertices)
         for corner in range(3):
-            np.add.at(total, self.faces[:, corner], self._crosses)
+            a, b, c = (self.corners[:, (corner + turn) % 3] for turn in range(3))
+            wide = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            angle = np.arctan2(wide, np.einsum("ij,ij->i", b - a, c - a))
+            np.add.at(total, self.faces[:, corner], angle[:, None] * self.face_normals)
         total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
         shared, own = total[self.faces], self.face_normals[:, None, :]
         calm = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE

@@ -7,7 +7,7 @@ Each part is worked out when it is asked for, and once.
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -29,8 +29,9 @@ SIDES = {"a": 1.0, "b": -1.0}
 
 _START_MM = 400.0
 """Rays towards the object start this far from the closing plane, outside any object that a gripper meets."""
-_TURNS_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
-_REST_RAD = math.radians(0.5)
+_COARSE_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
+_FINE_RAD = [math.radians(0.4 * step) for step in range(-10, 11)]
+_REST_RAD = math.radians(0.2)
 """The object ends at most this far from the position towards which the jaws turn it."""
 
 _SQUEEZED = 0.2
@@ -87,30 +88,27 @@ class Pinch:
     def turned(self) -> Placement:
         """The object as the closing jaws turn it: towards the nearest position in which they come closest together.
 
-        The jaws push it while they close, so that flat sides end square to the fingers but for a few degrees.
+        The jaws push it while they close, so that flat sides end square to the fingers but for a trifle.
         """
-        reach = self._reaches.sum(axis=1)
-        reach[np.isinf(reach)] = -np.inf  # turned away from a finger is not narrow
-        step = len(_TURNS_RAD) // 2
-        while 0 < step < len(reach) - 1:
-            further = max(step - 1, step + 1, key=lambda other: float(reach[other]))
-            if not reach[further] > reach[step] + 1e-3:
-                break
-            step = further
+        coarse = _nearest_widest(_COARSE_RAD, self._reaches)
+        fine = [coarse + angle for angle in _FINE_RAD]
         rest = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _REST_RAD
-        return self._turn(float(_TURNS_RAD[step]) + rest)
+        return self._turn(_nearest_widest(fine, self._reached(fine)) + rest)
 
     def _turn(self, angle: float) -> Placement:
         return Placement(self.placement.x_mm, self.placement.y_mm, self.placement.yaw_rad + angle)
 
     @cached_property
     def _reaches(self) -> Array:
+        return self._reached(_COARSE_RAD)
+
+    def _reached(self, turns: Sequence[float]) -> Array:
         """(turns, fingers): how far along its rays each finger goes until it touches; inf where it meets nothing."""
         self.passes["turn"] += 1
-        rays = [self._rays(side, _FEELERS, self._turn(angle)) for angle in _TURNS_RAD for side in SIDES.values()]
+        rays = [self._rays(side, _FEELERS, self._turn(angle)) for angle in turns for side in SIDES.values()]
         starts, directions = (np.concatenate(parts) for parts in zip(*rays, strict=True))
         reach = self.obj.body.cast(starts, directions)
-        return np.asarray(reach.reshape(len(_TURNS_RAD), len(SIDES), -1).min(axis=2))
+        return np.asarray(reach.reshape(len(turns), len(SIDES), -1).min(axis=2))
 
     def _rays(self, side: float, grid: tuple[int, int], placement: Placement) -> tuple[Array, Array]:
         """Starts and directions, in the object's frame, of parallel rays from the pad of a finger."""
@@ -130,7 +128,7 @@ class Pinch:
     @cached_property
     def missed(self) -> str | None:
         """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between."""
-        reach = self._reaches[len(_TURNS_RAD) // 2]
+        reach = self._reaches[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.opening_mm / 2).any():
             return "a finger comes down on the object"
         if not np.isfinite(self._walls["a"]).any() or not np.isfinite(self._walls["b"]).any():
@@ -226,6 +224,19 @@ class Pinch:
         z = height * (0.5 - ((rows + 0.5) * share).sum() / wall.shape[0])
         y = -SIDES[finger] * width * (((columns + 0.5) * share).sum() / wall.shape[1] - 0.5)
         return np.array([SIDES[finger] * (float(wall.min()) - _START_MM), y, z])
+
+
+def _nearest_widest(turns: Sequence[float], reached: Array) -> float:
+    """From the middle turn, the way on which the fingers reach further, up to the nearest place where neither does."""
+    reach = reached.sum(axis=1)
+    reach[np.isinf(reach)] = -np.inf  # turned away from a finger is not narrow
+    step = len(turns) // 2
+    while 0 < step < len(turns) - 1:
+        further = max(step - 1, step + 1, key=lambda other: float(reach[other]))
+        if not reach[further] > reach[step] + 1e-3:
+            break
+        step = further
+    return turns[step]
 
 
 def _mean_slope(contact: Contact, pixel_mm: float) -> float:

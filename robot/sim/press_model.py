@@ -29,8 +29,8 @@ from robot.sim.pose_fit import (
 )
 from robot.sim.presses import BALLS_MM, CROP, Presses
 
-# The Mini was pressed 0.3 mm deep at most, and few of its pixels are steep: what the neighbourhood does to colours
-# there, and fourth powers, draw rings and false colours on other objects.
+# The Mini was pressed in the middle alone, and lightly: what place, neighbourhood and fourth powers do to its colours
+# cannot be known elsewhere and for other objects, where they draw rings and false colours.
 SHALLOW = ("gelsight_mini",)
 # The Mini was pressed on three places, ever deeper: a random split holds out a depth, not a place.
 SAME_PLACE = {"gelsight_mini": (range(13), range(13, 18), range(18, 24))}
@@ -41,13 +41,14 @@ _WIDE = Setting(degree=4, places=6)
 _BLURS_PX = (0.0, 1.0, 2.0, 4.0, 8.0)
 _THICKNESSES_MM = (2.0, 4.0, 6.0)
 _SHARES = (1.0, 0.5)
+_RIDGES = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
 def candidates(wide: Setting, *, careful: bool = False) -> Iterator[Setting]:
-    """What selection chooses from, for one shape of the surface; `careful`: no degree 4 and no neighbourhood."""
+    """What to choose from, for one shape of the surface; `careful`: no degree 4, no places, no neighbourhood."""
     reaches = ((),) if careful else ((), wide.reaches_mm)
-    degrees = (2, 3) if careful else (2, 3, 4)
-    for degree, places, ridge, reach in itertools.product(degrees, (1, 3, 6), (1e-5, 1e-4, 1e-3, 1e-2), reaches):
+    degrees, places_known = ((2, 3), (1,)) if careful else ((2, 3, 4), (1, 3, 6))
+    for degree, places, ridge, reach in itertools.product(degrees, places_known, _RIDGES, reaches):
         yield replace(wide, degree=degree, places=places, ridge=ridge, reaches_mm=reach)
 
 

@@ -227,18 +227,19 @@ def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 
 def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Rows of letters and digits, upright, on the bias or lying."""
-    canvas = _canvas(sheet)
+    """Rows of letters and digits, each row once round the object."""
+    canvas, font = _canvas(sheet), cv2.FONT_HERSHEY_SIMPLEX
     down = sheet.pixel_mm[0]
     size = relief.pitch_mm / down / 21  # cv2's capitals are 21 px high at scale 1
     thick = max(round((0.1 + 0.12 * relief.sharpness) * relief.pitch_mm / down), 1)
-    step, shift = 1.7 * relief.pitch_mm / down, sheet.columns
-    for row, line in enumerate(np.arange(0.6 * step, canvas.shape[0] + step, step)):
-        text = "".join(rng.choice(list("ABCDEFGHJKLMNPRSTUVWXYZ2345678O"), int(shift * 1.1 / (16 * size)) + 1))
-        place = (int(-(row % 2) * 9 * size), int(line))
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, 255, thick, cv2.LINE_AA)
-    flipped = np.ascontiguousarray(canvas[::-1])
-    return sheet.blur(np.asarray(flipped[:, : sheet.columns] / np.float32(255)), _edge(relief))
+    step = 1.7 * relief.pitch_mm / down
+    for row, line in enumerate(np.arange(0.6 * step, sheet.rows + step, step)):
+        text = "".join(rng.choice(list("ABCDEFGHJKLMNPRSTUVWXYZ2345678O"), int(sheet.columns / (12 * size)) + 1))
+        while len(text) > 1 and cv2.getTextSize(text, font, size, thick)[0][0] > sheet.columns - 6 * size:
+            text = text[:-1]
+        place = (int((2 + row % 2 * 9) * size), int(line))
+        cv2.putText(canvas, text, place, font, size, 255, thick, cv2.LINE_AA)
+    return sheet.blur(_wrapped(np.ascontiguousarray(canvas[::-1]), sheet), _edge(relief))
 
 
 def scales(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:

@@ -29,7 +29,7 @@ STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
 
 _ATTEMPT_S = 40.0
 _WORKSPACE = Box((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
-_TABLE_MM = 20.0
+_TABLE_MM = 15.0
 """Objects stand at most this far from the centre of the workspace in x and y."""
 
 

@@ -2,30 +2,34 @@
 
 import argparse
 import dataclasses
+import itertools
 import json
 
 import torch
 
 from retrieval.towers import TOWERS
-from tests.benchmarks import build, rerank, step
+from tests.benchmarks import build, cylinder, grasp, rerank, step
 from tests.benchmarks.common import config_of
 
 BENCHMARKS = {"rerank": rerank.measure, "build": build.measure, "step": step.measure}
+WITHOUT_TOWER = {"cylinder": cylinder.measure, "grasp": grasp.measure}
 
 
 def main() -> None:
     """Print every line as soon as it is there; with --json one document a line."""
+    known = [*BENCHMARKS, *WITHOUT_TOWER]
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--tower", nargs="+", choices=sorted(TOWERS), default=["small", "resnet18"])
-    parser.add_argument("--only", nargs="+", choices=sorted(BENCHMARKS), default=list(BENCHMARKS))
+    parser.add_argument("--only", nargs="+", choices=sorted(known), default=known)
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     if not arguments.json:
         print(f"{torch.get_num_threads()} threads, torch {torch.__version__}; medians, ranges over repetitions")
     for name in arguments.only:
-        for tower in arguments.tower:
-            for line in BENCHMARKS[name](config_of(tower)):
-                print(json.dumps(dataclasses.asdict(line)) if arguments.json else line, flush=True)
+        runs = [WITHOUT_TOWER[name]()] if name in WITHOUT_TOWER else []
+        runs += [BENCHMARKS[name](config_of(tower)) for tower in arguments.tower if name in BENCHMARKS]
+        for line in itertools.chain.from_iterable(runs):
+            print(json.dumps(dataclasses.asdict(line)) if arguments.json else line, flush=True)
 
 
 if __name__ == "__main__":

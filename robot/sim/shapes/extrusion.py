@@ -5,7 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.sim.shapes.base import Chart, Floats, Points, Shape, arctan2, bounds, length, relief_limit, rounded
+from robot.sim.shapes.base import (
+    Chart,
+    Floats,
+    Points,
+    Shape,
+    arctan2,
+    bounds,
+    length,
+    relief_limit,
+    rounded,
+    smooth_min,
+)
 
 
 class Outline(ABC):
@@ -188,6 +199,7 @@ class Extrusion(Shape):
         wide = (outline.reach_x_mm, outline.reach_y_mm) if twist_rad == 0 else (reach, reach)
         self.lower, self.upper = bounds(*wide, height_mm)
         self.chart = Unrolled(self)
+        self._upright = taper == 0 and twist_rad == 0
         # How much faster than the point itself the straightened one can move.
         self._stretch = np.float32(np.hypot(1, reach * taper / height_mm) + reach * abs(self.twist_per_mm))
         narrow = 2 * min(outline.reach_x_mm, outline.reach_y_mm) * (1 - taper)
@@ -214,4 +226,8 @@ class Extrusion(Shape):
         if size is not None:
             side = side * size
         half = np.float32(self.height_mm / 2)
-        return rounded(side / self._stretch, np.abs(z - half) - half, self.rim_mm)
+        ends = np.abs(z - half) - half
+        if self._upright:
+            return rounded(side, ends, self.rim_mm)
+        # Leaning sides do not meet the ends at right angles: see Cone.
+        return -smooth_min(-side / self._stretch, -ends, 2 * self.rim_mm)

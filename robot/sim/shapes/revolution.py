@@ -92,7 +92,7 @@ class Revolution(Shape):
         if hollow is not None:
             self.relief_limit_mm = min(self.relief_limit_mm, (self.radius_mm - hollow.radius_mm) / 2)
             self.mask_slope = 1 / self._mask_width
-        self._cut_top = max(part.top_mm for part in parts) > height_mm
+        self._cut_top = len(parts) > 1 or parts[0].top_mm > height_mm
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
         r = length(x, y)

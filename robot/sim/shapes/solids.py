@@ -172,7 +172,10 @@ class Bars(Shape):
 
 
 class Comb(Shape):
-    """A slab whose slots (`gap_mm` wide, every `pitch_mm`) run upwards from `slot_mm`, or across if `lying`."""
+    """A slab with slots, `gap_mm` wide, every `pitch_mm`, open at the top or, if `lying`, at the right.
+
+    They begin `slot_mm` above (to the right of) the slab's middle.
+    """
 
     def __init__(self, slab: Bar, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
         self.slab, self.pitch_mm, self.gap_mm, self.slot_mm, self.lying = slab, pitch_mm, gap_mm, slot_mm, lying

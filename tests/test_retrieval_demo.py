@@ -1,0 +1,52 @@
+"""`retrieve demo` in small: the whole job, with files that a person can open, and a second run that makes nothing again."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from retrieval import cli
+from retrieval.demo import PHOTOS, SEED, TOUCHES
+from robot.recording import read_recording
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Where a demo of four objects has run."""
+    folder = tmp_path_factory.mktemp("demo")
+    assert cli.main(["demo", "--objects", "4", "--jobs", "1", "--out", str(folder / "demo")]) == 0
+    return folder / "demo"
+
+
+def test_the_demo_ends_with_a_page_of_photos_and_gel_images(finished):
+    page = (finished / "query.html").read_text()
+    assert page.count("data:image/jpeg;base64,") >= 4 + 2 * TOUCHES
+    assert (finished / "recording" / "preview.png").stat().st_size > 10_000
+
+
+def test_no_grasp_gives_both_a_photo_and_a_touch(finished):
+    photos = {path.read_bytes() for path in (finished / "catalog").rglob("*.jpg")}
+    grasps = [grasp for grasp in read_recording(finished / "recording").grasps if grasp.grasped]
+    assert len(photos) == 4 * PHOTOS
+    by_object = {}
+    for grasp in grasps:
+        by_object.setdefault(grasp.object_id, []).append((finished / "recording" / grasp.photo).read_bytes() in photos)
+    assert list(by_object.values()) == [[True] * PHOTOS + [False] * TOUCHES] * 4
+
+
+def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_defaults(finished, capsys):
+    lines = (finished / "recording" / "metadata.jsonl").read_bytes()
+    assert cli.main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished)]) == 0
+    said = capsys.readouterr()
+    assert (finished / "recording" / "metadata.jsonl").read_bytes() == lines
+    assert f"0 embedded, {4 * PHOTOS} unchanged" in said.err
+    assert f"--seed {SEED}" in said.err
+    assert "the true object comes first for" in said.err
+    assert "in the hand" in said.out
+    assert not list(Path(os.environ["XDG_STATE_HOME"]).iterdir())
+
+
+def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    assert cli.main(["demo", "--out", str(tmp_path)]) == 2
+    assert "must be a new folder or an earlier demo's; it holds thesis.tex" in capsys.readouterr().err

@@ -1,0 +1,344 @@
+"""Casting and normals against closed forms, a slow march that misses nothing, and the contract of every body."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from robot.errors import SceneError
+from robot.sim.body import SdfBody
+from robot.sim.objects import draw_object
+from robot.sim.relief import RELIEFS, Relief
+from robot.sim.shapes import SHAPES
+from robot.sim.shapes.extrusion import Extrusion, RoundedRectangle
+from robot.sim.shapes.revolution import Ball, Drum, Revolution
+from robot.sim.wall import FINEST_MM
+
+SMOOTH = Relief("smooth", 0.0, 5.0)
+ATOL = 2e-3  # mm; float32 coordinates and two secants
+
+
+def ball(radius=25.0):
+    return SdfBody(Revolution((Ball(radius, radius),), 2 * radius), SMOOTH)
+
+
+def can(relief=SMOOTH, radius=20.0, height=80.0):
+    return SdfBody(Revolution((Drum(radius, 0, height),), height), relief)
+
+
+def box(relief=SMOOTH):
+    return SdfBody(Extrusion(RoundedRectangle(40, 20, 2), 100, rim_mm=1), relief)
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def random_rays(body, count, seed=0, level=False):
+    """Rays from far away to places in the bounding box."""
+    rng = np.random.default_rng(seed)
+    directions = rng.standard_normal((count, 3)) * ([1, 1, 0] if level else [1, 1, 1])
+    directions = unit(directions)
+    return rng.uniform(body.lower, body.upper, (count, 3)) - 400 * directions, directions
+
+
+def wall_rays(body, rows=24, columns=32, z=40.0, pitch=0.5):
+    """Parallel rays from the front."""
+    x, up = np.meshgrid((np.arange(columns) - columns / 2) * pitch, z + (np.arange(rows) - rows / 2) * pitch)
+    origins = np.stack([x, np.full_like(x, body.lower[1] - 7.3), up], axis=-1).reshape(-1, 3)
+    return origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape)
+
+
+# Closed forms ----------------------------------------------------------------------------------------------
+
+
+def test_rays_meet_a_sphere_where_the_quadratic_says():
+    body = ball()
+    origins, directions = random_rays(body, 3000)
+    offset = origins - [0, 0, 25]
+    half = np.einsum("ij,ij->i", offset, directions)
+    root = half**2 - np.einsum("ij,ij->i", offset, offset) + 25**2
+    exact = np.where(root > 0, -half - np.sqrt(np.maximum(root, 0)), np.inf)
+    clear = np.abs(root) > 1  # a ray that grazes within 0.02 mm may go either way
+    np.testing.assert_allclose(body.cast(origins, directions)[clear], exact[clear], atol=ATOL)
+
+
+def test_rays_meet_the_side_of_a_cylinder_and_the_face_of_a_box():
+    body = can()
+    origins, directions = wall_rays(body, pitch=0.7)
+    inside = np.abs(origins[:, 0]) < 20
+    exact = -np.sqrt(400 - origins[inside, 0] ** 2) - origins[inside, 1]
+    np.testing.assert_allclose(body.cast(origins, directions)[inside], exact, atol=ATOL)
+    origins, directions = wall_rays(box())
+    np.testing.assert_allclose(box().cast(origins, directions), -20 - origins[:, 1], atol=ATOL)
+
+
+def test_rays_from_above_meet_the_lid():
+    origins = np.array([[3.0, 4.0, 300.0], [19.9, 0, 81], [20.1, 0, 81]])
+    found = can().cast(origins, np.tile([0.0, 0, -1], (3, 1)))
+    np.testing.assert_allclose(found, [220, 1, np.inf], atol=ATOL)
+
+
+def test_a_ray_that_looks_away_or_passes_by_misses():
+    found = can().cast(
+        np.array([[50.0, 0, 40], [50, 0, 40], [0, -60, 90]]), np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0]])
+    )
+    assert np.isinf(found).all()
+
+
+def test_a_ray_that_starts_inside_hits_at_once():
+    for body in (can(), can(Relief("ribs", 1.0, 5.0))):
+        found = body.cast(np.array([[0.0, 0, 40], [5, 5, 20]]), np.array([[1.0, 0, 0], [0, 0, 1]]))
+        np.testing.assert_array_equal(found, 0)
+
+
+def test_a_ray_along_an_axis_has_no_nan():
+    with np.errstate(all="raise"):
+        found = can().cast(np.array([[20.0, -60, 40], [0, -60, 0], [0, -60, 80.0]]), np.tile([0.0, 1, 0], (3, 1)))
+    assert not np.isnan(found).any()
+
+
+def test_normals_of_a_sphere_a_cylinder_and_a_box():
+    rng = np.random.default_rng(1)
+    out = unit(rng.standard_normal((500, 3)))
+    out = out[out[:, 2] > -0.9]
+    np.testing.assert_allclose(ball().normals(25 * out + [0, 0, 25]), out, atol=2e-3)
+    angle = rng.uniform(0, 2 * np.pi, 200)
+    flat = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    np.testing.assert_allclose(can().normals(20 * flat + [0, 0, 40]), flat, atol=2e-3)
+    np.testing.assert_allclose(
+        box().normals(np.array([[5.0, -20, 50], [-40, 3, 60]])), [[0, -1, 0], [-1, 0, 0]], atol=2e-3
+    )
+
+
+def test_ribs_on_a_flat_wall_have_the_height_and_slope_of_a_cosine():
+    """The gain at sharpness 0 is 0.4: h = 0.5 + tanh(0.4 cos) / (2 tanh 0.4)."""
+    body = box(Relief("ribs", 0.8, 8.0, angle_rad=np.pi / 2, sharpness=0.0))
+    origins, directions = wall_rays(body, rows=60, z=50.0, pitch=0.25)
+    depth = body.cast(origins, directions)
+    wave = np.cos(2 * np.pi * origins[:, 2] / 8.0)
+    height = 0.8 * (0.5 + np.tanh(0.4 * wave) / (2 * np.tanh(0.4)))
+    # Bilinear pixels of 0.2 mm cut an arch of curvature 0.25 / mm by 0.2^2 / 8 * 0.25 = 0.001 mm.
+    np.testing.assert_allclose(-20 - origins[:, 1] - depth, height, atol=5e-3)
+    normals = body.normals(origins + depth[:, None] * directions)
+    slope = (
+        -0.8
+        * 0.4
+        / np.cosh(0.4 * wave) ** 2
+        / (2 * np.tanh(0.4))
+        * np.sin(2 * np.pi * origins[:, 2] / 8)
+        * 2
+        * np.pi
+        / 8
+    )
+    np.testing.assert_allclose(normals[:, 2] / -normals[:, 1], -slope, atol=0.03)
+
+
+# Nothing is stepped through --------------------------------------------------------------------------------
+
+
+def slow_first_hits(body, origins, directions, step=0.02):
+    """March every ray in small equal steps through the whole bounding box."""
+    found = np.full(len(origins), np.inf)
+    for number, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        reach = np.linalg.norm(body.upper - body.lower)
+        middle = (body.lower + body.upper) / 2 - origin
+        t = max(middle @ direction - reach, 0) + np.arange(0, 2 * reach, step)
+        points = origin + t[:, None] * direction
+        inside = ((points >= body.lower) & (points <= body.upper)).all(axis=1)
+        if inside.any():
+            below = np.flatnonzero(body.field(*np.ascontiguousarray(points[inside].T, np.float32)) <= 0)
+            found[number] = t[inside][below[0]] if len(below) else np.inf
+    return found
+
+
+def thin_ribs():
+    return box(Relief("ribs", 1.0, 2.0, angle_rad=0.0, sharpness=1.0))
+
+
+def test_large_steps_miss_thin_ribs_and_ours_do_not():
+    """Rays that graze the wall at 2 degrees meet ribs 1 mm wide from the side."""
+    body = thin_ribs()
+    angle = np.radians(2)
+    directions = np.tile([np.cos(angle), np.sin(angle), 0], (80, 1))
+    targets = np.stack([np.linspace(-25, 10, 80), np.full(80, -20.6), np.full(80, 50.0)], axis=1)
+    origins = targets - 120 * directions
+    exact = slow_first_hits(body, origins, directions)
+    naive = slow_first_hits(body, origins, directions, step=2.5)
+    assert np.mean(naive > exact + 0.5) > 0.3
+    found = body.cast(origins, directions)
+    assert np.mean(np.abs(found - exact) < 0.1) > 0.97
+    assert not np.isinf(found).any()
+
+
+def test_sphere_tracing_without_the_slope_of_the_relief_passes_through_it():
+    """The naive step is f itself; the safe one is f / L. A ray along the wall enters ribs whose flanks are steep."""
+    body, level = thin_ribs(), thin_ribs().wall.levels[0]
+    assert level.slope > 1.5
+    start, direction = np.array([-41.5, -20.5, 50.0]), np.array([1.0, 0.0, 0.0])
+    exact = slow_first_hits(body, start[None], direction[None])[0]
+    t = 0.0
+    for _ in range(200):
+        f = float(body.field(*np.float32(start + t * direction)[:, None])[0])
+        if f < 0.01:
+            break
+        t += 2 * f  # the over-long step of a march that trusts a displaced field
+    naive_inside = f < -0.05
+    found = body.cast(start[None], direction[None])[0]
+    assert abs(found - exact) < 0.05
+    assert naive_inside
+
+
+@pytest.mark.parametrize("index", range(12))
+def test_casting_agrees_with_a_slow_march(index):
+    body = draw_object(3, index).body
+    origins, directions = random_rays(body, 60, seed=index, level=index % 2 == 0)
+    exact, found = slow_first_hits(body, origins, directions), body.cast(origins, directions)
+    hit = np.isfinite(exact) & np.isfinite(found)
+    agree = np.isinf(exact) & np.isinf(found)
+    agree[hit] = np.abs(exact[hit] - found[hit]) < 0.05
+    # A ray that grazes a crest by less than the stride of 0.05 mm may pass over it.
+    assert agree.mean() >= 0.98
+
+
+@pytest.mark.parametrize("index", [1, 4, 6, 9, 16, 20])
+def test_the_slope_of_a_level_bounds_how_fast_its_field_changes(index):
+    body = draw_object(5, index).body
+    bound = 1 + max((level.slope for level in body.wall.levels[:1]), default=0) if body.wall else 1
+    origins, directions = random_rays(body, 1500, seed=index)
+    t = body.cast(origins, directions)
+    p = (origins + t[:, None] * directions)[np.isfinite(t)]
+    q = p + np.random.default_rng(2).normal(0, 0.1, p.shape)
+    change = np.abs(body.field(*np.float32(p.T)) - body.field(*np.float32(q.T)))
+    assert (change <= 1.1 * bound * np.linalg.norm(p - q, axis=1) + 1e-3).mean() > 0.998
+
+
+# The contract over all objects -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", SHAPES)
+@pytest.mark.parametrize("relief", ["knurl", "glyphs"])
+def test_every_family_is_met_on_its_surface_and_within_its_bounds(family, relief):
+    body = draw_object(1, 7, family=family, relief=relief).body
+    origins, directions = random_rays(body, 1200)
+    t = body.cast(origins, directions)
+    assert not np.isnan(t).any()
+    assert np.isfinite(t).mean() > 0.1
+    points = (origins + np.where(np.isfinite(t), t, 0)[:, None] * directions)[np.isfinite(t)]
+    assert (points >= body.lower - 1e-3).all()
+    assert (points <= body.upper + 1e-3).all()
+    inner = ((points > body.lower + 0.05) & (points < body.upper - 0.05)).all(axis=1)
+    # Off the box's faces, as a ray that enters through one may start on the surface. Within a corner, behind a
+    # bracket's web, relief of two sides may meet in a step, where f jumps over 0.
+    assert np.mean(np.abs(body.field(*np.float32(points[inner].T))) < 0.02) > 0.995
+    normals = body.normals(points)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    facing = np.einsum("ij,ij->i", normals, directions[np.isfinite(t)])
+    assert np.mean(facing < 0.1) > 0.98
+
+
+@pytest.mark.parametrize("family", SHAPES)
+def test_every_family_stands_on_the_table(family):
+    body = draw_object(2, 3, family=family, relief="waffle").body
+    rng = np.random.default_rng(0)
+    origins = rng.uniform(body.lower, body.upper, (800, 3)) * [1, 1, 0] - [0, 0, 10]
+    found = body.cast(origins, np.tile([0.0, 0, 1], (800, 1)))
+    assert found.min() == pytest.approx(10, abs=0.05)
+
+
+@pytest.mark.parametrize("relief", RELIEFS)
+def test_every_relief_can_be_felt_on_a_can(relief):
+    body = draw_object(4, 11, family="cylinder", relief=relief).body
+    origins, directions = wall_rays(body, rows=60, columns=40, z=body.upper[2] / 2, pitch=0.3)
+    origins = origins[np.abs(origins[:, 0]) < 4]
+    found = body.cast(origins, directions[: len(origins)])
+    round_can = -np.sqrt(np.maximum(body.shape.radius_mm**2 - origins[:, 0] ** 2, 0)) - origins[:, 1]
+    lifted = np.ptp(round_can - found)
+    if relief == "smooth":
+        assert lifted < 5e-3
+    else:
+        assert 0.3 * body.relief.amplitude_mm < lifted < 1.4 * body.relief.amplitude_mm
+
+
+def test_a_ray_hits_the_same_whatever_is_cast_with_it():
+    body = draw_object(0, 14).body
+    origins, directions = random_rays(body, 4000)
+    together = body.cast(origins, directions)
+    apart = np.concatenate([body.cast(origins[part], directions[part]) for part in np.array_split(np.arange(4000), 7)])
+    np.testing.assert_allclose(apart, together, atol=1e-5)
+
+
+def test_hits_far_behind_the_nearest_may_be_left_out_and_the_others_stay():
+    body = can(Relief("bumps", 1.0, 6.0))
+    origins, directions = wall_rays(body, rows=40, columns=60, pitch=0.7)
+    every, some = body.cast(origins, directions), body.cast(origins, directions, beyond_mm=4.0)
+    near = every < every.min() + 3.9
+    np.testing.assert_allclose(some[near], every[near], atol=1e-5)
+    assert np.isinf(some).sum() > np.isinf(every).sum()
+
+
+def test_a_camera_that_asks_for_less_detail_gets_nearly_the_same():
+    body = can(Relief("knurl", 0.5, 4.0))
+    origins, directions = wall_rays(body, pitch=0.6)
+    fine, coarse = body.cast(origins, directions), body.cast(origins, directions, step_mm=0.6)
+    hit = np.isfinite(fine) & np.isfinite(coarse) & (np.abs(origins[:, 0]) < 15)
+    assert np.abs(fine - coarse)[hit].max() < 0.3
+    assert body.wall.level(0.6).pixel_mm > 2 * body.wall.level(0.1).pixel_mm
+    assert body.wall.level(0.1).pixel_mm >= FINEST_MM * 0.99
+
+
+def test_normals_over_a_pixel_are_calmer_than_those_of_the_gel():
+    body = can(Relief("ribs", 0.3, 1.5, angle_rad=np.pi / 2))
+    origins, directions = wall_rays(body, rows=50, columns=4, pitch=0.13)
+    points = origins + body.cast(origins, directions)[:, None] * directions
+    tilt = [np.abs(body.normals(points, step_mm=step)[:, 2]).max() for step in (0.1, 1.5)]
+    assert tilt[0] > 0.3
+    assert tilt[1] < 0.3 * tilt[0]
+
+
+def test_relief_fades_before_the_edges():
+    """The foot and the lid of a ribbed can are as round as those of a smooth one."""
+    body, bare = can(Relief("ribs", 2.0, 9.0, angle_rad=0.0)), can()
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    directions = -np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    for z in (0.1, 79.9):
+        origins = -60 * directions + [0, 0, z]
+        np.testing.assert_allclose(body.cast(origins, directions), bare.cast(origins, directions), atol=0.02)
+    middle = body.cast(-60 * directions + [0, 0, 40], directions)
+    assert np.ptp(middle) > 1.5
+
+
+# Bad rays, pickles -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "says"),
+    [
+        (np.zeros((3, 3)), np.ones((3, 3)), "unit length"),
+        (np.zeros((3, 3)), np.full((3, 3), np.nan), "unit length"),
+        (np.full((1, 3), np.inf), np.array([[1.0, 0, 0]]), "finite"),
+        (np.full((1, 3), np.nan), np.array([[1.0, 0, 0]]), "finite"),
+        (np.zeros((3, 2)), np.zeros((3, 2)), r"shape \(N, 3\)"),
+        (np.zeros((3, 3)), np.zeros((2, 3)), r"shape \(N, 3\)"),
+        (np.zeros(3), np.array([1.0, 0, 0]), r"shape \(N, 3\)"),
+    ],
+)
+def test_wrong_rays_are_refused(origins, directions, says):
+    with pytest.raises(SceneError, match=says):
+        can().cast(origins, directions)
+
+
+def test_wrong_points_are_refused_and_none_are_fine():
+    with pytest.raises(SceneError, match="points"):
+        can().normals(np.zeros(3))
+    assert can().cast(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+    assert can().normals(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_a_body_travels_without_its_bitmap():
+    body = can(Relief("pebble", 0.8, 5.0, seed=2))
+    origins, directions = wall_rays(body)
+    expected = body.cast(origins, directions)
+    packed = pickle.dumps(body)
+    assert len(packed) < 5000
+    np.testing.assert_array_equal(pickle.loads(packed).cast(origins, directions), expected)  # noqa: S301

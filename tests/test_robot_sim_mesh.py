@@ -1,0 +1,267 @@
+"""Meshes: what is read, what is refused and why, and casting against closed forms."""
+
+import builtins
+import pickle
+import struct
+import sys
+
+import numpy as np
+import pytest
+
+from robot.errors import SceneError, UnknownName
+from robot.sim.mesh import Mesh, load_mesh_object
+
+pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
+pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
+
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CUBE = np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))])
+
+
+def sphere(count=60):
+    """A sphere of radius 1 on a grid of angles: vertices and faces, poles shared."""
+    turn, fall = np.meshgrid(2 * np.pi * np.arange(2 * count) / (2 * count), np.pi * np.arange(1, count) / count)
+    ring = np.stack([np.cos(turn) * np.sin(fall), np.sin(turn) * np.sin(fall), np.cos(fall)], axis=-1)
+    vertices = np.concatenate([ring.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
+    i, j = np.meshgrid(np.arange(count - 2), np.arange(2 * count), indexing="ij")
+    a, b = i * 2 * count + j, i * 2 * count + (j + 1) % (2 * count)
+    sides = np.concatenate([np.stack([a, a + 2 * count, b], -1), np.stack([b, a + 2 * count, b + 2 * count], -1)])
+    j, last = np.arange(2 * count), (count - 2) * 2 * count
+    top = np.stack([np.full_like(j, len(vertices) - 2), j, (j + 1) % (2 * count)], -1)
+    low = np.stack([np.full_like(j, len(vertices) - 1), last + (j + 1) % (2 * count), last + j], -1)
+    return vertices, np.concatenate([sides.reshape(-1, 3), top, low])
+
+
+def stl(path, vertices, faces):
+    """A binary STL, by hand."""
+    rows = b"".join(struct.pack("<12fH", 0, 0, 0, *vertices[face].ravel(), 0) for face in faces)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + rows)
+    return path
+
+
+def obj(path, vertices, faces, head=""):
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + ["f " + " ".join(str(i + 1) for i in face) for face in faces]
+    path.write_text(head + "\n".join(lines) + "\n")
+    return path
+
+
+def ply(path, vertices, faces):
+    head = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [" ".join(map(str, row)) for row in vertices] + ["3 " + " ".join(map(str, row)) for row in faces]
+    path.write_text(head + "\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture
+def ball(tmp_path):
+    vertices, faces = sphere()
+    return load_mesh_object(stl(tmp_path / "ball.stl", 30 * vertices, faces), 0, relief="smooth", scale_to_mm=1)
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("write", "name"), [(stl, "cube.stl"), (obj, "cube.obj"), (ply, "cube.PLY")])
+def test_a_cube_stands_on_the_table_in_every_format(tmp_path, write, name):
+    item = load_mesh_object(write(tmp_path / name, 20 * CORNERS + [100, 5, -3], CUBE), 0, relief="smooth")
+    np.testing.assert_allclose([item.body.lower, item.body.upper], [[-20, -20, 0], [20, 20, 40]], atol=1e-4)
+    assert item.body.mesh.volume_mm3 == pytest.approx(64000)
+    assert item.object_id == "mesh.cube-smooth-0000"
+    assert len(item.body.mesh.vertices) == 8
+
+
+def test_small_numbers_are_metres_and_a_scale_overrules_that(tmp_path):
+    path = obj(tmp_path / "cube.obj", 0.02 * CORNERS, CUBE)
+    assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
+    inches = obj(tmp_path / "inches.obj", CORNERS, CUBE)
+    assert load_mesh_object(inches, 0, scale_to_mm=25.4).body.mesh.vertices[:, 2].max() == pytest.approx(50.8)
+
+
+def test_the_upward_axis_can_be_y(tmp_path):
+    path = obj(tmp_path / "bar.obj", CORNERS * [10, 40, 20], CUBE)
+    item = load_mesh_object(path, 0, relief="smooth", up="y")
+    np.testing.assert_allclose(item.body.upper - item.body.lower, [20, 40, 80])
+    assert item.body.mesh.volume_mm3 > 0
+
+
+def test_faces_that_look_inwards_are_turned(tmp_path):
+    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE[:, ::-1])
+    assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
+
+
+def test_only_geometry_is_read(tmp_path, monkeypatch):
+    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE, head="mtllib cube.mtl\nusemtl paint\n")
+    (tmp_path / "cube.mtl").write_text("newmtl paint\nmap_Kd secret.png\n")
+    opened, real = [], builtins.open
+    monkeypatch.setattr(builtins, "open", lambda *a, **k: opened.append(str(a[0])) or real(*a, **k))
+    load_mesh_object(path, 0, relief="smooth")
+    assert not [name for name in opened if name.endswith((".mtl", ".png"))]
+
+
+def test_the_same_file_and_seed_give_the_same_object(tmp_path):
+    path = obj(tmp_path / "my cube.obj", 20 * CORNERS, CUBE)
+    one, two = load_mesh_object(path, 4), load_mesh_object(path, 4)
+    assert (one.object_id, one.relief, one.material, one.looks) == (two.object_id, two.relief, two.material, two.looks)
+    assert one.object_id.startswith("mesh.my_cube-")
+    assert load_mesh_object(path, 5).looks != one.looks
+
+
+# Refusals --------------------------------------------------------------------------------------------------
+
+
+def with_nan():
+    vertices = 20 * CORNERS.copy()
+    vertices[3, 1] = np.nan
+    return vertices
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "says"),
+    [
+        (20 * CORNERS, CUBE[:-1], "3 edges lie beside a hole.*fill_holes"),
+        (with_nan(), CUBE, "NaN or infinite"),
+        (20 * CORNERS, CUBE[:0], "holds none"),
+        (60 * CORNERS, CUBE, "between fingers 110 mm apart.*120 mm"),
+        (CORNERS * [20, 20, 0], CUBE, "at least 2 mm thick"),
+        (CORNERS * [20, 20, 200], CUBE, "at most 300 mm high"),
+        (20 * CORNERS, np.where(np.arange(12)[:, None] == 0, CUBE[:, ::-1], CUBE), "turned outwards.*fix_normals"),
+        (20 * CORNERS[:4], np.array([[0, 1, 2], [0, 2, 1]]), "at least 2 mm thick"),
+    ],
+)
+def test_what_is_no_graspable_solid_is_refused(tmp_path, vertices, faces, says):
+    with pytest.raises(SceneError, match=says):
+        load_mesh_object(ply(tmp_path / "bad.ply", vertices, faces), 0)
+
+
+def test_a_box_that_is_wide_in_one_direction_only_is_welcome_even_when_turned(tmp_path):
+    turn = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
+    item = load_mesh_object(obj(tmp_path / "plank.obj", (CORNERS * [100, 10, 30]) @ turn, CUBE), 0)
+    assert item.body.upper[0] - item.body.lower[0] > 150
+
+
+@pytest.mark.parametrize("name", ["bad.stl", "bad.obj", "bad.ply"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 84, b"nonsense", b"ply\nformat ascii 1.0\nelement vertex 9", b"v 1 2 x\n"]
+)
+def test_broken_files_are_one_clear_error(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SceneError, match=r"bad\.(stl|obj|ply)"):
+        load_mesh_object(tmp_path / name, 0)
+
+
+def test_truncated_files_never_load_as_something_else(tmp_path):
+    vertices, faces = sphere(8)
+    whole = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()
+    for length in range(0, len(whole) - 1, 371):
+        (tmp_path / "cut.stl").write_bytes(whole[:length])
+        with pytest.raises(SceneError):
+            load_mesh_object(tmp_path / "cut.stl", 0)
+
+
+def test_other_kinds_missing_files_and_wrong_settings_are_refused(tmp_path):
+    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE)
+    with pytest.raises(SceneError, match=r"stl, obj, ply.*'cube\.glb'"):
+        load_mesh_object(tmp_path / "cube.glb", 0)
+    with pytest.raises(SceneError, match="No such file"):
+        load_mesh_object(tmp_path / "none.stl", 0)
+    for scale in (0, -1, np.nan, np.inf):
+        with pytest.raises(SceneError, match="scale_to_mm must be"):
+            load_mesh_object(path, 0, scale_to_mm=scale)
+    with pytest.raises(SceneError, match='"z" or "y"'):
+        load_mesh_object(path, 0, up="x")
+    with pytest.raises(UnknownName, match="knurl"):
+        load_mesh_object(path, 0, relief="fur")
+
+
+@pytest.mark.parametrize("package", ["trimesh", "embreex"])
+def test_a_missing_package_is_a_sentence_that_names_the_extra(tmp_path, monkeypatch, package):
+    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE)
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, "trimesh.ray.ray_pyembree", raising=False)
+    with pytest.raises(SceneError, match=rf"{package}.*pip install 'touch-retrieval\[mesh\]'"):
+        load_mesh_object(path, 0)
+
+
+# Casting ---------------------------------------------------------------------------------------------------
+
+
+def rays_at(body, count, seed=0):
+    rng = np.random.default_rng(seed)
+    directions = rng.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return rng.uniform(body.lower, body.upper, (count, 3)) - 200 * directions, directions
+
+
+def test_rays_meet_a_ball_where_the_quadratic_says(ball):
+    origins, directions = rays_at(ball.body, 2000)
+    offset = origins - [0, 0, 30]
+    half = np.einsum("ij,ij->i", offset, directions)
+    root = half**2 - np.einsum("ij,ij->i", offset, offset) + 900
+    found = ball.body.cast(origins, directions)
+    # Facets of 3 degrees lie up to 30 (1 - cos 1.5 deg) = 0.01 mm inside the ball, deeper across their diagonals.
+    clear = root > 50
+    np.testing.assert_allclose(found[clear], (-half - np.sqrt(np.maximum(root, 0)))[clear], atol=0.15)
+    assert np.isinf(found[root < -1]).all()
+    points = (origins + np.where(np.isfinite(found), found, 0)[:, None] * directions)[np.isfinite(found)]
+    radial = (points - [0, 0, 30]) / 30
+    np.testing.assert_allclose(ball.body.normals(points), radial, atol=0.03)
+
+
+def test_a_cube_keeps_its_edges_and_faces(tmp_path):
+    body = load_mesh_object(obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE), 0, relief="smooth").body
+    x = np.array([-19.9, -3.0, 19.9, 20.1])
+    origins = np.stack([x, np.full(4, -50.0), np.full(4, 20.0)], axis=1)
+    found = body.cast(origins, np.tile([0.0, 1, 0], (4, 1)))
+    np.testing.assert_allclose(found, [30, 30, 30, np.inf], atol=1e-5)
+    np.testing.assert_allclose(body.normals(origins[:3] * [1, 0.4, 1]), np.tile([0, -1, 0], (3, 1)), atol=1e-6)
+    below = body.cast(np.array([[0.0, 0, -5]]), np.array([[0.0, 0, 1]]))
+    np.testing.assert_allclose(below, 5, atol=1e-5)
+    assert body.cast(np.array([[0.0, 0, 20]]), np.array([[1.0, 0, 0]])) == 0
+
+
+def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
+    vertices, faces = sphere()
+    path = stl(tmp_path / "ball.stl", 30 * vertices, faces)
+    worn = load_mesh_object(path, 1, relief="ribs", scale_to_mm=1).body
+    bare = load_mesh_object(path, 1, relief="smooth", scale_to_mm=1).body
+    z = np.linspace(24, 36, 300)
+    x = np.linspace(-6, 6, 300)
+    origins = np.concatenate([np.stack([0 * z, 0 * z - 60, z], 1), np.stack([x, 0 * x - 60, 0 * x + 30], 1)])
+    directions = np.tile([0.0, 1, 0], (600, 1))
+    lift = bare.cast(origins, directions) - worn.cast(origins, directions)
+    amplitude = worn.relief.amplitude_mm
+    low, high = (-amplitude, 0) if worn.relief.engraved else (0, amplitude)
+    assert low - 0.1 <= lift.min()
+    assert lift.max() <= high + 0.1 * amplitude + 0.05
+    assert np.ptp(lift) > 0.6 * amplitude
+    points = origins + worn.cast(origins, directions)[:, None] * directions
+    assert np.abs(worn.normals(points) - bare.normals(points)).max() > 0.1
+
+
+def test_casting_is_the_same_again_and_after_a_pickle(ball):
+    origins, directions = rays_at(ball.body, 500)
+    expected = ball.body.cast(origins, directions)
+    again = pickle.loads(pickle.dumps(ball))  # noqa: S301
+    np.testing.assert_array_equal(again.body.cast(origins, directions), expected)
+    points = (origins + expected[:, None] * directions)[np.isfinite(expected)]
+    np.testing.assert_array_equal(again.body.normals(points), ball.body.normals(points))
+
+
+def test_the_mass_is_that_of_the_volume_or_of_a_shell(ball):
+    solid = 4 / 3 * np.pi * 0.03**3 * ball.material.density_kg_m3
+    shell = 4 * np.pi * 0.03**2 * 0.003 * ball.material.density_kg_m3
+    assert ball.mass_kg == pytest.approx(solid if solid <= 0.6 else shell, rel=0.01)
+
+
+def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
+    vertices, faces = sphere(20)
+    round_mesh = Mesh(vertices, faces)
+    np.testing.assert_allclose(round_mesh.corner_normals, vertices[faces], atol=0.03)
+    cube = Mesh(CORNERS, CUBE)
+    np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
+    assert cube.volume_mm3 == pytest.approx(8)
+    assert cube.areas.sum() == pytest.approx(24)

@@ -1,0 +1,154 @@
+"""Objects: drawn again alike, dealt evenly, of a size that fits, with paint that tells nothing of what is felt."""
+
+import pickle
+import re
+
+import numpy as np
+import pytest
+
+from robot.errors import RobotConfigError, UnknownName
+from robot.sim.body import SdfBody
+from robot.sim.looks import Looks
+from robot.sim.materials import MATERIALS
+from robot.sim.objects import STROKE_MM, SimObject, draw_object
+from robot.sim.relief import RELIEFS, Relief
+from robot.sim.shapes import SHAPES
+from robot.sim.shapes.revolution import Drum, Revolution
+
+
+def solid(radius, height, material):
+    relief = Relief("smooth", 0.0, 5.0)
+    body = SdfBody(Revolution((Drum(radius, 0, height),), height), relief)
+    return SimObject("x", "cylinder", relief, MATERIALS[material], Looks((1, 1, 1)), body)
+
+
+# Drawing ---------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_and_index_give_the_same_object():
+    for index in (0, 7, 1234):
+        one, two = draw_object(5, index), draw_object(5, index)
+        assert (one.object_id, one.relief, one.material, one.looks) == (
+            two.object_id,
+            two.relief,
+            two.material,
+            two.looks,
+        )
+        points = np.random.default_rng(0).uniform(one.body.lower, one.body.upper, (500, 3))
+        np.testing.assert_array_equal(one.body.shape.distance(points), two.body.shape.distance(points))
+        assert one.mass_kg == two.mass_kg
+
+
+def test_an_object_does_not_depend_on_which_others_were_drawn():
+    alone = draw_object(0, 40)
+    for index in range(40):
+        draw_object(0, index)
+    assert draw_object(0, 40).relief == alone.relief
+
+
+def test_98_objects_show_every_family_and_relief_several_times():
+    objects = [draw_object(0, index) for index in range(98)]
+    families = [item.family for item in objects]
+    reliefs = [item.relief.name for item in objects]
+    assert len(SHAPES) >= 12
+    assert min(families.count(name) for name in SHAPES) >= 3
+    assert min(reliefs.count(name) for name in RELIEFS) >= 6
+    assert len({(item.family, item.relief.name) for item in objects}) > 75
+
+
+def test_thousands_of_objects_differ():
+    objects = [draw_object(1, index) for index in range(2000)]
+    assert len({item.object_id for item in objects}) == 2000
+    felt = {(*np.round(item.body.upper, 2), round(item.relief.pitch_mm, 3)) for item in objects}
+    assert len(felt) == 2000
+
+
+def test_ids_can_be_read_and_name_a_file():
+    found = draw_object(3, 17, family="bottle", relief="knurl").object_id
+    assert found == "bottle-knurl-0003-00017"
+    assert re.fullmatch(r"[a-z]+-[a-z]+-\d{4}-\d{5}", draw_object(0, 0).object_id)
+
+
+def test_all_of_them_fit_between_the_fingers():
+    for index in range(400):
+        size = (draw_object(2, index).body.upper - draw_object(2, index).body.lower)[:2]
+        assert 8 <= size.min() <= 95 + 1e-9 < STROKE_MM
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "says"),
+    [
+        ({"family": "teapot"}, UnknownName, r"family must be one of box.*'teapot'"),
+        ({"relief": "fur"}, UnknownName, r"relief must be one of smooth.*'fur'"),
+        ({"index": -1}, RobotConfigError, "index must be a whole number from 0"),
+        ({"seed": 1.5}, RobotConfigError, "seed must be a whole number from 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(settings, error, says):
+    with pytest.raises(error, match=says):
+        draw_object(**{"seed": 0, "index": 0, **settings})
+
+
+def test_nothing_is_baked_until_a_ray_asks_and_pickles_stay_small():
+    item = draw_object(0, 14)
+    assert "wall" not in item.body.__dict__
+    assert len(pickle.dumps(item)) < 20_000
+    item.body.cast(np.array([[0.0, -300, 20]]), np.array([[0.0, 1, 0]]))
+    assert "wall" in item.body.__dict__
+    again = pickle.loads(pickle.dumps(item))  # noqa: S301
+    assert "wall" not in again.body.__dict__
+    assert len(pickle.dumps(item)) < 20_000
+
+
+# No shortcut between paint and touch -----------------------------------------------------------------------
+
+
+def test_looks_and_material_do_not_depend_on_shape_and_relief():
+    for index in range(30):
+        drawn = [
+            draw_object(4, index, family=family, relief=relief)
+            for family, relief in (("box", "knurl"), ("ring", "smooth"), (None, None))
+        ]
+        assert len({repr(item.looks) for item in drawn}) == 1
+        assert len({item.material for item in drawn}) == 1
+
+
+def test_colour_is_not_correlated_with_anything_that_is_felt():
+    objects = [draw_object(6, index) for index in range(1500)]
+    looks = np.array([[*item.looks.colour, item.looks.paint is None, item.looks.label is None] for item in objects])
+    felt = np.array(
+        [
+            [
+                list(SHAPES).index(item.family),
+                list(RELIEFS).index(item.relief.name),
+                item.relief.amplitude_mm,
+                item.relief.pitch_mm,
+                np.log(item.material.modulus_mpa),
+                *(item.body.upper - item.body.lower),
+            ]
+            for item in objects
+        ]
+    )
+    correlation = np.corrcoef(looks.T.astype(float), felt.T)[: looks.shape[1], looks.shape[1] :]
+    # Of 40 independent pairs of 1500 samples the largest is below 0.11 but once in a thousand worlds.
+    assert np.abs(correlation).max() < 0.11
+
+
+# Mass ------------------------------------------------------------------------------------------------------
+
+
+def test_a_light_object_is_solid():
+    exact = np.pi * 15**2 * 60 * 1e-9 * MATERIALS["cork"].density_kg_m3
+    assert solid(15, 60, "cork").mass_kg == pytest.approx(exact, rel=0.03)
+
+
+def test_a_heavy_object_is_hollow_with_a_wall_of_3_mm():
+    hollow = np.pi * (30**2 * 100 - 27**2 * 94) * 1e-9
+    assert solid(30, 100, "steel").mass_kg == pytest.approx(hollow * MATERIALS["steel"].density_kg_m3, rel=0.1)
+
+
+def test_all_masses_can_be_lifted():
+    masses = [draw_object(8, index).mass_kg for index in range(120)]
+    assert min(masses) > 1e-3
+    assert max(masses) < 3
+    assert np.median(masses) < 0.5
