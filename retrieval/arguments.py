@@ -49,7 +49,7 @@ def _add_collect(commands: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (default: 0)")
     parser.add_argument("--jobs", type=int, default=1, help="simulated rigs that work at once (default: 1)")
     parser.add_argument("--gate", type=Path, help="grasp-success checkpoint (default: a rule on the area of contact)")
-    parser.add_argument("--preview", action="store_true", help="write preview.png, pictures of some grasps, to --out")
+    parser.add_argument("--preview", action="store_true", help="write a contact sheet, OUT-preview.png")
 
 
 def _add_import(commands: Any) -> None:

@@ -132,7 +132,8 @@ def run_collect(arguments: argparse.Namespace) -> None:
     if arguments.preview:
         from robot.sim.preview import write_preview
 
-        _say(f"preview: {write_preview(arguments.out, arguments.out / 'preview.png')}")
+        beside = arguments.out.with_name(f"{arguments.out.name}-preview.png")  # every image inside belongs to a grasp
+        _say(f"preview: {write_preview(arguments.out, beside)}")
 
 
 def _load_gate(path: Path | None) -> tuple[Any, str | None]:

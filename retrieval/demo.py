@@ -20,7 +20,6 @@ SEED = 20_000
 """Of the demo's objects; the shipped checkpoint was trained on other seeds."""
 PHOTOS, TOUCHES = 3, 3
 """Grasps of each object that give a photo to the catalogue, and those that give a touch."""
-_PREVIEW = "preview.png"
 
 
 def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
@@ -42,11 +41,11 @@ def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
         _retrieve("query", *gelsight, "--index", index, "--html", folder / "query.html", "--top", 8)
         _say(f"in the hand: {in_hand}, an object that the model was never trained on")
         _say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
-        _say(f"look at {folder / 'query.html'} and {recording / _PREVIEW}")
+        _say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
 
 
 def _check_folder(folder: Path) -> None:
-    ours = {"recording", "catalog", "index", "state", "query.html"}
+    ours = {"recording", "recording-preview.png", "catalog", "index", "state", "query.html"}
     if folder.exists() and (others := {path.name for path in folder.iterdir()} - ours):
         raise BadInput(f"{folder} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
 

@@ -28,6 +28,7 @@ from retrieval.train import pair_logits
 
 # Worlds of the simulated rig. The demo has one of its own (retrieval.demo.SEED).
 SEED_TRAINED, SEED_SCORED = 10_000, 30_000
+RIG = Path(__file__).with_name("shipped_rig.toml")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -86,7 +87,9 @@ def print_table(grasps: list[Grasp], model: Path) -> None:
         guesses = [first_guess(table, owner, number, k) for number in range(len(grasps))]
         print(f"| K={k}, first guess | {by_object(np.array(guesses), owner)} | {1 / k:.2f} |")
     count = len(grasps) / len(names)
-    print(f"\n{len(names)} objects that were never trained on, {count:.1f} touches each; no photo of a touch's own grasp.")
+    print(
+        f"\n{len(names)} objects that were never trained on, {count:.1f} touches each; no photo of a touch's own grasp."
+    )
 
 
 def first_guess(table: NDArray[Any], owner: NDArray[Any], touch: int, k: int) -> float:
@@ -104,7 +107,7 @@ def first_guess(table: NDArray[Any], owner: NDArray[Any], touch: int, k: int) ->
 def collect(recording: Path, objects: int, grasps: int, seed: int, jobs: int) -> int:
     """`retrieve collect` on the simulated rig."""
     size = ("--objects", objects, "--grasps", grasps, "--seed", seed)
-    return retrieve("collect", "--rig", "sim", *size, "--jobs", jobs, "--out", recording)
+    return retrieve("collect", "--rig", RIG, *size, "--jobs", jobs, "--out", recording)
 
 
 def by_object(values: NDArray[Any], owner: NDArray[Any]) -> str:

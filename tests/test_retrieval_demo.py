@@ -1,4 +1,4 @@
-"""`retrieve demo` in small: the whole job, with files that a person can open, and a second run that makes nothing again."""
+"""`retrieve demo` in small: the whole job, with files that a person can open; a second run makes nothing again."""
 
 import os
 from pathlib import Path
@@ -21,7 +21,7 @@ def finished(tmp_path_factory):
 def test_the_demo_ends_with_a_page_of_photos_and_gel_images(finished):
     page = (finished / "query.html").read_text()
     assert page.count("data:image/jpeg;base64,") >= 4 + 2 * TOUCHES
-    assert (finished / "recording" / "preview.png").stat().st_size > 10_000
+    assert (finished / "recording-preview.png").stat().st_size > 10_000
 
 
 def test_no_grasp_gives_both_a_photo_and_a_touch(finished):

@@ -42,7 +42,7 @@ def test_the_object_is_seen_where_it_stands():
     middle = project(CAMERA, (30.0, -10.0, HEIGHT_MM / 2)).round().astype(int)
     mask = view.is_object.reshape(CAMERA.px, CAMERA.px)
     assert mask[middle[1], middle[0]]
-    rows, columns = np.nonzero(mask)
+    _, columns = np.nonzero(mask)
     assert columns.mean() == pytest.approx(middle[0], abs=2)
     above = project(CAMERA, (30.0, -10.0, HEIGHT_MM + 15)).round().astype(int)
     assert not mask[above[1], above[0]]

@@ -54,10 +54,10 @@ def thing(body, *, friction=0.6, modulus_mpa=1e4, density_kg_m3=1000.0):
     return dataclasses.replace(ANY, body=body, material=material)
 
 
-def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=Placement(), opening_mm=110.0, z_mm=50.0, y_mm=0.0):
+def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_mm=110.0, z_mm=50.0, y_mm=0.0):
     return Pinch(
         obj=obj,
-        placement=placement,
+        placement=placement or Placement(),
         pose=Pose(0.0, y_mm, z_mm, yaw),
         force_n=force_n,
         opening_mm=opening_mm,

@@ -54,9 +54,7 @@ def test_a_recording_of_another_rig_is_refused_in_words(tmp_path):
 
 
 def test_an_empty_recording_is_refused_in_words(tmp_path):
-    with RecordingWriter(
-        tmp_path / "r", {"source": "x", "sensor": "y", "rig": "sim", "seed": 0, "rig_settings": {}}
-    ):
+    with RecordingWriter(tmp_path / "r", {"source": "x", "sensor": "y", "rig": "sim", "seed": 0, "rig_settings": {}}):
         pass
     with pytest.raises(RecordingError, match="at least one grasp"):
         write_preview(tmp_path / "r", tmp_path / "p.png")

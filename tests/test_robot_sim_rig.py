@@ -115,6 +115,17 @@ def test_one_finger_is_enough():
         assert rig.world.scene.passes["contact"] == 1
 
 
+def test_several_pairs_of_gels_share_the_objects():
+    with SimRig(0, gels=3) as rig:
+        looks = set()
+        for name in rig.object_ids(12):
+            rig.prepare(name, 0)
+            looks.add(rig.sensors["a"].read().pixels.astype(float).mean().round())
+            scene = rig.world.scene
+            assert scene.sensors["a"] != scene.sensors["b"]
+        assert len(looks) == 3
+
+
 def test_devices_say_when_nothing_stands_on_the_table(rig):
     with pytest.raises(DeviceError, match="call prepare"):
         rig.camera.read()
@@ -134,6 +145,7 @@ def test_an_object_of_another_world_is_refused(rig):
         ({"fingers": ["a", "c"]}, RobotConfigError),
         ({"families": ["teapot"]}, RobotConfigError),
         ({"optics": "neon"}, UnknownName),
+        ({"gels": 0}, RobotConfigError),
         ({"contact_grid": [10, 10]}, RobotConfigError),
         ({"contact_grid": [0, 0]}, RobotConfigError),
         ({"contact_tolerance": 0.0}, RobotConfigError),

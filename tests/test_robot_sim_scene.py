@@ -122,7 +122,9 @@ def test_asking_in_another_order_or_alone_changes_no_pixel():
 
 
 def test_more_force_touches_more():
-    areas = [scene([], grip=dataclasses.replace(GRIP, force_n=force)).pinch.contact("a").area_mm2 for force in (2, 8, 32)]
+    areas = [
+        scene([], grip=dataclasses.replace(GRIP, force_n=force)).pinch.contact("a").area_mm2 for force in (2, 8, 32)
+    ]
     assert areas[0] < areas[1] < areas[2]
 
 

@@ -205,7 +205,7 @@ def _albedo(view: View, lighting: Lighting) -> Array:
 
 
 def _table(seed: int, points: Array) -> Array:
-    """Colour (px * px, 3) of the table top under points of the rig frame: streaked like wood or speckled, but weakly."""
+    """Colour (px * px, 3) of the table top under points of the rig frame: weakly streaked like wood, or speckled."""
     rng = np.random.default_rng([71, seed])
     colour = np.clip(rng.uniform(0.35, 0.85) + rng.uniform(-0.08, 0.08, 3), 0, 1)
     streaks, strength = int(rng.choice([24, 64, 160])), rng.uniform(0.02, 0.09)

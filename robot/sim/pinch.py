@@ -35,6 +35,8 @@ _REST_RAD = math.radians(0.2)
 """The object ends at most this far from the position towards which the jaws turn it."""
 
 _SQUEEZED = 0.2
+_DEEPEST_MM = 8.0
+"""What lies further behind the first touch is out of a gel's reach."""
 
 PAD_MM = (15.2, 20.3)
 """Height and width of a bare finger's pad."""
@@ -143,7 +145,8 @@ class Pinch:
     def _wall(self, finger: str) -> Array:
         grid = self.hand.grid if finger in self.sensors else _FEELERS
         self.passes["wall" if finger in self.sensors else "feel"] += 1
-        return self.obj.body.cast(*self._rays(SIDES[finger], grid, self.turned)).reshape(grid)
+        rays = self._rays(SIDES[finger], grid, self.turned)
+        return self.obj.body.cast(*rays, beyond_mm=_DEEPEST_MM).reshape(grid)
 
     # What the fingers feel ----------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The simulated rig: devices like any other, over one Scene. An attempt is a pure function of (seed, object, number)."""
+"""The simulated rig: devices like any other over one Scene; seed, object and number decide all of an attempt."""
 
 import dataclasses
 import math
@@ -72,7 +72,8 @@ class World:
 class SimRig(Rig):
     """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
 
-    `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `families`: only these shapes.
+    `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `gels`: gels wear out and are replaced;
+    so many pairs serve, each for its share of the objects. `families`: only these shapes.
     `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). `contact_grid` (rows,
     columns) and `contact_tolerance` of the contact solver; `shadow`: whether the lamp casts one; `localisation_mm`:
     how far off the camera's calibration is, drawn from this range. Raises RobotConfigError, UnknownName, SceneError.
@@ -86,6 +87,7 @@ class SimRig(Rig):
         *,
         fingers: Sequence[str] = ("a", "b"),
         optics: str = "led",
+        gels: int = 1,
         families: Sequence[str] = (),
         meshes: str = "",
         contact_grid: Sequence[int] = (120, 160),
@@ -94,16 +96,19 @@ class SimRig(Rig):
         localisation_mm: Sequence[float] = (5.0, 10.0),
     ) -> None:
         _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
+        if not 1 <= gels <= 1000:
+            raise RobotConfigError(f"gels must be from 1 to 1000 pairs, got {gels}")
         self._seed, self._families, self._meshes = seed, tuple(sorted(families)), meshes
         self._shadow = shadow
         self._hand = Hand(STROKE_MM, grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
-        self._sensors = {finger: draw_sensor(seed, finger, optics=optics) for finger in sorted(fingers)}
+        drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
+        self._gels = [{finger: draw_sensor(int(pair), finger, optics=optics) for finger in fingers} for pair in drawn]
         clock = SimClock()
         self.world = World(clock)
         super().__init__(
             SimArm(self.world),
             SimGripper(self.world),
-            {finger: SimTactileSensor(self.world, finger) for finger in self._sensors},
+            {finger: SimTactileSensor(self.world, finger) for finger in fingers},
             SimCamera(self.world, Camera(), _calibration_error(seed, localisation_mm)),
             info={
                 "source": "simulated rig",
@@ -122,14 +127,14 @@ class SimRig(Rig):
     def prepare(self, object_id: str, number: int) -> None:
         """Stand the object on the table, turned and placed at random, under new light."""
         obj = self._find(object_id)
-        stream = [self._seed, zlib.crc32(object_id.encode()), number]
-        rng = np.random.default_rng([101, *stream])
+        name = zlib.crc32(object_id.encode())
+        rng = np.random.default_rng([101, self._seed, name, number])
         x, y = rng.uniform(-_TABLE_MM, _TABLE_MM, 2)
         placement = Placement(float(x), float(y), float(rng.uniform(0.0, 2.0 * math.pi)))
         self.world.scene = Scene(
             obj,
             placement,
-            sensors=self._sensors,
+            sensors=self._gels[name % len(self._gels)],
             hand=self._hand,
             seed=int(rng.integers(2**31)),
             shadow=self._shadow,

@@ -47,10 +47,10 @@ class Scene:
     """
 
     obj: SimObject
-    placement: Placement = Placement()
-    camera: Camera = Camera()
+    placement: Placement = field(default_factory=Placement)
+    camera: Camera = field(default_factory=Camera)
     sensors: Mapping[str, GelSensor] = field(default_factory=dict)
-    hand: Hand = Hand()
+    hand: Hand = field(default_factory=Hand)
     grip: Grip | None = None
     seed: int = 0
     shadow: bool = True

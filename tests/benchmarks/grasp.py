@@ -1,4 +1,4 @@
-"""What a simulated grasp costs: the whole, each output alone, and what leaving one out saves; then whole collections."""
+"""What a simulated grasp costs: the whole, each output alone, what leaving one out saves; then whole collections."""
 
 import dataclasses
 import tempfile
@@ -38,7 +38,7 @@ def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        scenes = [scene for scene in _scenes(objects, grasps + 1)]
+        scenes = list(_scenes(objects, grasps + 1))
         yield from _arms(scenes[objects:], scenes[:objects])
     finally:
         cv2.setNumThreads(threads)
