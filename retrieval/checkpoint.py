@@ -51,8 +51,12 @@ def save_checkpoint(
     split: Split | None,
     calibration: Calibration | None,
     provenance: Mapping[str, Any],
+    float16: bool = False,
 ) -> None:
-    """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot."""
+    """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
+
+    float16: weights are stored so, at half the size, and reckoned with in float32 when they are loaded.
+    """
     require_writable(path)
     header = {
         "config": config.to_dict(),
@@ -61,8 +65,17 @@ def save_checkpoint(
         "provenance": dict(provenance),
     }
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
+    if float16:
+        state = {name: _half(path, name, tensor) for name, tensor in state.items()}
     write_tensors(path, state, header)
     _write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
+
+
+def _half(path: Path, name: str, tensor: Tensor) -> Tensor:
+    half = tensor.half() if tensor.is_floating_point() else tensor
+    if not bool(torch.isfinite(half).all()):
+        raise CheckpointError(f"{path} cannot hold {name} as float16, which ends at 65504; store it as float32")
+    return half
 
 
 def require_writable(path: Path) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from retrieval.errors import BadInput, CheckpointError
 
-SHIPPED = "synthetic-small.safetensors"
+SHIPPED = "simulated-mobilenet.safetensors"
 
 
 def shipped_model() -> Path:
-    """The checkpoint that comes with the package; trained on drawn pictures, for trying the program out."""
+    """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out."""
     return Path(str(resources.files("retrieval") / "shipped" / SHIPPED))
 
 
@@ -25,7 +25,7 @@ def find_model(given: str | None) -> tuple[Path, str]:
     if (last := _last().get("model")) and Path(last).is_file():
         return Path(last), "the last one trained"
     if shipped_model().is_file():
-        return shipped_model(), "shipped; trained on drawn pictures: train your own for real sensors"
+        return shipped_model(), "shipped; trained on the simulated rig: train your own for real sensors"
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
 
 

@@ -19,7 +19,7 @@ from robot.cylinder import fit_cylinder
 from robot.devices import MAX_AGE_S, RGBD, Box, Pose
 from robot.errors import DeviceError, PlanError, RobotConfigError
 from robot.grasp import GraspPlan, GraspSettings, plan_grasp
-from robot.rig import Rig
+from robot.rig import Rig, check_seed
 
 OUTPUTS = ("depth", "before", "after")
 """What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
@@ -90,6 +90,7 @@ class Attempter:
     """Makes attempts with a connected rig."""
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
+        check_seed(seed)
         settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
         lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper

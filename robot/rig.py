@@ -3,7 +3,8 @@
 import inspect
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+import typing
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -45,11 +46,17 @@ class Rig:
 
     @classmethod
     def from_settings(cls, seed: int, settings: Mapping[str, Any]) -> Self:
-        """Build from plain settings: the keywords of the class, `seed` among them or not. Raises RobotConfigError."""
+        """Build from plain settings: the keywords of the class, `seed` among them or not, of the types it annotates.
+
+        Raises RobotConfigError.
+        """
         parameters = inspect.signature(cls).parameters
         known = sorted(set(parameters) - {"seed"})
         if unknown := sorted(set(settings) - set(known)):
             raise RobotConfigError(f"{cls.__name__} has no setting {unknown[0]!r}; it knows {', '.join(known)}")
+        hints = typing.get_type_hints(cls.__init__)
+        for name, value in settings.items():
+            _check_type(name, hints.get(name), value)
         arguments: dict[str, Any] = {**settings, "seed": seed} if "seed" in parameters else dict(settings)
         return cls(**arguments)
 
@@ -140,13 +147,44 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     return rig
 
 
+_PLAIN: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
+    bool: (bool, "true or false"),
+    int: (int, "a whole number"),
+    float: ((int, float), "a number"),
+    str: (str, "a text in quotes"),
+}
+
+
+def _check_type(name: str, hint: Any, value: object) -> None:
+    """Raise RobotConfigError for a plain value, or list of such, that is not of the annotated type; others pass."""
+    if typing.get_origin(hint) is Sequence:
+        kind = typing.get_args(hint)[0]
+        good = isinstance(value, list | tuple) and all(_is_plain(each, kind) for each in value)
+        words = f"a list, each of them {_PLAIN[kind][1]}" if kind in _PLAIN else "a list"
+    else:
+        good, words = _is_plain(value, hint), _PLAIN[hint][1] if hint in _PLAIN else ""
+    if not good:
+        raise RobotConfigError(f"{name} must be {words}, got {value!r}")
+
+
+def _is_plain(value: object, hint: Any) -> bool:
+    """Python counts true and false among the whole numbers; a file of settings does not."""
+    return hint not in _PLAIN or (isinstance(value, _PLAIN[hint][0]) and (hint is bool or not isinstance(value, bool)))
+
+
+def check_seed(seed: int) -> None:
+    """Raise RobotConfigError unless random numbers can be drawn from `seed`."""
+    if not isinstance(seed, int) or seed < 0:
+        raise RobotConfigError(f"seed must be a whole number from 0, got {seed!r}")
+
+
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Name of the rig and its settings."""
     try:
         document = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
         raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)
     if not isinstance(name, str):

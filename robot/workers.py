@@ -6,10 +6,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from typing import Self
 
 import cv2
@@ -37,6 +38,7 @@ class Jobs:
         self.window = 1 if jobs == 1 else 2 * jobs
         self._environment: dict[str, str | None] = {}
         self._threads = cv2.getNumThreads()
+        self._not_ours = set(multiprocessing.active_children())
         if jobs > 1:
             self._environment = {name: os.environ.get(name) for name in _THREADS}
             self._pool = ProcessPoolExecutor(
@@ -68,7 +70,26 @@ class Jobs:
         """Waits for the attempts that have begun; the others are not made."""
         cv2.setNumThreads(self._threads)
         if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            _end(self._pool, set(multiprocessing.active_children()) - self._not_ours)
+
+
+def _end(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
+    """Tell the workers to leave and wait until they have; Ctrl-C does not break that off, but is raised afterwards.
+
+    A pool whose shutdown(wait=True) is broken off hangs when Python ends: the interrupted join of its thread makes that
+    thread look finished (CPython issue 90882), so nobody waits until it has told the workers.
+    """
+    again: KeyboardInterrupt | None = None
+    while True:
+        try:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in workers:
+                wait([worker.sentinel])
+            break
+        except KeyboardInterrupt as error:
+            again = error
+    if again is not None:
+        raise again
 
 
 def _restore(environment: dict[str, str | None]) -> None:

@@ -28,11 +28,11 @@ def test_the_two_commands_work_exactly_as_written(workplace, capsys):
     assert main(["build-index", "catalog/"]) == 0
     said = capsys.readouterr()
     assert said.out == ""
-    assert f"model: {defaults.shipped_model()} (shipped; trained on drawn pictures" in said.err
+    assert f"model: {defaults.shipped_model()} (shipped; trained on the simulated rig" in said.err
     assert main(["query", "--gelsight", "a.png", "b.png"]) == 0
     said = capsys.readouterr()
     assert "Which object is in the hand?" in said.out
-    assert "drawn test pictures" in said.err
+    assert "simulated rig" in said.err
 
 
 def test_the_index_and_the_model_are_found_again_from_another_folder(workplace, model, capsys, monkeypatch):

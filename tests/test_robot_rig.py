@@ -139,6 +139,7 @@ BAD_FILES = {
     'rig = "fake"\nfake = 3': "fake must be a table",
     'rig = "none"': "no rig is called 'none'",
     'rig = "fake"\n[fake]\ncolour = 3': "has no setting 'colour'",
+    "rig = " + "[" * 10**5: "is not TOML",
 }
 
 
@@ -148,6 +149,40 @@ def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
     path.write_text(text)
     with pytest.raises((RobotConfigError, UnknownName), match=BAD_FILES[text]):
         load_rig(str(path), seed=0)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("gels = 5.0", "gels must be a whole number, got 5.0"),
+        ("gels = true", "gels must be a whole number, got True"),
+        ('gels = "5"', "gels must be a whole number, got '5'"),
+        ('contact_tolerance = "x"', "contact_tolerance must be a number, got 'x'"),
+        ('shadow = "no"', "shadow must be true or false, got 'no'"),
+        ("meshes = 3", "meshes must be a text in quotes, got 3"),
+        ('fingers = "ab"', "fingers must be a list, each of them a text in quotes, got 'ab'"),
+        ('families = ["ring", 3]', r"families must be a list, each of them a text in quotes, got \['ring', 3\]"),
+        ("localisation_mm = 3", "localisation_mm must be a list, each of them a number, got 3"),
+        ("contact_grid = [120.0, 160.0]", "contact_grid must be a list, each of them a whole number"),
+    ],
+)
+def test_a_setting_of_another_type_says_which_is_wanted(tmp_path, setting, said):
+    path = tmp_path / "rig.toml"
+    path.write_text(f'rig = "sim"\n[sim]\n{setting}\n')
+    with pytest.raises(RobotConfigError, match=f"^{said}"):
+        load_rig(str(path), seed=0)
+
+
+def test_a_whole_number_is_a_number(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text('rig = "sim"\n[sim]\nlocalisation_mm = [0, 5]\n')
+    load_rig(str(path), seed=0)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, None, "0"])
+def test_a_seed_must_be_a_whole_number_from_0(seed):
+    with pytest.raises(RobotConfigError, match="^seed must be a whole number from 0, got"):
+        load_rig("sim", seed=seed)
 
 
 def test_a_file_that_is_not_there_is_named(fake):

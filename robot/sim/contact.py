@@ -194,7 +194,10 @@ def _check_settings(pixel_mm: float, tolerance: float, max_iterations: int) -> N
 
 
 def _checked_gap(gap_mm: npt.ArrayLike) -> Floats:
-    gap = np.asarray(gap_mm, np.float64)
+    try:
+        gap = np.asarray(gap_mm, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"a gap must be rows x cols of numbers: {error}; give a height map") from error
     if gap.ndim != 2 or gap.size == 0:
         raise SceneError(f"a gap must be rows x cols with at least one pixel, got shape {gap.shape}; give a height map")
     if np.isnan(gap).any() or (gap == -np.inf).any():

@@ -15,7 +15,7 @@ from robot.devices import RGBD, Arm, Box, Frame, Gripper, GripperState, Intrinsi
 from robot.devices import Camera as CameraDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.recorded_grasp import RecordedGrasp
-from robot.rig import Rig
+from robot.rig import Rig, check_seed
 from robot.sim.camera import Camera, Placement
 from robot.sim.gel import draw_sensor
 from robot.sim.objects import SimObject, draw_object
@@ -95,6 +95,7 @@ class SimRig(Rig):
         shadow: bool = True,
         localisation_mm: Sequence[float] = (5.0, 10.0),
     ) -> None:
+        check_seed(seed)
         _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
         if not 1 <= gels <= 1000:
             raise RobotConfigError(f"gels must be from 1 to 1000 pairs, got {gels}")
