@@ -132,7 +132,8 @@ def run_collect(arguments: argparse.Namespace) -> None:
     if arguments.preview:
         from robot.sim.preview import write_preview
 
-        beside = arguments.out.with_name(f"{arguments.out.name}-preview.png")  # every image inside belongs to a grasp
+        folder = arguments.out if arguments.out.name not in ("", "..") else arguments.out.resolve()
+        beside = folder.with_name(f"{folder.name}-preview.png")  # every image inside belongs to a grasp
         _say(f"preview: {write_preview(arguments.out, beside)}")
 
 

@@ -8,6 +8,7 @@ at most the last line is half or has no grasp, and then it does not count.
 
 import contextlib
 import json
+import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -46,13 +47,22 @@ class LoggedAttempt:
         """Raises RecordingError for what `to_row` never writes."""
         try:
             attempt = cls(**row)
-            whole = isinstance(attempt.number, int) and isinstance(attempt.accepted, bool)
-            if not whole or attempt.outcome not in OUTCOMES or not isinstance(attempt.object_id, str):
-                raise ValueError(f"got {row!r}")
-            float(attempt.ended_s)
-        except (TypeError, ValueError) as error:
+        except TypeError as error:
             raise RecordingError(f"is no attempt: {error}") from error
+        wrong = [name for name, types in _TYPES.items() if not isinstance(getattr(attempt, name), types)]
+        if wrong or attempt.outcome not in OUTCOMES or not math.isfinite(attempt.ended_s):
+            raise RecordingError(f"is no attempt: {(wrong or ['outcome or ended_s'])[0]} is wrong in {row!r}")
         return attempt
+
+
+_TYPES: Mapping[str, Any] = {
+    "object_id": str,
+    "number": int,
+    "outcome": str,
+    "accepted": bool,
+    "ended_s": int | float,
+    "grasp_id": str | None,
+}
 
 
 def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
@@ -69,6 +79,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
     found: list[tuple[LoggedAttempt, int]] = []
+    made: Counter[str] = Counter()
     end = 0
     for number, line in enumerate(lines, start=1):
         last = number == len(lines)
@@ -79,6 +90,12 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
             if last:
                 break
             raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
+        if attempt.number != made[attempt.object_id]:
+            raise RecordingError(
+                f"{path}, line {number}: attempts must be in order and there once, so that number "
+                f"{made[attempt.object_id]} is next for {attempt.object_id}, got {attempt.number}; restore the file"
+            )
+        made[attempt.object_id] += 1
         end += len(line)
         found.append((attempt, end))
     return found
@@ -87,7 +104,9 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
 def _parsed(path: Path, number: int, line: bytes) -> LoggedAttempt:
     try:
         return LoggedAttempt.from_row(json.loads(line))
-    except (ValueError, RecordingError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"{path}, line {number}: must be JSON in UTF-8: {error}") from error
+    except RecordingError as error:
         raise RecordingError(f"{path}, line {number}: {error}") from error
 
 

@@ -95,13 +95,25 @@ def test_an_earlier_line_without_its_grasp_is_damage(tmp_path):
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": 1, "ended_s": 1.0}',
         b'{"object_id": "mug", "number": "0", "outcome": "held", "accepted": true, "ended_s": 1.0}',
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": null}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": "1.0"}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": NaN}',
+        b'{"object_id": "mug", "number": 0, "outcome": ["held"], "accepted": true, "ended_s": 1.0}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "grasp_id": []}',
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "colour": 3}',
+        b'{"object_id": "mug", "number": 1, "outcome": "held", "accepted": true, "ended_s": 1.0}',
     ],
 )
 def test_a_damaged_line_is_named(tmp_path, line):
     path = write(tmp_path)
     path.write_bytes(line + b"\n" + path.read_bytes())
     with pytest.raises(RecordingError, match=r"attempts\.jsonl, line 1: "):
+        read_attempts(tmp_path, GRASPS)
+
+
+def test_an_attempt_that_is_there_twice_is_damage(tmp_path):
+    path = write(tmp_path)
+    path.write_bytes(path.read_bytes() + path.read_bytes().splitlines(keepends=True)[1])
+    with pytest.raises(RecordingError, match="line 5: attempts must be in order and there once, so that number 3 is"):
         read_attempts(tmp_path, GRASPS)
 
 

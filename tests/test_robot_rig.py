@@ -181,7 +181,7 @@ def test_a_whole_number_is_a_number(tmp_path):
 
 @pytest.mark.parametrize("seed", [-1, 1.5, None, "0"])
 def test_a_seed_must_be_a_whole_number_from_0(seed):
-    with pytest.raises(RobotConfigError, match="^seed must be a whole number from 0, got"):
+    with pytest.raises(RobotConfigError, match=r"^seed must be a whole number from 0, got"):
         load_rig("sim", seed=seed)
 
 

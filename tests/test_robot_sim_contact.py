@@ -262,6 +262,7 @@ def test_a_plane_on_an_incompressible_periodic_layer_cannot_go_deeper():
         ({"gap_mm": np.full((3, 3), np.nan)}, SceneError, "number or \\+inf in each pixel, got NaN"),
         ({"gap_mm": np.full((3, 3), -np.inf)}, SceneError, "got NaN or -inf"),
         ({"gap_mm": np.zeros(3)}, SceneError, "rows x cols with at least one pixel, got shape \\(3,\\)"),
+        ({"gap_mm": [["a", "b"]]}, SceneError, "must be rows x cols of numbers"),
         ({"gap_mm": np.zeros((0, 3))}, SceneError, "at least one pixel"),
         ({"force_n": -1.0}, SceneError, "not negative, got -1.0 N"),
         ({"force_n": math.nan}, SceneError, "finite and not negative, got nan"),

@@ -126,6 +126,17 @@ def test_several_pairs_of_gels_share_the_objects():
         assert len(looks) == 3
 
 
+def test_markers_are_black_dots_on_the_same_gels():
+    frames = []
+    for markers in (False, True):
+        with SimRig(0, markers=markers) as rig:
+            rig.prepare(rig.object_ids(1)[0], 0)
+            frames.append(rig.sensors["a"].read().pixels.astype(float).mean(axis=2))
+    darker = frames[0] - frames[1]
+    assert 0.005 < (darker > 40).mean() < 0.3
+    assert abs(np.median(darker)) < 3
+
+
 def test_devices_say_when_nothing_stands_on_the_table(rig):
     with pytest.raises(DeviceError, match="call prepare"):
         rig.camera.read()

@@ -287,7 +287,8 @@ def _read(file: Path) -> Mesh:
     except OSError as error:
         raise SceneError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged file raises whatever the parser stumbles over
-        raise SceneError(f"{file} must be a mesh in {kind.upper()}, and cannot be read as one: {error}") from error
+        reason = "it is neither whole nor text" if isinstance(error, ImportError) else error  # a guesser of encodings
+        raise SceneError(f"{file} must be a mesh in {kind.upper()}, and cannot be read as one: {reason}") from error
     _check_arrays(file, vertices, faces)
     return _merged(vertices, faces)
 

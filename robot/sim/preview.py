@@ -32,7 +32,7 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     chosen = _one_each(recording.grasps, rows)
     sheet = np.vstack([_header(tuple(rig.sensors)), *(_row(recording.folder, grasp, rig) for grasp in chosen)])
     data = cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
-    with storage_errors(Path(out).parent):
+    with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         write_file(Path(out), data)
     return Path(out)

@@ -1,9 +1,9 @@
 """The simulated rig: devices like any other over one Scene; seed, object and number decide all of an attempt."""
 
-import dataclasses
 import math
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,6 +18,7 @@ from robot.recorded_grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.sim.camera import Camera, Placement
 from robot.sim.gel import draw_sensor
+from robot.sim.gel_marks import Markers
 from robot.sim.objects import SimObject, draw_object
 from robot.sim.pinch import PAD_MM, SIDES, Hand
 from robot.sim.scene import Grip, Scene
@@ -73,7 +74,7 @@ class SimRig(Rig):
     """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
 
     `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `gels`: gels wear out and are replaced;
-    so many pairs serve, each for its share of the objects. `families`: only these shapes.
+    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: these shapes only.
     `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). `contact_grid` (rows,
     columns) and `contact_tolerance` of the contact solver; `shadow`: whether the lamp casts one; `localisation_mm`:
     how far off the camera's calibration is, drawn from this range. Raises RobotConfigError, UnknownName, SceneError.
@@ -88,6 +89,7 @@ class SimRig(Rig):
         fingers: Sequence[str] = ("a", "b"),
         optics: str = "led",
         gels: int = 1,
+        markers: bool = False,
         families: Sequence[str] = (),
         meshes: str = "",
         contact_grid: Sequence[int] = (120, 160),
@@ -103,7 +105,11 @@ class SimRig(Rig):
         self._shadow = shadow
         self._hand = Hand(STROKE_MM, grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
-        self._gels = [{finger: draw_sensor(int(pair), finger, optics=optics) for finger in fingers} for pair in drawn]
+        dots = Markers() if markers else None
+        self._gels = [
+            {finger: replace(draw_sensor(int(pair), finger, optics=optics), markers=dots) for finger in fingers}
+            for pair in drawn
+        ]
         clock = SimClock()
         self.world = World(clock)
         super().__init__(
@@ -150,7 +156,7 @@ class SimRig(Rig):
         if grasp.pose is None or grasp.force_n is None:
             raise RecordingError(f"{grasp.grasp_id} must have a pose and a force for its walls to be simulated again")
         self.prepare(grasp.object_id, int(grasp.grasp_id.rsplit("-", 1)[-1]))
-        scene = dataclasses.replace(self.world.now(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
+        scene = replace(self.world.now(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
         return {} if scene.pinch.missed else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
     def _find(self, object_id: str) -> SimObject:
@@ -274,13 +280,13 @@ class SimGripper(Gripper):
         world = self._world
         world.opening_mm = opening_mm
         if world.scene is not None and world.scene.grip is not None:
-            world.scene = dataclasses.replace(world.scene, grip=None)
+            world.scene = replace(world.scene, grip=None)
         return self._state()
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
         world = self._world
         grip = Grip(world.pose, force_n, world.opening_mm)
-        world.scene = dataclasses.replace(world.now(), grip=grip)
+        world.scene = replace(world.now(), grip=grip)
         world.clock.sleep(world.opening_mm / speed_mm_s)
         return self._state()
 
