@@ -25,7 +25,7 @@ PHOTOS, TOUCHES = 3, 3
 def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
     """Collect, build the index, query; ends with a table and `folder`/query.html. What is there is used again.
 
-    Raises BadInput for a folder of other files, RetrievalError where a command fails.
+    Raises BadInput for a folder of other files, and it or RetrievalError where a command fails, by its exit code.
     """
     _check_folder(folder)
     with _own_state(folder / "state"):
@@ -97,8 +97,9 @@ def _retrieve(*arguments: object) -> None:
     """Say a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
     _say("$ retrieve " + " ".join(words))
-    if cli.main(words):
-        raise RetrievalError(f"`retrieve {words[0]}` failed; what it said stands above")
+    if code := cli.main(words):
+        failure = BadInput if code == BadInput.exit_code else RetrievalError
+        raise failure(f"`retrieve {words[0]}` failed; what it said stands above")
 
 
 def _say(text: str) -> None:

@@ -113,6 +113,8 @@ def train_gate(
     """
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed must be in [0, 2^32); got {seed}")
     require_writable(out)
     attempts = load_attempts(recording)
     settings = settings or GateSettings(frame="after" if all(attempt.after for attempt in attempts) else "during")

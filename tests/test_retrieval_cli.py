@@ -84,6 +84,12 @@ WRONG_USE = {
     "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: sim"),
     "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
+    "too many objects": (["collect", "--objects", str(10**20), "--out", "rec"], "at most 100000 objects"),
+    "no seed of collections": (["collect", "--seed", "-1", "--out", "rec"], "seed must be a whole number from 0"),
+    "no seed of gates": (
+        ["train", "catalog/", "--task", "grasp-success", "--seed", "-1", "--out", "g.safetensors"],
+        "seed must be in [0, 2^32); got -1",
+    ),
     "no objects": (["collect", "--objects", "0", "--out", "rec"], "at least one object"),
     "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
     "not an empty folder": (["collect", "--out", "catalog"], "catalog holds other files"),
@@ -192,6 +198,14 @@ def test_ctrl_c_while_collecting_says_how_to_go_on(workplace, fake_rig, capsys, 
         "retrieve collect: stopped by Ctrl-C",
     ]
     monkeypatch.undo()
+
+
+def test_the_preview_of_the_folder_one_stands_in_lies_beside_it(workplace, capsys, monkeypatch):
+    """Path(".") has no name to which something could be added."""
+    Path("rec").mkdir()
+    monkeypatch.chdir("rec")
+    assert main(["collect", "--objects", "1", "--grasps", "1", "--out", ".", "--preview"]) == 0
+    assert Path("../rec-preview.png").is_file()
 
 
 def test_collecting_nothing_is_a_failure_that_says_where_to_look(workplace, fake_rig, capsys, monkeypatch):

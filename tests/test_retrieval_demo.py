@@ -46,6 +46,13 @@ def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_de
     assert not list(Path(os.environ["XDG_STATE_HOME"]).iterdir())
 
 
+def test_a_command_that_is_used_wrongly_ends_the_demo_with_its_exit_code(tmp_path, capsys):
+    assert cli.main(["demo", "--objects", "0", "--out", str(tmp_path / "demo")]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-2] == "retrieve collect: at least one object must be collected, got none"
+    assert said[-1] == "retrieve demo: `retrieve collect` failed; what it said stands above"
+
+
 def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
     assert cli.main(["demo", "--out", str(tmp_path)]) == 2

@@ -29,6 +29,7 @@ STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
 """Of the Weiss WSG-50 that is simulated: distance of the jaws, and its clamping force."""
 
 _ATTEMPT_S = 40.0
+_MOST_OBJECTS = 100_000
 _WORKSPACE = Box((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
 _TABLE_MM = 15.0
 """Objects stand at most this far from the centre of the workspace in x and y."""
@@ -74,10 +75,11 @@ class SimRig(Rig):
     """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
 
     `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `gels`: gels wear out and are replaced;
-    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: these shapes only.
-    `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). `contact_grid` (rows,
-    columns) and `contact_tolerance` of the contact solver; `shadow`: whether the lamp casts one; `localisation_mm`:
-    how far off the camera's calibration is, drawn from this range. Raises RobotConfigError, UnknownName, SceneError.
+    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: only shapes of
+    these families. `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`).
+    `contact_grid` (rows, columns) and `contact_tolerance` of the contact solver. `shadow`: whether the lamp casts one.
+    `localisation_mm`: how far off the camera's calibration is, drawn from this range.
+    Raises RobotConfigError, UnknownName, SceneError.
     """
 
     can_run_jobs: ClassVar[bool] = True
@@ -128,7 +130,9 @@ class SimRig(Rig):
         )
 
     def object_ids(self, count: int) -> list[str]:
-        """The first `count` objects of this seed. Raises RobotConfigError for more meshes than there are."""
+        """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
+        if count > _MOST_OBJECTS:
+            raise RobotConfigError(f"the simulated rig has at most {_MOST_OBJECTS} objects a seed, got {count}")
         return [self._object(index).object_id for index in range(count)]
 
     def prepare(self, object_id: str, number: int) -> None:
