@@ -153,6 +153,15 @@ def test_broken_files_are_one_clear_error(tmp_path, name, content):
         load_mesh_object(tmp_path / name, 0)
 
 
+def test_a_binary_file_cut_off_is_not_blamed_on_a_missing_package(tmp_path):
+    """trimesh takes it for text and asks a guesser of encodings, which need not be there."""
+    path = tmp_path / "cut.stl"
+    path.write_bytes(bytes([0xFF, 0xFE, 0x9D]) * 100)
+    with pytest.raises(SceneError, match="must be a mesh in STL, and cannot be read as one") as caught:
+        load_mesh_object(path, 0)
+    assert "No module" not in str(caught.value)
+
+
 def test_truncated_files_never_load_as_something_else(tmp_path):
     vertices, faces = sphere(8)
     whole = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()

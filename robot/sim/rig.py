@@ -75,8 +75,8 @@ class SimRig(Rig):
     """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
 
     `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `gels`: gels wear out and are replaced;
-    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: only shapes of
-    these families. `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`).
+    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: only shapes
+    of these. `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`).
     `contact_grid` (rows, columns) and `contact_tolerance` of the contact solver. `shadow`: whether the lamp casts one.
     `localisation_mm`: how far off the camera's calibration is, drawn from this range.
     Raises RobotConfigError, UnknownName, SceneError.
