@@ -1,6 +1,7 @@
 """Meshes: what is read, what is refused and why, and casting against closed forms."""
 
 import builtins
+import functools
 import pickle
 import struct
 import sys
@@ -8,7 +9,9 @@ import sys
 import numpy as np
 import pytest
 
-from robot.errors import SceneError, UnknownName
+from robot.collect import CollectSettings, collect
+from robot.errors import RecordingError, RobotConfigError, SceneError, UnknownName
+from robot.rig import load_rig
 from robot.sim.mesh import Mesh, load_mesh_object
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
@@ -274,3 +277,19 @@ def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
     assert cube.volume_mm3 == pytest.approx(8)
     assert cube.areas.sum() == pytest.approx(24)
+
+
+def test_a_rig_of_meshes_grasps_them_and_goes_on_with_the_same_files_only(tmp_path):
+    folder, make_rig = tmp_path / "meshes", functools.partial(load_rig, "sim", seed=0, meshes=str(tmp_path / "meshes"))
+    folder.mkdir()
+    for name, size in (("cube", 20), ("larger", 25)):
+        stl(folder / f"{name}.stl", size * CORNERS, CUBE)
+    settings = CollectSettings(grasps=1)
+    tallies = collect(make_rig, tmp_path / "recording", objects=2, seed=0, settings=settings)
+    assert [tally.object_id.split("-")[0] for tally in tallies] == ["mesh.cube", "mesh.larger"]
+    assert sum(tally.attempts for tally in tallies) > 0
+    with pytest.raises(RobotConfigError, match="must hold as many STL, OBJ or PLY"):
+        make_rig().object_ids(3)
+    stl(folder / "larger.stl", 30 * CORNERS, CUBE)
+    with pytest.raises(RecordingError, match="meshes sha256"):
+        collect(make_rig, tmp_path / "recording", objects=2, seed=0, settings=settings)

@@ -1,5 +1,6 @@
 """The simulated rig: devices like any other over one Scene; seed, object and number decide all of an attempt."""
 
+import hashlib
 import math
 import zlib
 from collections.abc import Sequence
@@ -124,6 +125,7 @@ class SimRig(Rig):
                 "sensor": f"simulated GelSight ({optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
+                **({"meshes_sha256": _mesh_digest(meshes)} if meshes else {}),
             },
             clock=clock,
             sleep=clock.sleep,
@@ -204,6 +206,14 @@ def _mesh_files(folder: str) -> list[Path]:
     if not Path(folder).is_dir():
         raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
     return sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in (".stl", ".obj", ".ply"))
+
+
+def _mesh_digest(folder: str) -> str:
+    """Of all mesh files and their names: a recording goes on with the same ones only."""
+    digest = hashlib.sha256()
+    for path in _mesh_files(folder):
+        digest.update(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()
 
 
 def _may_be(object_id: str, path: Path) -> bool:
