@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from retrieval import cli
+from robot.rig import load_rig
 from tests import synthetic
 
 ROOT = Path(__file__).parents[1]
@@ -52,6 +53,13 @@ def test_every_retrieve_command_of_the_readme_runs(home):
     assert {line[1] for line in found} == {"demo", "collect", "import", "check", "train", "build-index", "query"}
     for line in found:
         assert cli.main([*line[1:], *shorter.get(line[1], [])]) == 0, line
+
+
+def test_the_settings_in_the_readme_make_a_rig(tmp_path):
+    for number, block in enumerate(re.findall(r"```toml\n(.*?)```", README, flags=re.S)):
+        (tmp_path / f"{number}.toml").write_text(block)
+        rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)
+        assert len(rig.object_ids(1)) == 1
 
 
 def test_the_two_make_commands_exist_and_the_first_lines_name_them():
