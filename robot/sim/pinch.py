@@ -35,6 +35,8 @@ _REST_RAD = math.radians(0.2)
 """The object ends at most this far from the position towards which the jaws turn it."""
 
 _SQUEEZED = 0.2
+"""A soft object stands at this share of its width at least, as foam does that has no more room to give."""
+
 _DEEPEST_MM = 8.0
 """What lies further behind the first touch is out of a gel's reach."""
 
