@@ -43,7 +43,7 @@ SPLITS = 5
 DEGREES = (1, 2, 3, 4)
 THEIRS = "Taxim's shipped table (fitted on these presses)"
 PUBLISHED = "Taxim's table I (other objects, 400 x 400 crops, by hand aligned): L1 5.565, SSIM .882, PSNR 30.974"
-NOTES = "degree 4 of this project's notes (200 x 200 crops, gelsight, labels): L1 5.18, SSIM .966, PSNR 31.40"
+PROTOTYPE = "degree 4 of this project's prototype (200 x 200 crops, gelsight, labels): L1 5.18, SSIM .966, PSNR 31.40"
 SOURCE = (
     "fitted to the ball presses in the Python package taxim 1.4.1 (MIT licence, T. Schneider; Si & Yuan, RA-L 2022)"
 )
@@ -167,7 +167,7 @@ def table(presses: Presses, scores: dict[str, Scores]) -> str:
             for value, digits in zip(one.summary().values(), (2, 1, 3, 2), strict=True)
         ]
         lines.append(f"{name:54}" + "".join(f"{cell:>21}" for cell in cells))
-    return "\n".join([*lines, "", NOTES, PUBLISHED, ""])
+    return "\n".join([*lines, "", PROTOTYPE, PUBLISHED, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
