@@ -141,12 +141,11 @@ def _load_gate(path: Path | None) -> tuple[Any, str | None]:
     """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
     if path is None:
         return None, None
-    from hashlib import sha256
-
+    from retrieval.checkpoint import file_digest
     from retrieval.grasp_success import load_gate
 
     gate = load_gate(path)
-    return gate, f"learned, sha256 {sha256(path.read_bytes()).hexdigest()}"
+    return gate, f"learned, sha256 {file_digest(path)}"
 
 
 class _CollectBar:

@@ -20,6 +20,7 @@ from robot.devices import MAX_AGE_S, RGBD, Box, Pose
 from robot.errors import DeviceError, PlanError, RobotConfigError
 from robot.grasp import GraspPlan, GraspSettings, plan_grasp
 from robot.rig import Rig, check_seed
+from robot.storage import file_content
 
 OUTPUTS = ("depth", "before", "after")
 """What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
@@ -198,12 +199,15 @@ class Attempter:
     def _pictures(self, image: RGBD) -> dict[str, bytes]:
         pictures = {"photo": self._jpeg(image.colour)}
         if "depth" in self.settings.outputs and image.depth_m is not None:
-            pictures["depth"] = _encoded(".png", depth_in_mm(image.depth_m))
+            pictures["depth"], _ = file_content("depth", depth_in_mm(image.depth_m))
         return pictures
 
     def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
-        return _encoded(".jpg", np.ascontiguousarray(pixels[..., ::-1]), quality)
+        done, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), quality)
+        if not done:
+            raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as JPG")
+        return bytes(data.tobytes())
 
 
 def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
@@ -211,10 +215,3 @@ def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     depth = np.rint(depth_m.astype(np.float64) * 1000)
     known = np.isfinite(depth) & (depth > 0) & (depth < 65536)
     return np.where(known, depth, 0).astype(np.uint16)
-
-
-def _encoded(suffix: str, pixels: npt.NDArray[Any], options: list[int] | None = None) -> bytes:
-    done, data = cv2.imencode(suffix, pixels, options or [])
-    if not done:
-        raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as {suffix[1:].upper()}")
-    return bytes(data.tobytes())

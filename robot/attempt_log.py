@@ -6,20 +6,20 @@ error of the cylinder), else the reason. A line is written before its grasp is a
 at most the last line is half or has no grasp, and then it does not count.
 """
 
-import contextlib
 import json
 import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 from typing import Any, Self
 
 from robot.errors import RecordingError
 from robot.recorded_grasp import OUTCOMES
-from robot.recording import Recording
-from robot.storage import storage_errors
+from robot.recording import Recording, parse_object
+from robot.storage import append_line, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
 
@@ -43,7 +43,7 @@ class LoggedAttempt:
         return {key: value for key, value in vars(self).items() if value is not None}
 
     @classmethod
-    def from_row(cls, row: Any) -> Self:
+    def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Raises RecordingError for what `to_row` never writes."""
         try:
             attempt = cls(**row)
@@ -103,9 +103,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
 
 def _parsed(path: Path, number: int, line: bytes) -> LoggedAttempt:
     try:
-        return LoggedAttempt.from_row(json.loads(line))
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}, line {number}: must be JSON in UTF-8: {error}") from error
+        return LoggedAttempt.from_row(parse_object(line))
     except RecordingError as error:
         raise RecordingError(f"{path}, line {number}: {error}") from error
 
@@ -119,28 +117,20 @@ class AttemptLog:
         self.attempts = [attempt for attempt, _ in read]
         self._end = read[-1][1] if read else 0
         with storage_errors(folder):
-            self._descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT, 0o644)
-            os.ftruncate(self._descriptor, self._end)
+            descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+            self._file = FileIO(descriptor, "r+b")
+            self._file.truncate(self._end)
 
     def append(self, attempt: LoggedAttempt) -> None:
         """Write one line to the disk; whatever fails, no half of it stays. Raises StorageError."""
         data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode() + b"\n"
-        try:
-            with storage_errors(self.folder):
-                written = 0
-                while written < len(data):
-                    written += os.pwrite(self._descriptor, data[written:], self._end + written)
-                os.fsync(self._descriptor)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, self._end)
-            raise
-        self._end += len(data)
+        with storage_errors(self.folder):
+            self._end = append_line(self._file, self._end, data)
         self.attempts.append(attempt)
 
     def close(self) -> None:
-        """Let go of the file; once."""
-        os.close(self._descriptor)
+        """Let go of the file."""
+        self._file.close()
 
     def __enter__(self) -> Self:
         return self

@@ -138,15 +138,17 @@ def _heights(plane: Array, points: Array) -> Array:
     return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
 
 
-def find_thing(depth_mm: Depth, rays: Rays, region: Box | None = None) -> Thing:
+def find_thing(depth_mm: Depth, rays: Rays, table: Table, region: Box | None = None) -> Thing:
     """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
-    table = find_table(depth_mm, rays)
-    above = _above(depth_mm, rays, table)
+    above = height_above(depth_mm, rays, table)
     least = max(_LEAST_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
     raised = (above > least) & (above < MAX_HEIGHT_MM)
     if region is not None:
         raised &= _inside(depth_mm, rays, region)
-    patch = _largest(raised)
+    # Single pixels are outvoted.
+    patch = largest_patch(cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX), _LEAST_PX)
+    if patch is None:
+        raise PlanError("depth shows nothing on the table: the object is gone, transparent or out of the picture")
     rows, columns = (patch.mask & raised[patch.window]).nonzero()
     rows, columns = rows + patch.window[0].start, columns + patch.window[1].start
     points = rays.points(depth_mm, rows, columns)
@@ -158,7 +160,7 @@ def find_thing(depth_mm: Depth, rays: Rays, region: Box | None = None) -> Thing:
     return Thing(points, table, _missing(depth_mm[patch.window], patch.mask), patch.cut_off)
 
 
-def _above(depth_mm: Depth, rays: Rays, table: Table) -> Depth:
+def height_above(depth_mm: Depth, rays: Rays, table: Table) -> Depth:
     """(H, W) height above the table in mm, NaN where depth is unknown."""
     normal = np.array([-table.a, -table.b, 1.0])
     start = float(normal @ rays.pose[:3, 3]) - table.c
@@ -175,7 +177,7 @@ def _inside(depth_mm: Depth, rays: Rays, region: Box) -> Mask:
 
 
 @dataclass(frozen=True)
-class _Patch:
+class Patch:
     """Connected pixels: where in the picture, which of them there, and whether they touch its border."""
 
     window: tuple[slice, slice]
@@ -183,19 +185,18 @@ class _Patch:
     cut_off: bool
 
 
-def _largest(raised: Mask) -> _Patch:
-    """The largest connected part after single pixels have been outvoted. Raises PlanError."""
-    voted = cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(voted, connectivity=8)
+def largest_patch(candidates: npt.NDArray[np.uint8], least_px: int) -> Patch | None:
+    """The largest connected part of what is not 0; None where none has `least_px` pixels."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates, connectivity=8)
     sizes = stats[1:, cv2.CC_STAT_AREA]
-    if count < 2 or sizes.max() < _LEAST_PX:
-        raise PlanError("depth shows nothing on the table: the object is gone, transparent or out of the picture")
+    if count < 2 or sizes.max() < least_px:
+        return None
     best = 1 + int(sizes.argmax())
     left, top, width, height = (int(value) for value in stats[best, :4])
     window = slice(top, top + height), slice(left, left + width)
-    rows, columns = raised.shape
+    rows, columns = candidates.shape
     cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
-    return _Patch(window, labels[window] == best, cut_off)
+    return Patch(window, labels[window] == best, cut_off)
 
 
 def _missing(depth_mm: Depth, mask: Mask) -> float:

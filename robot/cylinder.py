@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.cloud import Rays, Thing, find_table, find_thing
+from robot.cloud import Depth, Rays, Table, Thing, find_table, find_thing
 from robot.devices import RGBD, Box
 from robot.errors import PlanError
 from robot.silhouette import fit_silhouette
@@ -98,21 +98,21 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = No
         raise PlanError("a cylinder needs a picture with depth; read the camera with depth=True")
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
     rays = Rays.of(image, np.asarray(extrinsics, np.float64))
+    table = find_table(depth, rays)
     try:
-        thing = find_thing(depth, rays, region)
+        thing = find_thing(depth, rays, table, region)
     except PlanError:
-        return _from_colour(image, depth, rays, region)
+        return _from_colour(image, depth, rays, table, region)
     if thing.missing > _MUCH_MISSING:
         try:
-            return _from_colour(image, depth, rays, region)
+            return _from_colour(image, depth, rays, table, region)
         except PlanError:
             pass  # what depth there is has to do
     return _fit(thing, rays)
 
 
-def _from_colour(image: RGBD, depth_mm: npt.NDArray[np.float32], rays: Rays, region: Box | None) -> CylinderFit:
+def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: Table, region: Box | None) -> CylinderFit:
     """See robot.silhouette."""
-    table = find_table(depth_mm, rays)
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
     return CylinderFit(
         found.x_mm,

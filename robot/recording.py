@@ -15,7 +15,6 @@ recorded is left out. The folder opens as it is with Hugging Face datasets ("ima
 A line is written when its images are on the disk: a crash leaves whole grasps; half a last line is dropped.
 """
 
-import contextlib
 import fcntl
 import json
 import os
@@ -28,7 +27,7 @@ from typing import Any, NoReturn, Self
 from robot.errors import RecordingError
 from robot.recorded_grasp import RecordedGrasp as RecordedGrasp
 from robot.recorded_grasp import check_name, unknown_keys
-from robot.storage import PART, ImageSource, file_content, storage_errors, sync_folder, write_file
+from robot.storage import PART, ImageSource, append_line, file_content, storage_errors, sync_folder, write_file
 
 SCHEMA_VERSION = 1
 KNOWN_VERSIONS = (1,)
@@ -74,7 +73,7 @@ def read_recording(folder: str | Path) -> Recording:
         if not line.strip():
             continue
         try:
-            row = _parse_object(line)
+            row = parse_object(line)
             grasp = RecordedGrasp.from_row(row)
             if grasp.grasp_id in grasps:
                 raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
@@ -94,7 +93,7 @@ def read_info(root: Path) -> dict[str, Any]:
     if not path.is_file():
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
     try:
-        info = _parse_object(_read(path))
+        info = parse_object(_read(path))
         _check_info(info)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
@@ -127,7 +126,8 @@ def _whole_lines(data: bytes) -> tuple[list[bytes], bytes]:
     return [*lines, last], b""
 
 
-def _parse_object(text: bytes) -> dict[str, Any]:
+def parse_object(text: bytes) -> dict[str, Any]:
+    """The JSON object of a line or file. Raises RecordingError for anything else, NaN and infinity too."""
     try:
         value = json.loads(text.decode(), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -225,17 +225,7 @@ class RecordingWriter:
 
     def _write_line(self, line: bytes) -> None:
         """Write after the last whole line and sync; whatever fails, no half of it stays."""
-        rest = line + b"\n"
-        try:
-            self._file.seek(self._end)
-            while rest:
-                rest = rest[self._file.write(rest) :]
-            os.fsync(self._file.fileno())
-        except BaseException:
-            with contextlib.suppress(OSError, ValueError):
-                self._file.truncate(self._end)
-            raise
-        self._end += len(line) + 1
+        self._end = append_line(self._file, self._end, line + b"\n")
 
     def close(self) -> None:
         """Let go of the folder; a second call does nothing."""

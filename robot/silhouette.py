@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.cloud import Array, Depth, Mask, Rays, Table
+from robot.cloud import Array, Depth, Mask, Patch, Rays, Table, height_above, largest_patch
 from robot.devices import Box
 from robot.errors import PlanError
 
@@ -38,15 +38,15 @@ def fit_silhouette(
     colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table, region: Box | None = None
 ) -> Outline:
     """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
-    rows, columns = np.nonzero(_patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm)))
+    patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
+    rows, columns = (at + part.start for at, part in zip(patch.mask.nonzero(), patch.window, strict=True))
     directions = rays.points(np.ones(depth_mm.shape, np.float32), rows, columns) - rays.pose[:3, 3]
     return _cylinder(directions, rows, rays.pose[:3, 3] - [0.0, 0.0, table.c], region)
 
 
 def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table) -> Mask:
     """Pixels whose colour is far from that of the pixels that depth puts on the table."""
-    above = depth_mm * rays.along(np.array([-table.a, -table.b, 1.0])) + np.float32(rays.pose[2, 3] - table.c)
-    flat = np.abs(above) < max(5.0, 3 * table.noise_mm)
+    flat = np.abs(height_above(depth_mm, rays, table)) < max(5.0, 3 * table.noise_mm)
     if flat.sum() < 100:
         raise PlanError("neither depth nor colour shows the table; look at camera and light")
     smooth = cv2.GaussianBlur(colour, (5, 5), 0).astype(np.float32)
@@ -55,19 +55,17 @@ def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays
     return np.asarray((np.abs(smooth - middle) > np.maximum(_COLOUR_LEVELS, 5 * spread)).any(2))
 
 
-def _patch(candidates: Mask) -> Mask:
+def _patch(candidates: Mask) -> Patch:
     """The largest connected patch, small gaps closed and single pixels left out."""
     kernel = np.ones((5, 5), np.uint8)
     closed = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    sizes = stats[1:, cv2.CC_STAT_AREA]
-    if count < 2 or sizes.max() < _LEAST_PX:
+    patch = largest_patch(opened, _LEAST_PX)
+    if patch is None:
         raise PlanError("nothing stands on the table, by depth and by colour; put the object there, or light it better")
-    left, top, width, height = (int(value) for value in stats[1 + sizes.argmax(), :4])
-    if left <= 1 or top <= 1 or left + width >= labels.shape[1] - 1 or top + height >= labels.shape[0] - 1:
+    if patch.cut_off:
         raise PlanError("depth shows nothing, and the outline touches the border of the picture")
-    return np.asarray(labels == 1 + sizes.argmax())
+    return patch
 
 
 def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Box | None) -> Outline:

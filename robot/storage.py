@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,21 @@ def write_file(path: Path, data: bytes) -> None:
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def append_line(file: FileIO, end: int, line: bytes) -> int:
+    """Write `line` at offset `end` and sync it; returns the new end. Whatever fails, no half of the line stays."""
+    rest = line
+    try:
+        file.seek(end)
+        while rest:
+            rest = rest[file.write(rest) :]
+        os.fsync(file.fileno())
+    except BaseException:
+        with contextlib.suppress(OSError, ValueError):
+            file.truncate(end)
+        raise
+    return end + len(line)
 
 
 def sync_folder(folder: Path) -> None:

@@ -15,6 +15,7 @@ from robot.attempt_log import (
 from robot.errors import RecordingError, StorageError
 from robot.recording import RecordingWriter, read_recording
 from tests.test_robot_recording import INFO, pictures
+from tests.test_robot_recording_crash import FullDisk
 
 HELD = LoggedAttempt("mug", 0, "held", True, 12.5, "mug-0000", 0.75, {"method": "circle", "error_mm": 0.3})
 NO_PLAN = LoggedAttempt("mug", 1, "no_plan", False, 13.0, reason="the object is wider than the stroke")
@@ -117,23 +118,15 @@ def test_an_attempt_that_is_there_twice_is_damage(tmp_path):
         read_attempts(tmp_path, GRASPS)
 
 
-def test_a_full_disk_leaves_whole_lines(tmp_path, monkeypatch):
-    import os
-
+def test_a_full_disk_leaves_whole_lines(tmp_path):
     path = write(tmp_path, ALL[:2])
-    whole, real = path.read_bytes(), os.pwrite
+    whole = path.read_bytes()
     with AttemptLog(tmp_path, GRASPS) as log:
-
-        def full(descriptor, data, offset):
-            if offset > len(whole):
-                raise OSError(28, "No space left on device")
-            return real(descriptor, data[:7], offset)
-
-        monkeypatch.setattr(os, "pwrite", full)
+        file, log._file = log._file, FullDisk(log._file, 7)
         with pytest.raises(StorageError, match="No space left on device"):
             log.append(MISSED)
         assert path.read_bytes() == whole
-        monkeypatch.undo()
+        log._file = file
         log.append(MISSED)
     assert read_attempts(tmp_path, GRASPS) == list(ALL[:3])
 

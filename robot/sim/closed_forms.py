@@ -15,6 +15,7 @@ from robot.sim.kernels import Floats
 
 HALF_SPACE = Layer(0.26 * (1.0 - 0.48**2), 0.48)  # E* = .26 MPa
 FIELD_MM = (14.4, 19.2)
+BALL_MM = 4.0
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,13 @@ def hertz(force_n: float, radius_mm: float, modulus_mpa: float) -> tuple[float, 
     return a, a * a / radius_mm, 1.5 * force_n / (math.pi * a * a)
 
 
-def pressed_ball(grid: Grid, layer: Layer, force_n: float, tolerance: float, *, radius_mm: float = 4.0) -> Contact:
-    """A paraboloid pressed into the middle of the field."""
-    gap = grid.radius() ** 2 / (2.0 * radius_mm)
-    return press(gap, grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance)
+def pressed_ball(grid: Grid, layer: Layer, force_n: float, tolerance: float, padded: bool = True) -> Contact:
+    """A paraboloid of BALL_MM pressed into the middle of the field."""
+    return press(_ball(grid), grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance, padded=padded)
+
+
+def _ball(grid: Grid) -> Floats:
+    return np.asarray(grid.radius() ** 2 / (2.0 * BALL_MM))
 
 
 # Rows, force, and the limits: depth %, peak pressure %, pressure in L2 %. (The prototype's first L2 was 7.4; ours is
@@ -111,7 +115,7 @@ def _hertz() -> Iterator[Check]:
     for rows, force, depth_limit, peak_limit, pressure_limit in _HERTZ:
         grid = Grid.of_field(rows)
         contact = pressed_ball(grid, HALF_SPACE, force, 1e-6)
-        a, depth, peak = hertz(force, 4.0, HALF_SPACE.plane_modulus_mpa)
+        a, depth, peak = hertz(force, BALL_MM, HALF_SPACE.plane_modulus_mpa)
         exact = peak * np.sqrt(np.maximum(1.0 - (grid.radius() / a) ** 2, 0.0))
         difference = np.linalg.norm(contact.pressure_mpa - exact) / np.linalg.norm(exact)
         case = f"Hertz, {force:g} N"
@@ -221,7 +225,7 @@ def _identities() -> Iterator[Check]:
         contact = pressed_ball(grid, layer, 0.5, 1e-8)
         yield Check(name, "dU/dd = F", str(grid), percent(_work_slope(grid, layer, contact), contact.force_n), 2e-3)
         yield Check(name, "sum p dA = F", str(grid), percent(contact.force_n, 0.5), 1e-9)
-        gap = contact.displacement_mm + grid.radius() ** 2 / 8.0 - contact.approach_mm
+        gap = contact.displacement_mm + _ball(grid) - contact.approach_mm
         touching = contact.pressure_mpa > 0.0
         worst = max(float(np.abs(gap[touching]).max()), float(-gap.min())) / contact.approach_mm
         yield Check(name, "contact conditions, of depth", str(grid), 100.0 * worst, 1e-4)
@@ -230,7 +234,7 @@ def _identities() -> Iterator[Check]:
 def _work_slope(grid: Grid, layer: Layer, contact: Contact) -> float:
     """dU/dd by central differences; U = 1/2 sum p u dA."""
     step = 1e-3 * contact.approach_mm
-    gap = grid.radius() ** 2 / 8.0
+    gap = _ball(grid)
     works = []
     for depth in (contact.approach_mm + step, contact.approach_mm - step):
         nearby = press(gap, grid.pixel_mm, layer, depth_mm=depth, tolerance=1e-8)

@@ -9,15 +9,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from robot.sim.closed_forms import HALF_SPACE, Grid, hertz, percent
+from robot.sim.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
 from robot.sim.closed_forms import closed_form_table as closed_form_table
 from robot.sim.closing import Jaws, LinearLaw, Motion, close
-from robot.sim.contact import Contact, Layer, press
+from robot.sim.contact import Layer
 from robot.sim.hard_cases import stability_sweep as stability_sweep
 from robot.sim.kernels import Floats
 
 LAYER = Layer(HALF_SPACE.modulus_mpa, 0.48, 2.0)
-_BALL_MM = 4.0
 T = TypeVar("T")
 
 
@@ -61,33 +60,28 @@ def contact_points(
 
 
 def _hertz_points(rows: tuple[int, ...], tolerances: tuple[float, ...], force_n: float = 0.5) -> Iterator[Point]:
-    depth = hertz(force_n, _BALL_MM, HALF_SPACE.plane_modulus_mpa)[1]
+    depth = hertz(force_n, BALL_MM, HALF_SPACE.plane_modulus_mpa)[1]
     for grid in map(Grid.of_field, rows):
         for tolerance in tolerances:
-            seconds, contact = timed(partial(_ball, grid, HALF_SPACE, force_n, tolerance))
+            seconds, contact = timed(partial(pressed_ball, grid, HALF_SPACE, force_n, tolerance))
             error = percent(contact.approach_mm, depth)
             setting = f"{grid}, tolerance {tolerance:g}"
             yield Point("contact grid and tolerance, half-space", setting, seconds, error, "% of depth", "Hertz")
 
 
 def _layer_points(rows: tuple[int, ...], tolerances: tuple[float, ...], reference_rows: int) -> Iterator[Point]:
-    fine = _ball(Grid.of_field(reference_rows), LAYER, 1.0, 1e-6)
+    fine = pressed_ball(Grid.of_field(reference_rows), LAYER, 1.0, 1e-6)
     reference = f"{Grid.of_field(reference_rows)}, tolerance 1e-06"
     for grid in map(Grid.of_field, rows):
         exact = _at_centres(fine.displacement_mm, reference_rows // grid.rows)
         for padded in (False, True):
             for tolerance in tolerances:
-                seconds, contact = timed(partial(_ball, grid, LAYER, 1.0, tolerance, padded))
+                seconds, contact = timed(partial(pressed_ball, grid, LAYER, 1.0, tolerance, padded))
                 error = 1e3 * math.sqrt(float(np.mean((contact.displacement_mm - exact) ** 2)))
                 setting = f"{grid}, tolerance {tolerance:g}, {'padded' if padded else 'periodic'}"
                 yield Point(
                     "contact grid and tolerance, layer", setting, seconds, error, "um rms of surface", reference
                 )
-
-
-def _ball(grid: Grid, layer: Layer, force_n: float, tolerance: float, padded: bool = True) -> Contact:
-    gap = grid.radius() ** 2 / (2.0 * _BALL_MM)
-    return press(gap, grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance, padded=padded)
 
 
 def _at_centres(fine: Floats, factor: int) -> Floats:

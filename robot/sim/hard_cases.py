@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from robot.sim.closed_forms import hertz
 from robot.sim.closing import Jaws, LinearLaw, Motion, close, settle
 from robot.sim.contact import Contact, Layer, press
 from robot.sim.kernels import Floats, Operator, influence, layer_compliance, layer_symbol, love_patch
@@ -166,7 +167,7 @@ def _pin_in_a_plate() -> HardCase:
 def _wrap_around() -> HardCase:
     """A half-space's influence falls like 1/r: a periodic grid feels its neighbours."""
     layer, gap, force = Layer(0.75, 0.5), _squares() / 200.0, 1.0
-    depth = (0.75 * force * math.sqrt(1.0 / 100.0) / 1.0) ** (2.0 / 3.0)
+    depth = hertz(force, 100.0, layer.plane_modulus_mpa)[1]
     errors = [
         press(gap, 1.0, layer, force_n=force, padded=padded).approach_mm / depth - 1.0 for padded in (False, True)
     ]
@@ -196,12 +197,12 @@ def _every_scale() -> HardCase:
     wrong, count, flagged = 0, 0, 0
     scales = itertools.product(10.0 ** np.arange(-3, 7, 3), 10.0 ** np.arange(-6, 5, 2), 10.0 ** np.arange(-3, 7, 3))
     for modulus, force, radius in scales:
-        a = (0.75 * force * radius / modulus) ** (1.0 / 3.0)
+        a, depth, _ = hertz(force, radius, modulus)
         for pixel in (0.1, a / 8.0):
             gap = (pixel * pixel / radius / 2.0) * _squares()
             contact = press(gap, pixel, Layer(modulus * 0.75, 0.5), force_n=force)
             trusted = not {"unresolved", "at_border"} & set(contact.flags)
-            exact = math.isclose(contact.approach_mm, a * a / radius, rel_tol=0.05)
+            exact = math.isclose(contact.approach_mm, depth, rel_tol=0.05)
             count, flagged = count + 1, flagged + (not trusted)
             wrong += not _solved(contact, force) or (trusted and not exact)
     wanted = "converged; depth within 5 % of Hertz or flagged"

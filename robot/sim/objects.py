@@ -19,7 +19,7 @@ from robot.sim.materials import Material, draw_material
 from robot.sim.relief import RELIEFS, Relief, draw_relief
 from robot.sim.shapes import SHAPES
 
-STROKE_MM = 110.0
+STROKE_MM = 110.0  # of the simulated gripper, into which every object fits
 SHELL_MM = 3.0
 HEAVY_KG = 0.6
 # Streams of random numbers; a new purpose takes a new number, and no other object changes.

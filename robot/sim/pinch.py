@@ -19,7 +19,7 @@ from robot.errors import SceneError
 from robot.sim.camera import Placement
 from robot.sim.contact import Contact, press
 from robot.sim.gel import GelSensor
-from robot.sim.objects import SimObject
+from robot.sim.objects import STROKE_MM, SimObject
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -54,7 +54,7 @@ class Hand:
     `grid` and `tolerance` are those of the contact solver: what they cost in error is measured by `frontier`.
     """
 
-    stroke_mm: float = 110.0
+    stroke_mm: float = STROKE_MM
     safety: float = 1.5
     grid: tuple[int, int] = (120, 160)
     tolerance: float = 1e-2

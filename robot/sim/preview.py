@@ -12,7 +12,7 @@ from robot.errors import RecordingError
 from robot.recording import RecordedGrasp, read_recording
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import storage_errors, write_file
+from robot.storage import file_content, storage_errors, write_file
 
 Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
@@ -31,7 +31,7 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     rig = _rig(recording.folder, recording.info)
     chosen = _one_each(recording.grasps, rows)
     sheet = np.vstack([_header(tuple(rig.sensors)), *(_row(recording.folder, grasp, rig) for grasp in chosen)])
-    data = cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
+    data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         write_file(Path(out), data)

@@ -20,14 +20,14 @@ from robot.rig import Rig, check_seed
 from robot.sim.camera import Camera, Placement
 from robot.sim.gel import draw_sensor
 from robot.sim.gel_marks import Markers
-from robot.sim.objects import SimObject, draw_object
+from robot.sim.objects import STROKE_MM, SimObject, draw_object
 from robot.sim.pinch import PAD_MM, SIDES, Hand
 from robot.sim.scene import Grip, Scene
 from robot.sim.shapes import SHAPES
 
 Array = npt.NDArray[np.float64]
-STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
-"""Of the Weiss WSG-50 that is simulated: distance of the jaws, and its clamping force."""
+FORCE_N = (5.0, 80.0)
+"""Clamping force of the Weiss WSG-50 that is simulated."""
 
 _ATTEMPT_S = 40.0
 _MOST_OBJECTS = 100_000
@@ -106,20 +106,21 @@ class SimRig(Rig):
             raise RobotConfigError(f"gels must be from 1 to 1000 pairs, got {gels}")
         self._seed, self._families, self._meshes = seed, tuple(sorted(families)), meshes
         self._shadow = shadow
-        self._hand = Hand(STROKE_MM, grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
+        self._hand = Hand(grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
         dots = Markers() if markers else None
         self._gels = [
             {finger: replace(draw_sensor(int(pair), finger, optics=optics), markers=dots) for finger in fingers}
             for pair in drawn
         ]
+        self._camera = Camera()
         clock = SimClock()
         self.world = World(clock)
         super().__init__(
             SimArm(self.world),
             SimGripper(self.world),
             {finger: SimTactileSensor(self.world, finger) for finger in fingers},
-            SimCamera(self.world, Camera(), _calibration_error(seed, localisation_mm)),
+            SimCamera(self.world, self._camera, _calibration_error(seed, localisation_mm)),
             info={
                 "source": "simulated rig",
                 "sensor": f"simulated GelSight ({optics} optics)",
@@ -147,6 +148,7 @@ class SimRig(Rig):
         self.world.scene = Scene(
             obj,
             placement,
+            self._camera,
             sensors=self._gels[name % len(self._gels)],
             hand=self._hand,
             seed=int(rng.integers(2**31)),

@@ -22,7 +22,7 @@ from robot.errors import SceneError
 from robot.sim import camera as cameras
 from robot.sim.camera import Camera, Lighting, Placement
 from robot.sim.gel import GelSensor
-from robot.sim.objects import SimObject
+from robot.sim.objects import STROKE_MM, SimObject
 from robot.sim.pinch import SIDES, Hand, Pinch
 
 _TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
@@ -35,7 +35,7 @@ class Grip:
 
     pose: Pose
     force_n: float
-    opening_mm: float = 110.0
+    opening_mm: float = STROKE_MM
 
 
 @dataclass(frozen=True, eq=False)
