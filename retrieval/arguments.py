@@ -23,6 +23,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_build_index(commands)
     _add_query(commands)
+    _add_evaluate(commands)
     return parser
 
 
@@ -120,3 +121,28 @@ def _add_query(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--html", type=Path, help="write a page with photos and gel images")
     parser.add_argument("--no-verify", action="store_true", help="skip the checksums of a huge index")
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "evaluate",
+        "Compare methods on objects they never saw; goes on where it was stopped. Writes a report.",
+    )
+    parser.add_argument("recording", type=Path, help="recording folder")
+    parser.add_argument("--out", type=Path, required=True, help="folder for results.json, report.md and report.html")
+    parser.add_argument("--methods", help="methods to compare, with commas between (default: all)")
+    parser.add_argument(
+        "--preset",
+        dest="config",
+        metavar="PRESET",
+        help="preset (tiny, small, mobilenet, paper) or TOML file (default: small)",
+    )
+    parser.add_argument("--model", type=Path, help="checkpoint to judge, instead of one fitted here")
+    parser.add_argument("--init", help="first weights of the towers: random, imagenet, or a state dict file")
+    parser.add_argument("--iterations", type=int, help="optimiser steps, instead of the preset's")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each method (default: 1)")
+    parser.add_argument("--seed", type=int, help="seed of split, queries and first training, instead of the preset's")
+    parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects")
+    parser.add_argument("--cache", type=Path, help="folder where features of images are kept (default: OUT/features)")
+    parser.add_argument("--json", action="store_true", help="print the results as one JSON document")

@@ -1,6 +1,8 @@
 """From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
 
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -57,6 +59,10 @@ class BatchImages:
             )
         return [self._touch(*pair) for pair in zip(grasp.touches, grasp.backgrounds, strict=True)]
 
+    def files(self, grasp: Grasp) -> tuple[Path, ...]:
+        """What the finger images of a grasp are read from."""
+        return grasp.touches + (grasp.backgrounds if self.uses_background else ())
+
     def photo(self, path: Path) -> Image:
         """A photo, preprocessed."""
         return self._photo(path)
@@ -75,6 +81,10 @@ class TrainedFeatures(BatchImages):
         touches = touch_batch(list(self._threads.map(self.touch, grasps)), self.device)
         return Loaded(batch, touches, to_batch(list(self._threads.map(self.photo, photos)), self.device))
 
+    def stepping(self) -> AbstractContextManager[None]:
+        """What a step is computed in: towers use every core."""
+        return nullcontext()
+
     def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
         """Pass each distinct image through its tower once."""
         with autocast(self.device, self.config.training.precision):
@@ -90,15 +100,24 @@ class TrainedFeatures(BatchImages):
 
 
 class FrozenFeatures(BatchImages):
-    """Features of towers that stand still: each image is encoded the first time it is met, and never again."""
+    """Features of towers that stand still: each image is encoded the first time it is met, and never again.
 
-    def __init__(self, config: Config, device: torch.device) -> None:
+    known: features by grasp id (of the touch) and by photo file that need no encoding (`retrieval.features.by_image`).
+    """
+
+    def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
         super().__init__(config, device, keep_bytes=0)  # an image is read once: its features are kept
-        self._kept: dict[str | Path, Tensor] = {}
+        self._kept: dict[str | Path, Tensor] = dict(known)
 
     def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
-        """Look up the features of a batch, encoding what is new."""
-        return self._ahead.submit(self._look_up, matcher, batch)
+        """Look up the features of a batch, encoding what is new; done when this returns.
+
+        Not on the thread ahead: PyTorch gives every thread that calls it a team of workers of its own, and two teams
+        on the same cores spend a hundred times a step's arithmetic waiting for each other.
+        """
+        done: Future[Loaded] = Future()
+        done.set_result(self._look_up(matcher, batch))
+        return done
 
     @torch.inference_mode()
     def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
@@ -111,6 +130,10 @@ class FrozenFeatures(BatchImages):
         touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
         return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
 
+    def stepping(self) -> AbstractContextManager[None]:
+        """What a step is computed in: the head's few small products gain nothing from a second core."""
+        return one_thread()
+
     def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
         """The features, as constants of the step."""
         return loaded.touches.clone(), loaded.photos.clone()
@@ -119,6 +142,18 @@ class FrozenFeatures(BatchImages):
         """The features of all pairs at once."""
         loaded = self.prepare(matcher, pairs).result()
         return loaded.touches, loaded.photos
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """PyTorch computes on the calling thread alone. Its workers wait for each other many times a step, and where one
+    finds its core taken by another program all the others spin: milliseconds become hundreds."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from retrieval.dataset import Split
     from robot.collect import Progress
 
+DEFAULT_PRESET = "small"
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
@@ -250,7 +252,7 @@ def _train_gate(arguments: argparse.Namespace) -> None:
 def _training_config(arguments: argparse.Namespace) -> "Config":
     from retrieval.config import load_config
 
-    config = load_config(arguments.config or "small")
+    config = load_config(arguments.config or DEFAULT_PRESET)
     given = {name: getattr(arguments, name) for name in ("init", "iterations", "seed")}
     changed = {name: value for name, value in given.items() if value is not None}
     return dataclasses.replace(config, training=dataclasses.replace(config.training, **changed))
@@ -322,6 +324,35 @@ def run_query(arguments: argparse.Namespace) -> None:
         _say("no photo is above the reject threshold: the object may not be in the catalogue")
 
 
+def run_evaluate(arguments: argparse.Namespace) -> None:
+    """`retrieve evaluate`."""
+    from retrieval.evaluation.run import evaluate
+    from retrieval.methods import METHODS
+    from retrieval.report import write_report
+
+    if arguments.model and (arguments.config or arguments.init):
+        raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
+    try:
+        results = evaluate(
+            arguments.recording,
+            arguments.out,
+            config=_training_config(arguments),
+            preset="of the model" if arguments.model else Path(arguments.config or DEFAULT_PRESET).stem,
+            methods=arguments.methods.split(",") if arguments.methods else tuple(METHODS),
+            model=arguments.model,
+            seeds=arguments.seeds,
+            split=_read_split(arguments.split),
+            cache=arguments.cache,
+        )
+    except KeyboardInterrupt:
+        _say(f"what was made is kept in {arguments.out}; the same command goes on with it")
+        raise
+    text, page, *_ = write_report(arguments.out, arguments.recording)
+    _say(f"report: {text}, {page}")
+    if arguments.json:
+        _print_json(results)
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "demo": run_demo,
     "collect": run_collect,
@@ -330,6 +361,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "train": run_train,
     "build-index": run_build_index,
     "query": run_query,
+    "evaluate": run_evaluate,
 }
 
 

@@ -46,7 +46,10 @@ class TrainingConfig:
 
     init: "random", "imagenet" or the path of a state dict. iterations: optimiser steps. touches_per_batch times
     (positives_per_touch + negatives_per_touch) pairs make a batch. contrastive_weight: weight of the contrastive
-    term; 0 is exactly the paper's loss, and leaves the embeddings untrained. freeze_batch_norm: keep the batch
+    term; 0 is exactly the paper's loss, and leaves the embeddings untrained. listwise_weight: weight of a term that
+    asks each touch of a batch to pick its object's photos by match logit out of all photos of the batch; 0 in the
+    paper. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way round would; not in
+    the paper. freeze_batch_norm: keep the batch
     statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
     encoded once for the whole training. validation_fraction, test_fraction: shares of the objects.
     """
@@ -59,6 +62,8 @@ class TrainingConfig:
     learning_rate: float = 1e-4
     schedule: str = "constant"
     contrastive_weight: float = 0.0
+    listwise_weight: float = 0.0
+    shuffle_fingers: bool = False
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
     validation_fraction: float = 0.1
@@ -77,10 +82,9 @@ class TrainingConfig:
         ):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
         _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
-        _require(
-            0 <= self.contrastive_weight < math.inf,
-            f"contrastive_weight must be a number from 0; got {self.contrastive_weight}",
-        )
+        for name in ("contrastive_weight", "listwise_weight"):
+            weight = getattr(self, name)
+            _require(0 <= weight < math.inf, f"{name} must be a number from 0; got {weight}")
         _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
         for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
             value = getattr(self, name)

@@ -1,4 +1,4 @@
-"""The two terms of the training loss, on logits and in float32."""
+"""Losses on logits and unit embeddings, in float32 whatever comes in."""
 
 import math
 
@@ -8,6 +8,8 @@ from torch.nn import functional
 
 LOG_SCALE_INIT = math.log(1 / 0.07)
 LOG_SCALE_MAX = math.log(100.0)
+# Where the sigmoid loss starts: with most pairs negative, a bias of 0 would begin far from their log-odds.
+SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT = math.log(10.0), -10.0
 
 
 def match_loss(logits: Tensor, labels: Tensor) -> Tensor:
@@ -29,8 +31,13 @@ def contrastive_loss(
     Zero where no touch has both a positive and a negative.
     """
     scores = log_scale.float().exp() * touch.float() @ photo.float().T
+    return listwise_loss(scores, touch_objects, photo_objects)
+
+
+def listwise_loss(scores: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
+    """The same for any scores (T, N) of touches with photos, such as match logits: it asks for order alone."""
     same = touch_objects[:, None] == photo_objects[None, :]
-    return (_pick_loss(scores, same) + _pick_loss(scores.T, same.T)) / 2
+    return (_pick_loss(scores.float(), same) + _pick_loss(scores.float().T, same.T)) / 2
 
 
 def _pick_loss(scores: Tensor, same: Tensor) -> Tensor:
@@ -42,3 +49,17 @@ def _pick_loss(scores: Tensor, same: Tensor) -> Tensor:
     per_row = torch.where(usable, losses, 0.0).sum(1) / usable.sum(1).clamp(min=1)
     rows = usable.any(1)
     return per_row.sum() / rows.sum().clamp(min=1)
+
+
+def sigmoid_loss(
+    touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor, log_scale: Tensor, bias: Tensor
+) -> Tensor:
+    """Binary cross-entropy of every touch with every photo, summed over the photos of a touch, mean over touches.
+
+    Zhai et al., ICCV 2023 (SigLIP), eq. in section 3.2, with logits `exp(log_scale) * cosine + bias`, and every photo
+    of the touch's object a positive. touch (T, d) and photo (N, d) are unit embeddings, `*_objects` integer labels.
+    """
+    logits = log_scale.float().exp() * touch.float() @ photo.float().T + bias.float()
+    same = touch_objects[:, None] == photo_objects[None, :]
+    # softplus(-z) is -log sigmoid(z) without overflow.
+    return functional.softplus(torch.where(same, -logits, logits)).sum(1).mean()

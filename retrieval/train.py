@@ -47,8 +47,9 @@ from retrieval.dataset import (
 )
 from retrieval.encode import default_device
 from retrieval.errors import CheckpointError, Interrupted, NumericalError
+from retrieval.features import Features, by_image
 from retrieval.fusion import Matcher
-from retrieval.losses import contrastive_loss, match_loss
+from retrieval.losses import contrastive_loss, listwise_loss, match_loss
 from retrieval.progress import Bar
 from retrieval.towers.weights import initialise_tower
 
@@ -106,18 +107,30 @@ class StepResult:
 class Trainer:
     """The state of one training run."""
 
-    def __init__(self, config: Config, split: Split, grasps: list[Grasp], out: Path, source: str) -> None:
+    def __init__(
+        self,
+        config: Config,
+        split: Split,
+        grasps: list[Grasp],
+        out: Path,
+        source: str,
+        known: Features | None = None,
+    ) -> None:
+        """known: features of all these grasps, for frozen towers; then they are the data, and no image is read."""
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
-        self.data_digest = data_digest(grasps)
+        self.data_digest = known.digest if known else data_digest(grasps)
         self.device = default_device()
         torch.manual_seed(settings.seed)
         self.matcher = build_matcher(config).to(self.device)
-        self.optimizer = torch.optim.Adam(self.matcher.parameters(), lr=settings.learning_rate)
+        trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
+        # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
+        self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
         self.sampler = self._sampler("train", grasps)
         self.validation = self._sampler("validation", grasps).every_touch() if split.validation else None
-        features = FrozenFeatures if settings.freeze_towers else TrainedFeatures
-        self.features: FeatureSource = features(config, self.device)
+        self.features: FeatureSource = TrainedFeatures(config, self.device)
+        if settings.freeze_towers:
+            self.features = FrozenFeatures(config, self.device, by_image(grasps, known, self.device) if known else {})
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
 
@@ -144,7 +157,8 @@ class Trainer:
             while upcoming is not None:
                 loaded = upcoming.result()
                 upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
-                result = self.train_step(loaded)
+                with self.features.stepping():
+                    result = self.train_step(loaded)
                 bar.advance(note=f"loss {result.loss:.3f}  accuracy {result.accuracy:.2f}{self._best_note()}")
                 # All ranks stop after the same step: one that went on would wait for the others for ever.
                 stopped = distributed.any_rank(stop.is_set(), self.device)
@@ -165,12 +179,13 @@ class Trainer:
     def train_step(self, loaded: Loaded) -> StepResult:
         """One optimiser step on a prepared batch."""
         settings, batch = self.config.training, loaded.batch
-        set_training_mode(self.matcher, settings)
         torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
         self._set_learning_rate()
         self.optimizer.zero_grad(set_to_none=True)
-        features = self.features.train_features(self.matcher, loaded)
-        loss, logits = batch_loss(self.matcher, settings, batch, *features)
+        touch, photo = self.features.train_features(self.matcher, loaded)
+        if settings.shuffle_fingers:
+            touch = shuffle_fingers(touch, self.matcher.config.fingers)
+        loss, logits = batch_loss(self.matcher, settings, batch, touch, photo)
         if not math.isfinite(loss.item()):
             raise NumericalError(f"the loss must stay finite; step {self.step} gave {loss.item()}; lower learning_rate")
         loss.backward()  # type: ignore[no-untyped-call]
@@ -210,6 +225,7 @@ class Trainer:
         if self.validation is None:
             return {}, None
         logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
+        set_training_mode(self.matcher, self.config.training)
         calibration = fit_calibration(logits, labels)
         metrics = {
             "validation_auc": pair_auc(logits, labels),
@@ -243,7 +259,9 @@ class Trainer:
         }
 
     def _save_state(self) -> None:
-        tensors = {f"model.{name}": tensor.cpu().contiguous() for name, tensor in self.matcher.state_dict().items()}
+        frozen = FROZEN if self.config.training.freeze_towers else ()  # these stand in the checkpoint beside it
+        state = {name: tensor for name, tensor in self.matcher.state_dict().items() if not name.startswith(frozen)}
+        tensors = {f"model.{name}": tensor.cpu().contiguous() for name, tensor in state.items()}
         for name, parameter in self.matcher.named_parameters():
             for key, value in self.optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{name}.{key}"] = value.cpu().contiguous()
@@ -260,8 +278,8 @@ class Trainer:
                     f"{path} was made with another {name.replace('_', ' ')}; resume with the same recording and "
                     "configuration, or delete the file to start afresh"
                 )
-        self._require_own_checkpoint()
-        self.matcher.load_state_dict({name: tensors[f"model.{name}"] for name in self.matcher.state_dict()})
+        kept = self._own_checkpoint().matcher.state_dict()
+        self.matcher.load_state_dict({name: tensors.get(f"model.{name}", kept[name]) for name in kept})
         for name, parameter in self.matcher.named_parameters():
             prefix = f"optimizer.{name}."
             kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
@@ -271,7 +289,7 @@ class Trainer:
                 }
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
-    def _require_own_checkpoint(self) -> None:
+    def _own_checkpoint(self) -> Checkpoint:
         """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
         two writes): the steps since then are repeated to the same end."""
         kept = load_checkpoint(self.out)
@@ -284,6 +302,11 @@ class Trainer:
             raise CheckpointError(
                 f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
             )
+        return kept
+
+
+FROZEN = ("touch_tower.", "photo_tower.")
+"""How the names of weights begin that stand still where towers are frozen."""
 
 
 def build_matcher(config: Config) -> Matcher:
@@ -321,15 +344,21 @@ def batch_loss(
     touch_index, photo_index = _on(device, batch.touch_index), _on(device, batch.photo_index)
     logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
     loss = match_loss(logits, _on(device, batch.labels))
+    objects = _on(device, batch.touch_objects), _on(device, batch.photo_objects)
     if settings.contrastive_weight > 0:
-        loss = loss + settings.contrastive_weight * contrastive_loss(
-            touch.embedding,
-            photo.embedding,
-            _on(device, batch.touch_objects),
-            _on(device, batch.photo_objects),
-            matcher.log_scale,
-        )
+        apart = contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
+        loss = loss + settings.contrastive_weight * apart
+    if settings.listwise_weight > 0:
+        every = matcher.head(touch.half[:, None], photo.half[None])
+        loss = loss + settings.listwise_weight * listwise_loss(every, *objects)
     return loss, logits
+
+
+def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
+    """Each touch's features (B, fingers * F) with its fingers in a random order, by PyTorch's seed on the CPU."""
+    each = touch_features.view(len(touch_features), fingers, -1)
+    order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
+    return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)
 
 
 def _on(device: torch.device, array: Any) -> Tensor:
@@ -341,11 +370,10 @@ def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> ND
     """Match logits (P,) of pairs, in evaluation mode, each image encoded once."""
     matcher.eval()
     touch_features, photo_features = source.eval_features(matcher, pairs)
-    touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-    logits: NDArray[np.float32] = (
-        matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index]).cpu().numpy()
-    )
-    return logits
+    with source.stepping():
+        touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
+        logits = matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index])
+    return np.asarray(logits.cpu().numpy())
 
 
 @contextmanager

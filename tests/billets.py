@@ -26,6 +26,7 @@ from retrieval.config import load_config
 from retrieval.dataset import Grasp, PairSampler, Split, load_grasps
 from retrieval.encode import encode_photos, encode_touches
 from retrieval.evaluation.metrics import binomial_interval, guess_curve
+from retrieval.features import blurred
 from retrieval.images import read_rgb, resize
 from retrieval.train import train
 from robot.importers import load_importer
@@ -67,9 +68,7 @@ def write_control(recording: Path, out: Path) -> Path:
         (out / name).write_bytes((recording / name).read_bytes())
     for grasp in load_grasps(recording):
         (out / "images" / grasp.photo.name).write_bytes(grasp.photo.read_bytes())
-        image = read_rgb(grasp.touches[0])
-        blurred = cv2.GaussianBlur(image, (0, 0), image.shape[1] / 10)
-        small = resize(resize(blurred, (6, 8)), image.shape[:2])
+        small = blurred(read_rgb(grasp.touches[0]))
         cv2.imwrite(str(out / "images" / grasp.touches[0].name), np.rint(small[..., ::-1] * 255).astype(np.uint8))
     return out
 

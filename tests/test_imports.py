@@ -20,10 +20,14 @@ STAGES = (
     ("fusion",),
     ("encode", "distributed", "calibration"),
     ("checkpoint", "batches", "gate"),
+    ("features",),
     ("train", "defaults"),
+    ("finish",),
+    ("methods",),
     ("build",),
     ("search",),
-    ("report", "evaluation", "grasp_success"),
+    ("evaluation", "grasp_success"),
+    ("report",),
     ("arguments", "cli", "demo"),
 )
 
@@ -117,7 +121,7 @@ def test_indexes_import_with_numpy_alone():
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["demo"], ["collect"], ["import"], ["check"], ["train"], ["build-index"], ["query"]]
+    "command", [[], ["demo"], ["collect"], ["import"], ["check"], ["train"], ["build-index"], ["query"], ["evaluate"]]
 )
 def test_help_loads_nothing_heavy(command):
     code = f"from retrieval.cli import main\nmain({[*command, '--help']!r})"

@@ -10,6 +10,7 @@ from torch import nn
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.towers import TOWERS, build_tower
+from retrieval.towers.base import stage_statistics
 from retrieval.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 
@@ -145,7 +146,7 @@ def test_a_tower_refuses_what_is_not_an_image(images, error, words):
 def test_unknown_towers_and_outputs_are_refused_with_the_known_ones():
     with pytest.raises(ConfigError, match="resnet50, small; got 'vgg'"):
         build_tower("vgg")
-    with pytest.raises(ConfigError, match="classes, pooled; got 'logits'"):
+    with pytest.raises(ConfigError, match="classes, pooled, stages; got 'logits'"):
         build_tower("small", "logits")
 
 
@@ -221,3 +222,39 @@ def test_real_imagenet_weights_load_in_their_older_key_layout():
     # ReLU6 after the last convolution, averaged.
     assert features.min() >= 0
     assert features.max() <= 6
+
+
+@pytest.mark.parametrize("name", sorted(TOWERS))
+def test_stages_are_mean_deviation_and_maximum_of_maps_of_any_image(name):
+    torch.manual_seed(0)
+    tower = build_tower(name, "stages").eval()
+    with torch.inference_mode():
+        features = tower(torch.rand(2, 3, 64, 96))
+    assert features.shape == (2, tower.feature_count)
+    assert torch.isfinite(features).all()
+
+
+def test_stage_statistics_are_those_of_each_map_side_by_side():
+    first = torch.tensor([[[[0.0, 2.0], [4.0, 6.0]]]])  # mean 3, deviation sqrt(5), maximum 6
+    second = torch.full((1, 1, 1, 3), 7.0)  # constant
+    wanted = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
+    torch.testing.assert_close(stage_statistics([first, second]), wanted)
+
+
+def test_a_constant_map_has_a_finite_gradient():
+    x = torch.ones(1, 1, 2, 2, requires_grad=True)
+    x.var((2, 3), correction=0).sqrt().sum().backward()
+    assert torch.isnan(x.grad).all()  # the naive deviation
+    x.grad = None
+    stage_statistics([x]).sum().backward()
+    assert torch.isfinite(x.grad).all()
+
+
+def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_path):
+    torch.manual_seed(1)
+    source = build_tower("mobilenet_v2", "classes")
+    torch.save(source.state_dict(), tmp_path / "weights.pth")
+    tower = build_tower("mobilenet_v2", "stages")
+    initialise_tower(tower, "mobilenet_v2", str(tmp_path / "weights.pth"))
+    assert not any(key.startswith("features.18") for key in tower.state_dict())
+    torch.testing.assert_close(tower.features[17].conv[2].weight, source.features[17].conv[2].weight)

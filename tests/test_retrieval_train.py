@@ -17,7 +17,15 @@ from retrieval.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.fusion import Matcher
 from retrieval.losses import match_loss
-from retrieval.train import Trainer, batch_loss, build_matcher, set_training_mode, state_path, train
+from retrieval.train import (
+    Trainer,
+    batch_loss,
+    build_matcher,
+    set_training_mode,
+    shuffle_fingers,
+    state_path,
+    train,
+)
 from tests.conftest import TINY
 
 CPU = torch.device("cpu")
@@ -371,3 +379,17 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert load_checkpoint(out).provenance["step"] > 0
+
+
+def test_fingers_are_shuffled_within_a_touch_and_by_the_seed():
+    features = torch.arange(24.0).view(4, 6)  # four touches of two fingers with three features
+    torch.manual_seed(3)
+    shuffled = shuffle_fingers(features, fingers=2)
+    torch.manual_seed(3)
+    assert torch.equal(shuffled, shuffle_fingers(features, fingers=2))
+    swapped = features.view(4, 2, 3).flip(1).flatten(1)
+    same, other = (shuffled == features).all(1), (shuffled == swapped).all(1)
+    assert (same ^ other).all()
+    seen = torch.cat([shuffle_fingers(features, fingers=2) for _ in range(50)])
+    assert 60 < int((seen == swapped.repeat(50, 1)).all(1).sum()) < 140
+    assert torch.equal(shuffle_fingers(features, fingers=1), features)

@@ -19,19 +19,29 @@ def guess_curve(true_score: float, other_scores: ArrayLike, k: int) -> NDArray[n
     for fewer than k - 1 others, NumericalError for a score that is not finite.
     """
     others = np.asarray(other_scores, dtype=np.float64)
-    if k < 1 or len(others) < k - 1:
-        raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} other photos; got {len(others)}")
     if not (np.isfinite(others).all() and np.isfinite(true_score)):
         raise NumericalError("every score must be finite; one of a K-way test is not")
     higher, equal = int((others > true_score).sum()), int((others == true_score).sum())
+    return np.ravel(guess_curves(np.array([higher]), np.array([equal]), len(others), k))
+
+
+def guess_curves(higher: NDArray[np.int64], equal: NDArray[np.int64], others: int, k: int) -> NDArray[np.float64]:
+    """`guess_curve` (Q, k) of many queries: of `others` rivals, so many (Q,) score higher and so many the same."""
+    if k < 1 or others < k - 1:
+        raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} rivals; got {others}")
+    cases, place = np.unique(np.stack([higher, equal], axis=1), axis=0, return_inverse=True)
+    curves = [_curve(int(above), int(tied), others, k) for above, tied in cases]
+    return np.array(curves)[place]
+
+
+def _curve(higher: int, equal: int, others: int, k: int) -> NDArray[np.float64]:
     curve = np.zeros(k)
     for above in range(min(higher, k - 1) + 1):
         for tied in range(min(equal, k - 1 - above) + 1):
             ways = comb(higher, above) * comb(equal, tied)
-            ways *= comb(len(others) - higher - equal, k - 1 - above - tied)
-            share = ways / comb(len(others), k - 1)
+            ways *= comb(others - higher - equal, k - 1 - above - tied)
             within = np.clip((np.arange(1, k + 1) - above) / (tied + 1), 0, 1)
-            curve += share * within
+            curve += ways / comb(others, k - 1) * within
     return curve
 
 

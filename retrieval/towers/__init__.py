@@ -16,14 +16,15 @@ TOWERS = {
     "small": "retrieval.towers.small:small",
 }
 
-OUTPUTS = ("classes", "pooled")
+OUTPUTS = ("classes", "pooled", "stages")
 
 
 def build_tower(name: str, output: str = "pooled") -> "Tower":
     """Build the tower `name` with random weights.
 
     output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way
-    linear layer that ImageNet checkpoints carry, whose outputs the paper concatenates.
+    linear layer that ImageNet checkpoints carry, whose outputs the paper concatenates; "stages" gives mean, deviation
+    and maximum over the maps of several stages, from edges to parts.
     Raises ConfigError for an unknown name or output.
     """
     if name not in TOWERS:
@@ -31,5 +32,5 @@ def build_tower(name: str, output: str = "pooled") -> "Tower":
     if output not in OUTPUTS:
         raise ConfigError(f"tower output must be one of {', '.join(OUTPUTS)}; got {output!r}")
     module, function = TOWERS[name].split(":")
-    tower: Tower = getattr(import_module(module), function)(classes=1000 if output == "classes" else None)
+    tower: Tower = getattr(import_module(module), function)(output)
     return tower

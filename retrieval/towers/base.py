@@ -1,5 +1,7 @@
 """What every tower owes its callers; a backbone only writes `_encode`."""
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor, nn
 
@@ -12,13 +14,12 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 class Tower(nn.Module):
     """Encoder of one modality: RGB images to feature vectors.
 
-    `feature_count` is the length of a vector. `classifier_prefix` names the 1000-way layer in the state dict (None
-    where
-    the tower has none).
+    `feature_count` is the length of a vector. `optional_prefixes` begin the names of weights that published
+    checkpoints hold and that some outputs of the tower do not need, the 1000-way layer first.
     """
 
     feature_count: int
-    classifier_prefix: str | None = None
+    optional_prefixes: tuple[str, ...]
     mean: Tensor
     std: Tensor
 
@@ -44,6 +45,18 @@ class Tower(nn.Module):
     def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
         """Map the keys of a known older layout to today's; the identity unless a backbone has one."""
         return state
+
+
+def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
+    """Mean, standard deviation and maximum over each of several maps (B, C, H, W), side by side: (B, 3 * all C).
+
+    The mean alone thins out what covers a small part of an image; deviation and maximum keep it.
+    """
+    parts = []
+    for x in maps:
+        # Not the root of the variance, whose slope is infinite where a map is constant; that of `std` is 0 there.
+        parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
+    return torch.cat(parts, dim=1)
 
 
 def _check_images(images: Tensor) -> None:

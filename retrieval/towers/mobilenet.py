@@ -1,10 +1,11 @@
 """MobileNetV2, width 1.0 (Sandler et al., CVPR 2018), with the key names of torchvision's checkpoints."""
 
 import re
+from collections.abc import Iterator
 
 from torch import Tensor, nn
 
-from retrieval.towers.base import Tower
+from retrieval.towers.base import Tower, stage_statistics
 
 # Expansion, output channels, blocks, first stride: table 2 of the paper.
 _STAGES = (
@@ -16,6 +17,8 @@ _STAGES = (
     (6, 160, 3, 2),
     (6, 320, 1, 1),
 )
+# Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
+_DESCRIBED = {6: 32, 10: 64, 13: 96, 17: 320}
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -49,9 +52,9 @@ class InvertedResidual(nn.Module):
 class MobileNetV2(Tower):
     """Nineteen convolutional features, global average, and the 1000-way layer where it is asked for."""
 
-    classifier_prefix = "classifier"
+    optional_prefixes = ("classifier.", "features.18.")
 
-    def __init__(self, classes: int | None) -> None:
+    def __init__(self, output: str) -> None:
         super().__init__()
         layers: list[nn.Module] = [_convolution(3, 32, 3, stride=2)]
         inputs = 32
@@ -59,15 +62,27 @@ class MobileNetV2(Tower):
             for block in range(blocks):
                 layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
                 inputs = outputs
-        layers.append(_convolution(inputs, 1280, 1))
+        self.output = output
+        if output == "stages":
+            self.feature_count = 3 * sum(_DESCRIBED.values())
+        else:
+            layers.append(_convolution(inputs, 1280, 1))
+            self.feature_count = 1000 if output == "classes" else 1280
         self.features = nn.Sequential(*layers)
-        self.classifier = nn.Sequential(nn.Dropout(0.2), nn.Linear(1280, classes)) if classes else None
-        self.feature_count = classes or 1280
+        self.classifier = nn.Sequential(nn.Dropout(0.2), nn.Linear(1280, 1000)) if output == "classes" else None
         _initialise(self)
 
     def _encode(self, images: Tensor) -> Tensor:
+        if self.output == "stages":
+            return stage_statistics(self._stages(images))
         x = nn.functional.adaptive_avg_pool2d(self.features(images), 1).flatten(1)
         return x if self.classifier is None else self.classifier(x)
+
+    def _stages(self, x: Tensor) -> Iterator[Tensor]:
+        for number, layer in enumerate(self.features):
+            x = layer(x)
+            if number in _DESCRIBED:
+                yield x
 
     @staticmethod
     def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -100,6 +115,6 @@ def _initialise(tower: nn.Module) -> None:
             nn.init.zeros_(module.bias)
 
 
-def mobilenet_v2(classes: int | None) -> MobileNetV2:
-    """MobileNetV2: 1280 pooled features; 3,504,872 parameters with its 1000-way layer."""
-    return MobileNetV2(classes)
+def mobilenet_v2(output: str) -> MobileNetV2:
+    """MobileNetV2: 1280 pooled features, 1536 of stages; 3,504,872 parameters with its 1000-way layer."""
+    return MobileNetV2(output)

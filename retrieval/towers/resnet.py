@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from retrieval.towers.base import Tower
+from retrieval.towers.base import Tower, stage_statistics
 
 
 class BasicBlock(nn.Module):
@@ -66,9 +66,9 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
 class ResNet(Tower):
     """Stem, four stages, global average, and the 1000-way layer where it is asked for."""
 
-    classifier_prefix = "fc"
+    optional_prefixes = ("fc.",)
 
-    def __init__(self, block: type[BasicBlock | Bottleneck], depths: tuple[int, ...], classes: int | None) -> None:
+    def __init__(self, block: type[BasicBlock | Bottleneck], depths: tuple[int, ...], output: str) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
@@ -83,14 +83,21 @@ class ResNet(Tower):
                 blocks.append(block(inputs, width, stride))
                 inputs = width * block.expansion
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
-        self.fc = nn.Linear(inputs, classes) if classes else None
-        self.feature_count = classes or inputs
+        self.output = output
+        self.fc = nn.Linear(inputs, 1000) if output == "classes" else None
+        # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the one before.
+        counts = {"classes": 1000, "pooled": inputs, "stages": 3 * (inputs + inputs // 2 + inputs // 4)}
+        self.feature_count = counts[output]
         _initialise(self)
 
     def _encode(self, images: Tensor) -> Tensor:
         x = self.maxpool(self.relu(self.bn1(self.conv1(images))))
+        maps = []
         for stage in range(1, 5):
             x = self.get_submodule(f"layer{stage}")(x)
+            maps.append(x)
+        if self.output == "stages":
+            return stage_statistics(maps[1:])
         x = torch.flatten(nn.functional.adaptive_avg_pool2d(x, 1), 1)
         return x if self.fc is None else self.fc(x)
 
@@ -102,16 +109,16 @@ def _initialise(tower: nn.Module) -> None:
             nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
 
-def resnet18(classes: int | None) -> ResNet:
+def resnet18(output: str) -> ResNet:
     """ResNet-18: 512 pooled features."""
-    return ResNet(BasicBlock, (2, 2, 2, 2), classes)
+    return ResNet(BasicBlock, (2, 2, 2, 2), output)
 
 
-def resnet34(classes: int | None) -> ResNet:
+def resnet34(output: str) -> ResNet:
     """ResNet-34: 512 pooled features."""
-    return ResNet(BasicBlock, (3, 4, 6, 3), classes)
+    return ResNet(BasicBlock, (3, 4, 6, 3), output)
 
 
-def resnet50(classes: int | None) -> ResNet:
+def resnet50(output: str) -> ResNet:
     """ResNet-50: 2048 pooled features; 25,557,032 parameters with its 1000-way layer."""
-    return ResNet(Bottleneck, (3, 4, 6, 3), classes)
+    return ResNet(Bottleneck, (3, 4, 6, 3), output)

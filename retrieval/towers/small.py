@@ -3,10 +3,12 @@
 Group normalisation keeps every image's output independent of the rest of its batch, in training too.
 """
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor, nn
 
-from retrieval.towers.base import Tower
+from retrieval.towers.base import Tower, stage_statistics
 
 _WIDTHS = (24, 48, 96, 128)
 
@@ -14,9 +16,9 @@ _WIDTHS = (24, 48, 96, 128)
 class Small(Tower):
     """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features."""
 
-    classifier_prefix = "fc"
+    optional_prefixes = ("fc.",)
 
-    def __init__(self, classes: int | None) -> None:
+    def __init__(self, output: str) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         inputs = 3
@@ -29,15 +31,24 @@ class Small(Tower):
             ]
             inputs = width
         self.stages = nn.Sequential(*layers)
-        self.fc = nn.Linear(2 * inputs, classes) if classes else None
-        self.feature_count = classes or 2 * inputs
+        self.output = output
+        self.fc = nn.Linear(2 * inputs, 1000) if output == "classes" else None
+        self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 
     def _encode(self, images: Tensor) -> Tensor:
+        if self.output == "stages":
+            return stage_statistics(self._maps(images))
         x = self.stages(images).flatten(2)
         x = torch.cat([x.mean(2), x.amax(2)], dim=1)
         return x if self.fc is None else self.fc(x)
 
+    def _maps(self, x: Tensor) -> Iterator[Tensor]:
+        for layer in self.stages:
+            x = layer(x)
+            if isinstance(layer, nn.ReLU):
+                yield x
 
-def small(classes: int | None) -> Small:
-    """The small tower: 256 pooled features."""
-    return Small(classes)
+
+def small(output: str) -> Small:
+    """The small tower: 256 pooled features, 888 of stages."""
+    return Small(output)

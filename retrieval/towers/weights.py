@@ -52,12 +52,12 @@ def read_state(path: Path) -> dict[str, Tensor]:
 
 
 def load_tower_state(tower: Tower, state: dict[str, Tensor], source: str) -> None:
-    """Load `state` into `tower`: every layer must fit, save that either side may lack the 1000-way layer."""
+    """Load `state` into `tower`: every layer must fit, save that either side may lack an optional one."""
     state = tower.rename_state(state)
     wanted = tower.state_dict()
-    prefix = f"{tower.classifier_prefix}."
-    unknown = [key for key in state if key not in wanted and not key.startswith(prefix)]
-    missing = [key for key in wanted if key not in state and not key.startswith(prefix)]
+    optional = tower.optional_prefixes
+    unknown = [key for key in state if key not in wanted and not key.startswith(optional)]
+    missing = [key for key in wanted if key not in state and not key.startswith(optional[0])]
     if unknown or missing:
         what = f"lacks {missing[0]}" if missing else f"has an unknown {unknown[0]}"
         raise CheckpointError(f"{source} does not fit {type(tower).__name__}: it {what}; name the tower it is for")
@@ -65,7 +65,7 @@ def load_tower_state(tower: Tower, state: dict[str, Tensor], source: str) -> Non
     if shapes:
         got, want = tuple(state[shapes[0]].shape), tuple(wanted[shapes[0]].shape)
         raise CheckpointError(f"{source} does not fit {type(tower).__name__}: {shapes[0]} is {got}, must be {want}")
-    if any(key.startswith(prefix) and key not in state for key in wanted):
+    if any(key.startswith(optional[0]) and key not in state for key in wanted):
         log.warning("%s has no 1000-way layer; that layer starts random", source)
     tower.load_state_dict({key: state.get(key, value) for key, value in wanted.items()})
 

@@ -1,17 +1,13 @@
-"""Results for people: the table on a terminal and the self-contained HTML page of a query."""
+"""Results of a query for people: the table on a terminal and the self-contained HTML page."""
 
-import base64
 from importlib import resources
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
-import cv2
 import jinja2
-import numpy as np
 
-from retrieval.errors import ImageError
-from retrieval.images import read_rgb, resize
+from retrieval.report.pictures import data_uri, jpeg, thumbnail
 from retrieval.search import QueryResult
 
 _THUMBNAIL_PX = 320
@@ -63,13 +59,5 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
 
 def _data_uri(path: Path) -> str:
     """The image, no larger than a thumbnail, as a data URI; empty where it cannot be read."""
-    try:
-        image = read_rgb(path)
-    except ImageError:
-        return ""
-    height, width = image.shape[:2]
-    scale = min(1.0, _THUMBNAIL_PX / max(height, width))
-    image = resize(image, (max(1, round(height * scale)), max(1, round(width * scale))))
-    bgr = np.rint(image[..., ::-1] * 255).astype(np.uint8)
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 88])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    image = thumbnail(path, _THUMBNAIL_PX)
+    return "" if image is None else data_uri(jpeg(image), "jpeg")

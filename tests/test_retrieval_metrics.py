@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.metrics import binomial_interval, grouped_interval, guess_curve
+from retrieval.evaluation.metrics import binomial_interval, grouped_interval, guess_curve, guess_curves
 
 
 def curve_by_enumeration(true_score, others, k):
@@ -41,8 +41,16 @@ def test_the_best_and_the_worst_photo():
     assert guess_curve(-1.0, np.zeros(9), 5).tolist() == [0, 0, 0, 0, 1]
 
 
+def test_curves_of_many_queries_are_those_of_each():
+    rng = np.random.default_rng(0)
+    scores = rng.integers(0, 4, (30, 9))
+    higher, equal = (scores[:, 1:] > scores[:, :1]).sum(1), (scores[:, 1:] == scores[:, :1]).sum(1)
+    expected = [guess_curve(row[0], row[1:], 4) for row in scores]
+    np.testing.assert_array_equal(guess_curves(higher, equal, 8, 4), expected)
+
+
 def test_too_few_rivals_and_scores_that_are_not_finite_are_refused():
-    with pytest.raises(BadInput, match="needs k >= 1 and 4 other photos; got 3"):
+    with pytest.raises(BadInput, match="needs k >= 1 and 4 rivals; got 3"):
         guess_curve(0.0, np.zeros(3), 5)
     with pytest.raises(NumericalError):
         guess_curve(np.nan, np.zeros(9), 5)

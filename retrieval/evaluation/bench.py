@@ -1,0 +1,102 @@
+"""Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from retrieval.batches import one_thread
+from retrieval.checkpoint import Checkpoint
+from retrieval.config import Config
+from retrieval.dataset import Split
+from retrieval.errors import BadInput
+from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
+from retrieval.evaluation.queries import Queries
+from retrieval.features import Features
+from retrieval.methods import build_method
+from retrieval.methods.base import Method, Setting
+from retrieval.methods.late_fusion import LateFusion
+from retrieval.version import __version__
+
+SEEDLESS = frozenset({"cca", "plsca", "constant"})
+"""Methods that come out alike for every seed: one is enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What methods are fitted on and asked, and the folder where fits and predictions lie.
+
+    checkpoint: a whole model, which late fusion and what shares its weights then are; None: they are fitted.
+    shuffled: touches are dealt anew among the objects of each part before fitting, so that nothing can be learned.
+    """
+
+    folder: Path
+    config: Config
+    split: Split
+    features: Features
+    queries: Queries
+    checkpoint: Checkpoint | None
+    shuffled: bool
+    quiet: bool
+
+    def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
+        """The seeds that make a difference to a method."""
+        return seeds[:1] if name in SEEDLESS or self._comes_fitted(name) else seeds
+
+    def predict(self, name: str, seed: int) -> None:
+        """Fit a method and write its predictions; nothing where these lie there already."""
+        path = self._path(name, seed)
+        if path.is_file():
+            try:
+                read_predictions(path, self._made_by(name, seed))
+                return
+            except BadInput:  # damaged, or of other features, queries or settings: made again
+                path.unlink()
+        if not self.quiet:
+            print(f"evaluate: {name}, seed {seed}", file=sys.stderr)
+        method, fit_s = self._fitted(name, seed)
+        write_predictions(path, predict(method, self.features, self.queries, fit_s), self._made_by(name, seed))
+
+    def predictions(self, name: str, seed: int) -> Predictions:
+        """What `predict` wrote. Raises BadInput for a file of other features, queries or settings."""
+        return read_predictions(self._path(name, seed), self._made_by(name, seed))
+
+    def _path(self, name: str, seed: int) -> Path:
+        return self.folder / "predictions" / f"{name}-{seed}.safetensors"
+
+    def _made_by(self, name: str, seed: int) -> dict[str, Any]:
+        return {
+            "method": name,
+            "seed": seed,
+            "features": self.features.digest,
+            "queries": self.queries.digest,
+            "split": self.split.to_dict(),
+            "config": self.config.to_dict(),
+            "model": self.checkpoint.digest if self.checkpoint else None,
+            "shuffled": self.shuffled,
+            "software": __version__,
+        }
+
+    def _comes_fitted(self, name: str) -> bool:
+        return self.checkpoint is not None and isinstance(build_method(name, Setting(self.config)), LateFusion)
+
+    def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
+        method = build_method(name, Setting(self.config, seed, self.folder / "fits", self.quiet))
+        if self.checkpoint is not None and isinstance(method, LateFusion):
+            return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
+        train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))
+        if self.shuffled:
+            train, validation = _shuffled(train, seed), _shuffled(validation, seed)
+        start = time.perf_counter()
+        with one_thread():  # heads are small, and times are then those of one core
+            method.fit(train, validation)
+        return method, time.perf_counter() - start
+
+
+def _shuffled(features: Features, seed: int) -> Features:
+    """Every touch with a grasp drawn at random; photos stay where they are."""
+    order = np.random.default_rng([seed, 13]).permutation(len(features))
+    return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)

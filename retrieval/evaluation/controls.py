@@ -1,0 +1,66 @@
+"""Controls: the same method where it must not be able to do what it does. Printed beside the result."""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from retrieval.dataset import Grasp
+from retrieval.evaluation.bench import Bench
+from retrieval.evaluation.material import Material
+from retrieval.evaluation.queries import draw_queries
+from retrieval.evaluation.scoring import Judged, main_measures, summaries
+from retrieval.features import encode_recording
+
+METHOD = "late_fusion"
+CONTROLS = {
+    "shuffled": "touches are dealt to other objects before fitting, so that there is nothing to learn",
+    "before": "the frames taken before the contact stand in for the touch, in fitting and in judging",
+    "blurred": "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging",
+}
+MOST_GRASPS = 12
+"""Grasps of an object whose other images are encoded for a control."""
+
+
+def control_benches(bench: Bench, material: Material, cache: Path, seed: int) -> dict[str, Bench]:
+    """The bench of each control; "before" is left out where the recording lacks frames from before the contact."""
+    benches = {
+        "shuffled": dataclasses.replace(bench, folder=_folder(bench, "shuffled"), checkpoint=None, shuffled=True)
+    }
+    grasps = thinned(material.grasps, MOST_GRASPS)
+    queries = draw_queries(grasps, material.split, seed)
+    for variant in ("before", "blurred"):
+        if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
+            continue
+        features = encode_recording(
+            grasps, material.matcher, material.config, cache, variant=variant, quiet=bench.quiet
+        )
+        benches[variant] = dataclasses.replace(
+            bench, folder=_folder(bench, variant), features=features, queries=queries, checkpoint=None
+        )
+    return benches
+
+
+def _folder(bench: Bench, name: str) -> Path:
+    return bench.folder / "controls" / name
+
+
+def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
+    """At most so many grasps of each object, evenly spaced over its own."""
+    rows_of: dict[str, list[int]] = defaultdict(list)
+    for row, grasp in enumerate(grasps):
+        rows_of[grasp.object_id].append(row)
+    kept: set[int] = set()
+    for rows in rows_of.values():
+        kept |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)}
+    return [grasps[row] for row in sorted(kept)]
+
+
+def score_control(name: str, bench: Bench, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
+    """A control's entry of results.json."""
+    judged = Judged(bench.queries, bench.predictions(METHOD, training_seed), seed)
+    measures = main_measures(judged, judged.calibrations())
+    return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}

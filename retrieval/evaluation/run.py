@@ -1,0 +1,233 @@
+"""One evaluation from recording to results.json: encode, fit, predict, score. What is done is not done again."""
+
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from retrieval.batches import BatchImages, one_thread
+from retrieval.config import Config
+from retrieval.dataset import Split
+from retrieval.encode import photo_features, touch_features
+from retrieval.errors import BadInput, ConfigError, Interrupted
+from retrieval.evaluation.audit import audit
+from retrieval.evaluation.bench import Bench
+from retrieval.evaluation.controls import METHOD, control_benches, score_control
+from retrieval.evaluation.intervals import compare
+from retrieval.evaluation.material import Material, prepare
+from retrieval.evaluation.queries import draw_queries
+from retrieval.evaluation.scoring import Measures, score_method
+from retrieval.features import encode_recording
+from retrieval.methods import METHODS
+from retrieval.progress import Bar
+from retrieval.version import __version__
+
+Jobs = Mapping[str, Sequence[int]]
+"""Training seeds by method."""
+SCHEMA_VERSION = 1
+DRAWS = 10_000
+COMPARED = ("pair_accuracy", "guesses_k5")
+"""Measures by which the first method is compared with each of the others."""
+
+
+def evaluate(
+    recording: Path,
+    out: Path,
+    *,
+    config: Config,
+    preset: str,
+    methods: Sequence[str] = tuple(METHODS),
+    model: Path | None = None,
+    seeds: int = 1,
+    split: Split | None = None,
+    cache: Path | None = None,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Judge methods on objects they never saw; writes results.json and timings.json under `out`, returns the results.
+
+    config: towers, heads and split (its `seed` is that of everything drawn); preset: what it is called. model: a
+    checkpoint to judge instead of one fitted here. seeds: trainings of each method, from `config`'s seed on. cache:
+    where features are kept (`out`/features where None). What lies under `out` from the same settings is used again,
+    so that a run which was stopped goes on; equal settings give equal results to the byte. Raises ConfigError for an
+    unknown method, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+    """
+    _require_known(methods, seeds)
+    out.mkdir(parents=True, exist_ok=True)
+    seed = config.training.seed
+    try:
+        material = prepare(recording, out, config, model=model, split=split, quiet=quiet)
+        bench, controls = _benches(material, out, cache or out / "features", seed, quiet)
+        jobs = {name: bench.seeds_of(name, [seed + turn for turn in range(seeds)]) for name in dict.fromkeys(methods)}
+        _predict(bench, controls, jobs, seed)
+    except Interrupted as error:
+        raise Interrupted(f"stopped; what was made is kept in {out}, and the same command goes on with it") from error
+    results = {
+        **_about(material, bench, preset, [seed + turn for turn in range(seeds)]),
+        "audit": _audited(material, out, quiet),
+        **_scored(bench, jobs, seed, quiet),
+        "controls": {
+            name: score_control(name, control, seed, draws=DRAWS, seed=seed) for name, control in controls.items()
+        },
+    }
+    _write(out / "results.json", results)
+    _write(out / "timings.json", _timings(material, bench, jobs))
+    return results
+
+
+def _require_known(methods: Sequence[str], seeds: int) -> None:
+    if unknown := [name for name in methods if name not in METHODS]:
+        raise ConfigError(f"method must be one of {', '.join(METHODS)}; got {unknown[0]!r}")
+    if not methods or seeds < 1:
+        raise BadInput(f"give one method and one seed at least; got {len(methods)} and {seeds}")
+
+
+def _benches(material: Material, out: Path, cache: Path, seed: int, quiet: bool) -> tuple[Bench, dict[str, Bench]]:
+    """The bench of the evaluation, and those of the controls."""
+    bench = Bench(
+        folder=out,
+        config=material.config,
+        split=material.split,
+        features=encode_recording(material.grasps, material.matcher, material.config, cache, quiet=quiet),
+        queries=draw_queries(material.grasps, material.split, seed),
+        checkpoint=material.checkpoint,
+        shuffled=False,
+        quiet=quiet,
+    )
+    return bench, control_benches(bench, material, cache, seed)
+
+
+def _predict(bench: Bench, controls: Mapping[str, Bench], jobs: Jobs, seed: int) -> None:
+    for name, seeds in jobs.items():
+        for one in seeds:
+            bench.predict(name, one)
+    for control in controls.values():
+        control.predict(METHOD, seed)
+
+
+def _about(material: Material, bench: Bench, preset: str, seeds: list[int]) -> dict[str, Any]:
+    features = bench.features
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "software": __version__,
+        "recording": {
+            "path_name": material.name,
+            "source": material.source,
+            "digest": material.digest,
+            "objects": len(set(features.object_ids)),
+            "grasps": len(features),
+        },
+        "split": {**material.split.to_dict(), "from": material.split_from},
+        "setting": {
+            "preset": preset,
+            "model": material.checkpoint.digest if material.checkpoint else None,
+            "config": _without_paths(material.config),
+            "seeds": seeds,
+            "draws": DRAWS,
+            "features": {
+                "touch": features.touch.shape[2],
+                "photo": features.photo.shape[1],
+                "fingers": features.touch.shape[1],
+                "digest": features.digest,
+            },
+        },
+    }
+
+
+def _without_paths(config: Config) -> dict[str, Any]:
+    """Where the first weights lay on this machine concerns nobody; the features' digest says what they were."""
+    tables = config.to_dict()
+    tables["training"]["init"] = Path(tables["training"]["init"]).name
+    return tables
+
+
+def _scored(bench: Bench, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any]:
+    """ "methods" and "comparisons" of results.json."""
+    entries: dict[str, Any] = {}
+    measures: dict[str, list[Measures]] = {}
+    with Bar("score", len(jobs), "methods", quiet=quiet) as bar:
+        for name, seeds in jobs.items():
+            predictions = [bench.predictions(name, one) for one in seeds]
+            entries[name], measures[name] = score_method(
+                bench.queries, bench.features.grasp_ids, predictions, draws=DRAWS, seed=seed
+            )
+            bar.advance(note=name)
+    return {"methods": entries, "comparisons": _compared(measures, seed)}
+
+
+def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:
+    first, *others = measures
+    return [
+        {"a": first, "b": other, "measure": key}
+        | compare([one[key] for one in measures[first]], [one[key] for one in measures[other]], draws=DRAWS, seed=seed)
+        for key in COMPARED
+        if key in measures[first][0]
+        for other in others
+    ]
+
+
+def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
+    """The leakage audit; it reads every image, so it is kept."""
+    path, of = out / "audit.json", {"recording": material.digest, "split": material.split.to_dict()}
+    if path.is_file():
+        try:
+            kept = json.loads(path.read_text("utf-8"))
+            if kept["of"] == json.loads(json.dumps(of)):
+                return dict(kept["audit"])
+        except (ValueError, KeyError, TypeError):  # damaged: made again
+            pass
+    found = audit(material.grasps, material.split, quiet=quiet)
+    _write(path, {"of": of, "audit": found})
+    return found
+
+
+def _timings(material: Material, bench: Bench, jobs: Jobs) -> dict[str, Any]:
+    found = {name: _method_times([bench.predictions(name, seed).seconds for seed in jobs[name]]) for name in jobs}
+    if {"late_fusion", "prune_rerank"} <= set(found):  # one training serves both
+        found["prune_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
+    return {
+        "machine": {"cpus": os.cpu_count(), "threads": 1},
+        "encode": _tower_times(material),
+        "methods": found,
+    }
+
+
+def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Medians over the seeds."""
+    seconds = {key: float(np.median([one[key] for one in by_seed])) for key in by_seed[0]}
+    return {
+        "fit_s": seconds["fit"],
+        "encode_touch_ms": 1e3 * seconds["encode_touch"],
+        "encode_photo_ms": 1e3 * seconds["encode_photo"],
+        "score_us_per_photo": 1e6 * seconds["score"],
+        "query_ms": 1e3 * seconds["query"],
+    }
+
+
+@one_thread()
+def _tower_times(material: Material, count: int = 4, repeats: int = 3) -> dict[str, Any]:
+    """Median time of the towers, on one thread, for one touch and for one photo; their files are read before."""
+    grasps = material.grasps[:count]
+    with BatchImages(material.config, torch.device("cpu"), keep_bytes=0) as images:
+        touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
+    times: dict[str, list[float]] = {"touch_ms": [], "photo_ms": []}
+    for touch, photo in zip(touches * repeats, photos * repeats, strict=True):
+        start = time.perf_counter()
+        touch_features(material.matcher, [touch])
+        middle = time.perf_counter()
+        photo_features(material.matcher, [photo])
+        times["touch_ms"].append(1e3 * (middle - start))
+        times["photo_ms"].append(1e3 * (time.perf_counter() - middle))
+    return {**{name: float(np.median(found)) for name, found in times.items()}, "where": "towers"}
+
+
+def _write(path: Path, document: Mapping[str, Any]) -> None:
+    """Whole or not at all, and equal documents to the byte."""
+    text = json.dumps(document, sort_keys=True, indent=1, allow_nan=False)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text + "\n", "utf-8")
+    temporary.replace(path)

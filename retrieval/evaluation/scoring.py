@@ -1,0 +1,209 @@
+"""From the predictions of a method to its part of results.json: measures, confusions, calibration, examples."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.evaluation import protocols
+from retrieval.evaluation.calibrate import Calibrations, Choice, calibrate, reliability
+from retrieval.evaluation.intervals import summarise
+from retrieval.evaluation.predictions import Predictions
+from retrieval.evaluation.queries import SHOWN_PHOTOS, Queries
+from retrieval.evaluation.reject import fit_gate, reject
+from retrieval.evaluation.table import Measure, ScoreTable
+
+CHOICES = (Choice(5), Choice(10), Choice(5, 5, SHOWN_PHOTOS))
+_CONFUSIONS, _EXAMPLES, _RANKED = 12, 6, 6
+
+Measures = dict[str, Measure]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """One method and seed: its scores as tables for the protocols, and what validation objects say of them."""
+
+    queries: Queries
+    predictions: Predictions
+    seed: int
+
+    def touches(self, rows: str | None, columns: str | None) -> ScoreTable:
+        """Touches of one part of the split with photos of one; None for all parts."""
+        asked = self.queries
+        touches, photos = _of(asked, asked.touch_owner, rows), _of(asked, asked.photo_owner, columns)
+        return ScoreTable(
+            scores=self.predictions.scores[np.ix_(touches, photos)],
+            touch_owner=asked.touch_owner[touches],
+            photo_owner=asked.photo_owner[photos],
+            own=asked.own_photo[touches][:, None] == photos,
+            object_words=f"{columns} objects" if columns else "objects of all parts",
+        )
+
+    def sets(self, part: str) -> dict[int, ScoreTable]:
+        """By number of grasps: sets of grasps of a part with the photos of that part; sizes that can be asked."""
+        tables = {size: self._sets(part, size) for size in self.queries.sets}
+        return {size: table for size, table in tables.items() if table is not None and table.askable.any()}
+
+    def _sets(self, part: str, size: int) -> ScoreTable | None:
+        asked, sets = self.queries, self.queries.sets[size]
+        owner = asked.touch_owner[sets[:, 0]]
+        rows, photos = asked.of_part(owner, part), asked.of_part(asked.photo_owner, part)
+        if not len(rows):
+            return None
+        return ScoreTable(
+            scores=self.predictions.set_scores[size][np.ix_(rows, photos)],
+            touch_owner=owner[rows],
+            photo_owner=asked.photo_owner[photos],
+            own=(asked.own_photo[sets[rows]][:, :, None] == photos).any(1),
+            object_words=f"{part} objects",
+            row_words="sets of grasps",
+        )
+
+    def by_grasps(self, part: str) -> dict[int, ScoreTable]:
+        """For calibration: single touches, and sets of more grasps."""
+        return {1: self.touches(part, part)} | {size: table for size, table in self.sets(part).items() if size > 1}
+
+    def calibrations(self) -> Calibrations:
+        """Fitted on validation objects."""
+        return calibrate(self.by_grasps("validation"), CHOICES, seed=self.seed)
+
+
+def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
+    return np.arange(len(owner)) if part is None else queries.of_part(owner, part)
+
+
+def main_measures(judged: Judged, calibrations: Calibrations) -> Measures:
+    """Pair accuracy and guess curves on test objects; a curve needs as many objects as candidates."""
+    test = judged.touches("test", "test")
+    found = {"pair_accuracy": protocols.pair_accuracy(test, calibrations.pairs[1])}
+    for k in (5, 10):
+        found |= _guesses(f"guesses_k{k}", test, k, judged.seed)
+    return found
+
+
+def all_measures(judged: Judged, calibrations: Calibrations) -> Measures:
+    """Every measure of results.json."""
+    test = judged.touches("test", "test")
+    found = main_measures(judged, calibrations) | {"pair_auc": protocols.pair_auc(test)}
+    for size, table in judged.sets("test").items():
+        found |= _guesses(f"guesses_k5_g{size}_p{SHOWN_PHOTOS}", table, 5, judged.seed, SHOWN_PHOTOS)
+    found |= _guesses("all_objects_k5", judged.touches("test", None), 5, judged.seed)
+    photos = test.transposed()
+    found |= protocols.full_gallery(test)
+    found |= {f"photo_to_touch_{name}": measure for name, measure in protocols.full_gallery(photos).items()}
+    found["objectfolder_touch_to_photo"] = protocols.objectfolder(test)
+    found["objectfolder_photo_to_touch"] = protocols.objectfolder(photos)
+    if (test.own.sum(0) == 1).all():  # photos that grasps share have no one touch to be paired with
+        found |= protocols.paired(test)
+    return found
+
+
+def _guesses(name: str, table: ScoreTable, k: int, seed: int, photos: int = 1) -> Measures:
+    return {name: protocols.k_way(table, k, photos=photos, seed=seed)} if len(table.objects) >= k else {}
+
+
+def summaries(by_seed: Sequence[Measures], draws: int, seed: int) -> dict[str, Any]:
+    """The "measures" of results.json."""
+    return {name: summarise([found[name] for found in by_seed], draws=draws, seed=seed) for name in by_seed[0]}
+
+
+def score_method(
+    queries: Queries, grasp_ids: Sequence[str], by_seed: Sequence[Predictions], *, draws: int, seed: int
+) -> tuple[dict[str, Any], list[Measures]]:
+    """A method's entry of results.json, and its measures by training seed for comparisons.
+
+    Values are means over the training seeds; reliability, reject's curve and threshold, and the examples are those of
+    the first.
+    """
+    judged = [Judged(queries, predictions, seed) for predictions in by_seed]
+    calibrations = [one.calibrations() for one in judged]
+    measures = [all_measures(one, fitted) for one, fitted in zip(judged, calibrations, strict=True)]
+    diagrams = reliability(calibrations[0], judged[0].by_grasps("test"), seed=seed)
+    entry = {
+        "chosen": [predictions.chosen for predictions in by_seed],
+        "measures": summaries(measures, draws, seed),
+        "per_object": _per_object(queries, judged, measures, seed),
+        "confusions": _confusions(queries, judged, seed),
+        "calibration": diagrams.pop("calibration"),
+        "reliability": diagrams,
+        "reject": _reject(judged, draws, seed),
+        "examples": _examples(judged[0].touches("test", "test"), queries, grasp_ids),
+    }
+    return entry, measures
+
+
+def _per_object(
+    queries: Queries, judged: Sequence[Judged], measures: Sequence[Measures], seed: int
+) -> dict[str, dict[str, float]]:
+    """Mean first guess at K = 5 of each object: among test objects, and of every object among all."""
+    every = [_guesses("all", one.touches(None, None), 5, seed) for one in judged]
+    shares = {
+        "test_candidates": [found["guesses_k5"] for found in measures if "guesses_k5" in found],
+        "all_candidates": [found["all"] for found in every if found],
+    }
+    return {name: _mean_by_name(queries, map(protocols.per_object, found)) for name, found in shares.items()}
+
+
+def _mean_by_name(queries: Queries, by_seed: Iterable[Mapping[int, float]]) -> dict[str, float]:
+    found: dict[str, list[float]] = {}
+    for shares in by_seed:
+        for number, share in shares.items():
+            found.setdefault(queries.objects[number], []).append(share)
+    return {name: float(np.mean(values)) for name, values in found.items()}
+
+
+def _confusions(queries: Queries, judged: Sequence[Judged], seed: int) -> list[dict[str, Any]]:
+    """The largest shares of first guesses among all test objects that fell on a wrong one."""
+    shares: dict[tuple[int, int], float] = {}
+    for one in judged:
+        for true, guessed, share in protocols.confusions(one.touches("test", "test"), seed=seed):
+            shares[true, guessed] = shares.get((true, guessed), 0) + share / len(judged)
+    largest = sorted(shares.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
+    names = queries.objects
+    return [
+        {"object_id": names[true], "mistaken_for": names[guessed], "share": share} for (true, guessed), share in largest
+    ]
+
+
+def _reject(judged: Sequence[Judged], draws: int, seed: int) -> dict[str, Any]:
+    found = []
+    for one in judged:
+        gate = fit_gate(one.touches("validation", "validation"), seed=seed)
+        found.append(reject(gate, one.touches("test", "test"), seed=seed))
+    return {
+        "auroc": summarise([one.auroc for one in found], draws=draws, seed=seed),
+        "balanced_accuracy": summarise([one.balanced_accuracy for one in found], draws=draws, seed=seed),
+        "threshold": found[0].threshold,
+        "roc": found[0].roc,
+    }
+
+
+def _examples(table: ScoreTable, queries: Queries, grasp_ids: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    """The best and the worst queries, one of an object: by the rank of its first photo, then by the margin."""
+    ranks = protocols.true_ranks(table)
+    shown = np.where(table.own, -np.inf, table.scores)
+    margin = np.where(table.relevant, shown, -np.inf).max(1) - np.where(table.relevant, -np.inf, shown).max(1)
+    order = [row for row in np.lexsort((-margin, ranks)) if table.askable[row]]
+    touches, photos = (queries.of_part(owner, "test") for owner in (queries.touch_owner, queries.photo_owner))
+
+    def example(row: int) -> dict[str, Any]:
+        columns = np.argsort(-shown[row], kind="stable")[:_RANKED]
+        return {
+            "grasp_id": grasp_ids[queries.touches[touches[row]]],
+            "object_id": queries.objects[table.touch_owner[row]],
+            "true_rank": float(ranks[row]),
+            "ranked": [grasp_ids[queries.photos[photos[column]]] for column in columns],
+        }
+
+    first, last = (_one_each(rows, table.touch_owner) for rows in (order, order[::-1]))
+    return {"best": [example(row) for row in first], "worst": [example(row) for row in last]}
+
+
+def _one_each(rows: Sequence[int], owner: NDArray[np.int64]) -> list[int]:
+    """The first row of each object, the first few of these."""
+    first: dict[int, int] = {}
+    for row in rows:
+        first.setdefault(int(owner[row]), int(row))
+    return list(first.values())[:_EXAMPLES]

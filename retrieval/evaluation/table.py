@@ -1,0 +1,163 @@
+"""What protocols take and give: a table of scores with its owners, and the values of every query of a measure."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput, NumericalError
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreTable:
+    """Scores of touches (rows; a row may be a set of grasps) with photos (columns), and who is who.
+
+    scores (T, N) floating, the higher the better; touch_owner (T,) and photo_owner (N,): numbers of the objects;
+    own (T, N): the photo was taken in a grasp of that very row, so it is never shown to it (except where a protocol
+    says so). object_words, row_words, column_words: what a reader is told the objects, rows and columns are.
+
+    Raises BadInput for shapes that do not fit and an own photo of another object, NumericalError for a score that is
+    not finite: sorted downwards, a NaN would stand first.
+    """
+
+    scores: NDArray[np.float32]
+    touch_owner: NDArray[np.int64]
+    photo_owner: NDArray[np.int64]
+    own: NDArray[np.bool_]
+    object_words: str = "objects"
+    row_words: str = "touches"
+    column_words: str = "photos"
+
+    def __post_init__(self) -> None:
+        shape = (len(self.touch_owner), len(self.photo_owner))
+        if self.scores.shape != shape or self.own.shape != shape or self.own.dtype != bool or 0 in shape:
+            raise BadInput(
+                f"scores and own (bool) must have a row for each of the {shape[0]} touches and a column for each of "
+                f"the {shape[1]} photos, and one at least; got {self.scores.shape} and {self.own.shape}"
+            )
+        bad = np.argwhere(~np.isfinite(self.scores))
+        if len(bad):
+            row, column = bad[0]
+            raise NumericalError(
+                f"every score must be finite; row {row}, column {column} is {self.scores[row, column]}"
+            )
+        if (self.own & ~self.relevant).any():
+            raise BadInput("a photo of a row's own grasp must show the row's object; one shows another: check the ids")
+
+    @cached_property
+    def relevant(self) -> NDArray[np.bool_]:
+        """(T, N): the photo shows the object of the row, own photos included."""
+        return np.asarray(self.touch_owner[:, None] == self.photo_owner[None])
+
+    @cached_property
+    def askable(self) -> NDArray[np.bool_]:
+        """(T,): the row has a photo of its object to find that is not its own."""
+        return np.asarray((self.relevant & ~self.own).any(1))
+
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """(O,) numbers of the objects that have photos, ascending."""
+        return np.unique(self.photo_owner)
+
+    def select(
+        self, rows: NDArray[np.int64] | NDArray[np.bool_], columns: NDArray[np.int64] | NDArray[np.bool_]
+    ) -> "ScoreTable":
+        """The table of these rows and these columns, in the order given."""
+        scores, own = self.scores[rows][:, columns], self.own[rows][:, columns]
+        touch_owner, photo_owner = self.touch_owner[rows], self.photo_owner[columns]
+        return replace(self, scores=scores, own=own, touch_owner=touch_owner, photo_owner=photo_owner)
+
+    def transposed(self) -> "ScoreTable":
+        """Photos ask, touches are the gallery."""
+        return ScoreTable(
+            self.scores.T, self.photo_owner, self.touch_owner, self.own.T,
+            self.object_words, self.column_words, self.row_words,
+        )  # fmt: skip
+
+    def with_own(self) -> "ScoreTable":
+        """The table of a protocol that shows a row its own photos too."""
+        return replace(self, own=np.zeros_like(self.own))
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Values of one protocol, query by query; shares, so that they lie between 0 and 1 on average.
+
+    values (Q, m): m = 1, or K for a guess curve; owner (Q,): object of the query, which is what intervals resample;
+    chance (m,): what a constant scorer gets, in closed form, averaged as the values are (objects alike);
+    gallery: what was searched, in plain words.
+    """
+
+    values: NDArray[np.float64]
+    owner: NDArray[np.int64]
+    chance: NDArray[np.float64]
+    gallery: str
+
+    def __post_init__(self) -> None:
+        wanted = (len(self.owner), len(self.chance))
+        if self.values.shape != wanted or 0 in wanted:
+            raise BadInput(
+                f"a measure must have values of shape {wanted}, and a query at least; got {self.values.shape}"
+            )
+        if not np.isfinite(self.values).all():
+            raise NumericalError("every value of a measure must be finite; one is not")
+
+    def by_object(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Numbers of the objects (R,), ascending, and the mean value of the queries of each (R, m)."""
+        return object_means(self.values, self.owner)
+
+
+def object_means(
+    values: NDArray[np.float64], owner: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Numbers of the objects (R,), ascending, and the mean of the rows of `values` (Q, m) that each owns, (R, m)."""
+    objects, place = np.unique(owner, return_inverse=True)
+    means = np.zeros((len(objects), values.shape[1]))
+    np.add.at(means, place, values)
+    return objects, means / np.bincount(place)[:, None]
+
+
+def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(Q,) weights that sum to 1 and make every object count alike, however many queries it has."""
+    _, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    return np.asarray(1 / (counts[place] * len(counts)))
+
+
+def object_scores(table: ScoreTable, photos: int, draws: int, seed: int) -> NDArray[np.float64]:
+    """Scores (draws, T, O) of rows with objects: the mean over `photos` photos of each, drawn without replacement.
+
+    Columns stand in the order of `table.objects`. Own photos are never drawn; an object with fewer photos shows all
+    that it has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the
+    same. Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
+    """
+    if not (table.askable | ~table.relevant.any(1)).all():
+        raise BadInput("every row must leave its object a photo to show; one has none but its own: leave the row out")
+    rng = np.random.default_rng([seed, photos])
+    found = np.empty((draws, len(table.touch_owner), len(table.objects)))
+    for draw in range(draws):
+        for place, name in enumerate(table.objects):
+            columns = rng.permutation(np.flatnonzero(table.photo_owner == name))
+            mine = np.flatnonzero(table.touch_owner == name)
+            found[draw, :, place] = _window_means(table.scores, columns, photos, rng)
+            found[draw, mine, place] = _means_without_own(table, mine, columns, photos, rng)
+    return found
+
+
+def _window_means(
+    scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Every row sees a window of its own over the shuffled columns: without replacement, and cheap."""
+    start = rng.integers(len(columns), size=len(scores))
+    window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
+    return np.asarray(scores[np.arange(len(scores))[:, None], columns[window]].mean(1, dtype=np.float64))
+
+
+def _means_without_own(
+    table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """The object's own rows: a random order of the photos for each, its own ones last and never counted."""
+    own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
+    order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
+    shown = ~np.take_along_axis(own, order, 1)
+    return np.asarray((np.take_along_axis(scores, order, 1) * shown).sum(1) / shown.sum(1))

@@ -1,0 +1,163 @@
+"""What every method owes the harness; a method only writes `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.config import Config
+from retrieval.errors import BadInput, NumericalError
+
+if TYPE_CHECKING:
+    from retrieval.features import Features
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a method is made with.
+
+    folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
+    """
+
+    config: Config
+    seed: int = 0
+    folder: Path | None = None
+    quiet: bool = True
+
+
+class Method(ABC):
+    """A way to say how well a touch and a photo go together: a higher score is a better match.
+
+    Scores are ranked, equal ones by expected rank; only calibration gives them a unit. `chosen` says after `fit` what
+    was chosen on validation objects, in JSON types. A method that comes fitted (from a checkpoint) sets `fitted`.
+    """
+
+    def __init__(self, setting: Setting) -> None:
+        self.setting = setting
+        self.chosen: dict[str, Any] = {}
+        self.fitted = False
+        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+
+    def fit(self, train: "Features", validation: "Features") -> None:
+        """Learn from the grasps of training objects; choose whatever is to be chosen on those of validation objects.
+
+        Raises BadInput unless both hold at least two objects and share none, NumericalError for features that are
+        not finite.
+        """
+        _require_fit(train, validation)
+        self._fit(train, validation)
+        self._shapes = train.touch.shape[1:], train.photo.shape[1:]
+        self.fitted = True
+
+    def encode_touch(self, touch: NDArray[Any]) -> Array:
+        """Codes (T, ...) of touch features (T, fingers, F). Raises BadInput for another shape than fitted on."""
+        self._require_fitted()
+        touch = _checked("touch features", touch, 3, self._shapes and self._shapes[0])
+        return _codes(self._encode_touch(touch), len(touch))
+
+    def encode_photo(self, photo: NDArray[Any]) -> Array:
+        """Codes (N, ...) of photo features (N, F). Raises BadInput for another shape than fitted on."""
+        self._require_fitted()
+        photo = _checked("photo features", photo, 2, self._shapes and self._shapes[1])
+        return _codes(self._encode_photo(photo), len(photo))
+
+    def score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        """Scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
+        self._require_fitted()
+        return _scores(self._score(touch_codes, photo_codes), len(touch_codes), len(photo_codes))
+
+    def score_sets(self, touch_codes: Array, photo_codes: Array, sets: NDArray[np.int64]) -> Array:
+        """Scores (S, N) of sets of grasps of one object with every photo.
+
+        sets (S, G): rows of `touch_codes`. Unless a method fuses otherwise, the sum over the set of `score`: log-odds
+        of grasps that are independent given the object add.
+        """
+        self._require_fitted()
+        _require_sets(sets, len(touch_codes))
+        return _scores(self._score_sets(touch_codes, photo_codes, sets), len(sets), len(photo_codes))
+
+    @abstractmethod
+    def _fit(self, train: "Features", validation: "Features") -> None: ...
+
+    @abstractmethod
+    def _encode_touch(self, touch: Array) -> Array: ...
+
+    @abstractmethod
+    def _encode_photo(self, photo: Array) -> Array: ...
+
+    @abstractmethod
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array: ...
+
+    def _score_sets(self, touch_codes: Array, photo_codes: Array, sets: NDArray[np.int64]) -> Array:
+        used, place = np.unique(sets, return_inverse=True)
+        return add_up(self._score(touch_codes[used], photo_codes), place.reshape(sets.shape))
+
+    def _require_fitted(self) -> None:
+        if not self.fitted:
+            raise BadInput(f"a method must be fitted before it is used; call fit on this {type(self).__name__} first")
+
+
+def add_up(scores: Array, sets: NDArray[np.int64]) -> Array:
+    """(S, N) sums over sets (S, G) of rows of scores (T, N); in float64, for the order of a set must not decide
+    near-ties."""
+    total = np.zeros((len(sets), scores.shape[1]))
+    for rows in sets.T:
+        total += scores[rows]
+    return total.astype(np.float32)
+
+
+def _require_fit(train: "Features", validation: "Features") -> None:
+    for name, part in (("training", train), ("validation", validation)):
+        count = len(set(part.object_ids))
+        if count < 2:
+            raise BadInput(f"a method is fitted on at least 2 {name} objects; got {count}; record more objects")
+        _checked(f"touch features of {name} objects", part.touch, 3, train.touch.shape[1:])
+        _checked(f"photo features of {name} objects", part.photo, 2, train.photo.shape[1:])
+    if shared := set(train.object_ids) & set(validation.object_ids):
+        raise BadInput(
+            f"training and validation objects must be apart; {min(shared)!r} is in both; split the grasps by object"
+        )
+
+
+def _checked(what: str, array: NDArray[Any], ndim: int, shape: tuple[int, ...] | None) -> Array:
+    array = np.asarray(array, dtype=np.float32)
+    if array.ndim != ndim or (shape is not None and array.shape[1:] != shape):
+        wanted = f"of shape (B, {', '.join(map(str, shape))})" if shape is not None else f"with {ndim} axes"
+        raise BadInput(f"{what} must be an array {wanted}, as fitted on; got {array.shape}")
+    _require_finite(what, array)
+    return array
+
+
+def _codes(codes: Array, count: int) -> Array:
+    codes = np.asarray(codes, dtype=np.float32)
+    if len(codes) != count:
+        raise BadInput(f"a method must give one code for each item; got {len(codes)} for {count}")
+    _require_finite("codes", codes)
+    return codes
+
+
+def _scores(scores: Array, touches: int, photos: int) -> Array:
+    scores = np.asarray(scores, dtype=np.float32)
+    if scores.shape != (touches, photos):
+        raise BadInput(f"scores must be of shape {(touches, photos)}, touches by photos; got {scores.shape}")
+    _require_finite("scores", scores)
+    return scores
+
+
+def _require_finite(what: str, array: Array) -> None:
+    """Sorting would rank a NaN first."""
+    if not np.isfinite(array).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise NumericalError(f"{what} must be finite; got {array[place]} at {place}")
+
+
+def _require_sets(sets: NDArray[np.int64], touches: int) -> None:
+    if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
+        raise BadInput(f"sets of grasps must be whole numbers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}")
+    if sets.size and (sets.min() < 0 or sets.max() >= touches):
+        raise BadInput(f"sets must name rows of the {touches} touch codes; got {sets.min()}..{sets.max()}")

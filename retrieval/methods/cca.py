@@ -1,0 +1,198 @@
+"""Canonical correlation analysis (Hotelling, Biometrika 1936), as retrieval needs it.
+
+Three things make it a rival instead of a straw man: a ridge (with fewer grasps than features the plain method fits any
+noise with correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: cosine would count noise dimensions in
+full), and settings chosen by ranking on validation objects. Everything is reckoned in float64 from the singular value
+decomposition of the centred data; X'X would square the condition number.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.methods.base import Array, Method
+from retrieval.methods.selection import Judge, judge
+from retrieval.methods.standardise import Standardiser
+
+if TYPE_CHECKING:
+    from retrieval.features import Features
+
+Matrix = NDArray[np.float64]
+
+RANK_CUT = 1e-7
+"""Directions thinner than this share of the widest are the rounding of float32 features."""
+RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
+COMPONENTS = (8, 16, 32, 64, 128, 256)
+POWERS = (0, 1, 2, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One modality of n items, standardised and decomposed: `left * singular @ right` of rank r.
+
+    left (n, r), singular (r,) falling, right (r, F').
+    """
+
+    standardise: Standardiser
+    left: Matrix
+    singular: Matrix
+    right: Matrix
+
+    @property
+    def rank(self) -> int:
+        """How many directions vary."""
+        return len(self.singular)
+
+    def damped(self, ridge: float) -> Matrix:
+        """(r,) standard deviations after a ridge of `ridge` times the mean variance of the features."""
+        variance = self.singular**2 / len(self.left)
+        return np.asarray(np.sqrt(variance + ridge * variance.sum() / self.right.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Canonical:
+    """correlations (k,) falling, within 0..1; touch_weights, photo_weights (F', k): standardised features to variates.
+
+    In each column the weight of largest size, touch or photo, is positive.
+    """
+
+    correlations: Matrix
+    touch_weights: Matrix
+    photo_weights: Matrix
+
+
+def decompose(x: NDArray[Any]) -> View:
+    """View of items x (n, ...). Raises NumericalError unless finite, BadInput unless something varies."""
+    if not np.isfinite(x).all():
+        raise NumericalError("features must be finite to be correlated; got a NaN or infinite one")
+    standardise = Standardiser.fit(x)
+    left, singular, right = svd(standardise(x))
+    rank = int((singular > RANK_CUT * singular[0]).sum())
+    return View(standardise, left[:, :rank], singular[:rank], right[:rank])
+
+
+def canonical(touch: View, photo: View, owner: NDArray[np.int64], ridge: float = 0.0) -> Canonical:
+    """Canonical correlations of touches with photos, each touch paired with every photo of its object.
+
+    owner (n,): object of each row, from 0; `arange(n)` pairs row with row. A pair of an object with m grasps weighs
+    1/m, so every grasp counts the same, and pairing is the block average B = E'E, E (objects, n) with rows
+    1/sqrt(m): the cross-covariance X'BY needs object means only, and its rank is below the number of objects. Its
+    whitened form is factored by QR of both sides. Raises BadInput for a negative ridge or too few rows.
+    """
+    if ridge < 0 or not len(touch.left) == len(photo.left) == len(owner):
+        raise BadInput(
+            f"a canonical analysis needs a ridge from 0 and one owner a row; got ridge {ridge}, "
+            f"{len(touch.left)} touches, {len(photo.left)} photos and {len(owner)} owners"
+        )
+    touch_q, touch_r = np.linalg.qr(_whitened_means(touch, owner, ridge))
+    photo_q, photo_r = np.linalg.qr(_whitened_means(photo, owner, ridge))
+    left, rho, right = svd(touch_r @ photo_r.T)
+    count = min(len(rho), len(np.unique(owner)) - 1)  # the means of centred data have one dimension less
+    weights = (
+        touch.right.T @ ((touch_q @ left)[:, :count] / touch.damped(ridge)[:, None]),
+        photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.damped(ridge)[:, None]),
+    )
+    signs = _signs(np.concatenate(weights))
+    return Canonical(np.clip(rho[:count], 0.0, 1.0), weights[0] * signs, weights[1] * signs)
+
+
+def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+    """Thin singular value decomposition (left, singular values, right).
+
+    LAPACK's fast driver, gesdd, does not converge on some finite matrices of low rank; its slow one, gesvd, does.
+    """
+    try:
+        left, singular, right = np.linalg.svd(x, full_matrices=False)
+    except np.linalg.LinAlgError:
+        left, singular, right = scipy.linalg.svd(x, full_matrices=False, lapack_driver="gesvd")
+    return left, singular, right
+
+
+def _whitened_means(view: View, owner: NDArray[np.int64], ridge: float) -> Matrix:
+    """(r, objects): E times the whitened left vectors, turned over."""
+    objects, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(objects), view.rank))
+    np.add.at(sums, place, view.left)
+    shrink = view.singular / np.sqrt(len(view.left)) / view.damped(ridge)
+    return np.asarray((sums / np.sqrt(counts)[:, None] * shrink).T)
+
+
+def _signs(weights: Matrix) -> Matrix:
+    largest = np.abs(weights).argmax(0)
+    return np.where(weights[largest, np.arange(weights.shape[1])] < 0, -1.0, 1.0)
+
+
+def unit_rows(x: Matrix) -> Array:
+    """Rows at norm 1, float32; a row of zeros stays one."""
+    norms = np.linalg.norm(x, axis=1, keepdims=True)
+    return np.asarray(x / np.where(norms > 0, norms, 1.0), dtype=np.float32)
+
+
+def cosine(touch_codes: Array, photo_codes: Array) -> Array:
+    """Cosines (T, N) of unit codes."""
+    return touch_codes @ photo_codes.T
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One cell of the grid, and how well it ranks photos of validation objects."""
+
+    ridge: float
+    components: int
+    power: int
+    auc: float
+
+
+class Cca(Method):
+    """Cosine of canonical variates weighted by rho^p; ridge, components and p by ranking on validation objects."""
+
+    def _fit(self, train: "Features", validation: "Features") -> None:
+        touch, photo = decompose(train.touch), decompose(train.photo)
+        self._standardise = touch.standardise, photo.standardise
+        # The decompositions are made once; a ridge only damps them.
+        found = ((ridge, canonical(touch, photo, train.owner, ridge)) for ridge in RIDGES)
+        cells = (cell for ridge, one in found for cell in self._cells(ridge, one, judge(validation)))
+        self._keep(*max(cells, key=lambda cell: cell[0].auc))
+        self.chosen["rank"] = {"touch": touch.rank, "photo": photo.rank}
+
+    def _cells(self, ridge: float, found: Canonical, judged: Judge) -> Iterator[tuple[Choice, Canonical]]:
+        touch = self._standardise[0](judged.features.touch) @ found.touch_weights
+        photo = self._standardise[1](judged.features.photo) @ found.photo_weights
+        for components in admissible(COMPONENTS, len(found.correlations)):
+            for power in POWERS:
+                weights = found.correlations[:components] ** power
+                codes = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
+                yield Choice(ridge, components, power, judged.touches(cosine(*codes))), found
+
+    def _keep(self, choice: Choice, found: Canonical) -> None:
+        weights = found.correlations[: choice.components] ** choice.power
+        self._maps = (
+            found.touch_weights[:, : choice.components] * weights,
+            found.photo_weights[:, : choice.components] * weights,
+        )
+        self.chosen = {
+            "ridge": choice.ridge,
+            "components": choice.components,
+            "most_components": len(found.correlations),
+            "power": choice.power,
+            "validation_auc": choice.auc,
+        }
+
+    def _encode_touch(self, touch: Array) -> Array:
+        return unit_rows(self._standardise[0](touch) @ self._maps[0])
+
+    def _encode_photo(self, photo: Array) -> Array:
+        return unit_rows(self._standardise[1](photo) @ self._maps[1])
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        return cosine(touch_codes, photo_codes)
+
+
+def admissible(counts: tuple[int, ...], most: int) -> list[int]:
+    """The counts up to `most`, and `most` itself in place of larger ones."""
+    return sorted({min(count, most) for count in counts})

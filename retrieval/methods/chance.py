@@ -1,0 +1,39 @@
+"""Chance as a method: what the harness says of scores that know nothing."""
+
+from hashlib import blake2b
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from retrieval.methods.base import Array, Method
+
+if TYPE_CHECKING:
+    from retrieval.features import Features
+
+DIM = 64
+
+
+class Chance(Method):
+    """Cosines of random directions, drawn for each touch and photo by the seed and its own bytes.
+
+    So a score depends on nothing else: not on the other items, nor on their order or batch.
+    """
+
+    def _fit(self, train: "Features", validation: "Features") -> None:
+        pass
+
+    def _encode_touch(self, touch: Array) -> Array:
+        return self._directions(0, touch)
+
+    def _encode_photo(self, photo: Array) -> Array:
+        return self._directions(1, photo)
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        return touch_codes @ photo_codes.T
+
+    def _directions(self, modality: int, items: Array) -> Array:
+        drawn = np.empty((len(items), DIM), dtype=np.float32)
+        for row, item in enumerate(items):
+            content = int.from_bytes(blake2b(item.tobytes(), digest_size=8).digest())
+            drawn[row] = np.random.default_rng([self.setting.seed, modality, content]).standard_normal(DIM)
+        return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))

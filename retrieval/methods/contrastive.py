@@ -1,0 +1,151 @@
+"""Two projections into one metric space, pulled together by a contrastive loss over given tower features."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from retrieval.losses import (
+    LOG_SCALE_INIT,
+    LOG_SCALE_MAX,
+    SIGMOID_BIAS_INIT,
+    SIGMOID_LOG_SCALE_INIT,
+    contrastive_loss,
+    sigmoid_loss,
+)
+from retrieval.methods.base import Array, Method
+from retrieval.methods.optimise import Best, ObjectDraws, Optimisation, optimise, seeded, standardised
+from retrieval.methods.selection import Judge, judge
+from retrieval.methods.standardise import Standardiser
+from retrieval.progress import Bar
+
+if TYPE_CHECKING:
+    from retrieval.features import Features
+
+MOST_STEPS, JUDGE_EVERY = 800, 40
+LEARNING_RATE = 1e-3
+OBJECTS_PER_BATCH, EACH = 64, 2
+"""A batch holds each object at most once, with so many of its touches and as many of its photos."""
+REGULARISATIONS = ((0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 1.0))
+"""Dropout of features and weight decay, to be chosen from."""
+
+
+class Projections(nn.Module):
+    """Standardised features to unit embeddings: a linear map each, as the matcher has, with dropout before it."""
+
+    log_scale_init, bias_init = LOG_SCALE_INIT, 0.0
+
+    def __init__(self, touch_features: int, photo_features: int, dim: int, dropout: float) -> None:
+        super().__init__()
+        self.dropout = nn.Dropout(dropout)
+        self.touch, self.photo = nn.Linear(touch_features, dim), nn.Linear(photo_features, dim)
+        self.log_scale = nn.Parameter(torch.tensor(self.log_scale_init))
+        self.bias = nn.Parameter(torch.tensor(self.bias_init))
+
+    def forward(self, features: Tensor, projection: nn.Linear) -> Tensor:
+        """Unit embeddings (B, dim) of features (B, F)."""
+        embedding: Tensor = projection(self.dropout(features))
+        return functional.normalize(embedding, dim=-1, eps=1e-6)
+
+    def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
+        """Loss (scalar) of a batch of embeddings. InfoNCE compares photos of one touch, so its bias stays 0."""
+        return contrastive_loss(touch, photo, touch_objects, photo_objects, self.log_scale)
+
+    @torch.no_grad()
+    def clamp_scale(self) -> None:
+        """Hold the scale at 100 at most; on the parameter, so that it can come back."""
+        self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
+
+    @torch.no_grad()
+    def logit_map(self) -> tuple[float, float]:
+        """Scale and bias that make logits of cosines."""
+        return self.log_scale.exp().item(), self.bias.item()
+
+
+class SigmoidProjections(Projections):
+    """The same with the sigmoid loss and its learned bias."""
+
+    log_scale_init, bias_init = SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT
+
+    def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
+        """Loss (scalar) of a batch of embeddings."""
+        return sigmoid_loss(touch, photo, touch_objects, photo_objects, self.log_scale, self.bias)
+
+
+class Contrastive(Method):
+    """Scaled cosine of embeddings trained with InfoNCE; regularisation and steps by ranking on validation objects."""
+
+    name = "contrastive"
+    projections: type[Projections] = Projections
+
+    def _fit(self, train: "Features", validation: "Features") -> None:
+        self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
+        judged = judge(validation)
+        steps = min(self.setting.config.training.iterations, MOST_STEPS)
+        with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.setting.quiet) as bar:
+            fits = [self._trained(train, judged, *cell, steps, bar) for cell in REGULARISATIONS]
+        best_of = [best.value for _, best in fits]
+        place = best_of.index(max(best_of))
+        self._module, best = fits[place]
+        scale, bias = self._module.logit_map()
+        self.chosen = {
+            "dropout": REGULARISATIONS[place][0],
+            "weight_decay": REGULARISATIONS[place][1],
+            "steps": best.step,
+            "validation_auc": best.value,
+            "scale": scale,
+            "bias": bias,
+        }
+
+    def _trained(
+        self, train: "Features", judged: Judge, dropout: float, weight_decay: float, steps: int, bar: Bar
+    ) -> tuple[Projections, Best]:
+        """Projections trained with one regularisation, as they were at their best step."""
+        with seeded(self.setting.seed) as generator:
+            dim = self.setting.config.matcher.embedding_dim
+            module = self.projections(len(self._touch.kept), len(self._photo.kept), dim, dropout)
+            plan = Optimisation(steps, JUDGE_EVERY, LEARNING_RATE, weight_decay)
+            loss, worth = self._training_loss(module, train, generator), self._worth(module, judged)
+            return module, optimise(module, plan, loss, worth, bar=bar, after_step=module.clamp_scale)
+
+    def _training_loss(
+        self, module: Projections, train: "Features", generator: torch.Generator
+    ) -> Callable[[], Tensor]:
+        touch, photo = standardised(self._touch, train.touch), standardised(self._photo, train.photo)
+        draws = ObjectDraws(torch.from_numpy(train.owner), generator)
+
+        def loss() -> Tensor:
+            objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(EACH)
+            touches = module(touch[draws.rows(objects)], module.touch)
+            photos = module(photo[draws.rows(objects)], module.photo)
+            return module.loss(touches, photos, objects, objects)
+
+        return loss
+
+    def _worth(self, module: Projections, judged: Judge) -> Callable[[], float]:
+        touch = standardised(self._touch, judged.features.touch)
+        photo = standardised(self._photo, judged.features.photo)
+        return lambda: judged.touches((module(touch, module.touch) @ module(photo, module.photo).T).numpy())
+
+    @torch.inference_mode()
+    def _encode_touch(self, touch: Array) -> Array:
+        embeddings: Array = self._module(standardised(self._touch, touch), self._module.touch).numpy()
+        return embeddings
+
+    @torch.inference_mode()
+    def _encode_photo(self, photo: Array) -> Array:
+        embeddings: Array = self._module(standardised(self._photo, photo), self._module.photo).numpy()
+        return embeddings
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        scale, bias = self._module.logit_map()
+        return scale * (touch_codes @ photo_codes.T) + bias
+
+
+class ContrastiveSigmoid(Contrastive):
+    """The same, trained with the sigmoid loss: its scores are log-odds of a match by themselves."""
+
+    name = "contrastive_sigmoid"
+    projections = SigmoidProjections

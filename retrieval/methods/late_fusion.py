@@ -1,0 +1,127 @@
+"""Late fusion (Lin, Calandra, Levine, ICRA 2019): the head that judges a pair, trained as `retrieve train` does."""
+
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+
+from retrieval.checkpoint import Checkpoint
+from retrieval.config import Config
+from retrieval.dataset import Grasp, Split
+from retrieval.errors import BadInput
+from retrieval.features import Features
+from retrieval.finish import finish, unfinished
+from retrieval.fusion import Matcher, score_halves
+from retrieval.methods.base import Array, Method, Setting
+from retrieval.train import Trainer, build_matcher
+
+SOURCE = "features of a recording"
+"""What a checkpoint says it was trained on."""
+
+
+class LateFusion(Method):
+    """Match logits of a fusion head over frozen towers. A code is a half: a modality's share of the first layer."""
+
+    @classmethod
+    def of_checkpoint(cls, checkpoint: Checkpoint, setting: Setting) -> Self:
+        """The method as a checkpoint has it; it is not fitted again."""
+        method = cls(setting)
+        method._take(checkpoint)
+        fingers, touch, photo = _feature_counts(checkpoint.matcher)
+        method._shapes, method.fitted = ((fingers, touch), (photo,)), True
+        return method
+
+    def _fit(self, train: Features, validation: Features) -> None:
+        self._take(trained_checkpoint(self.setting, train, validation))
+
+    def _take(self, checkpoint: Checkpoint) -> None:
+        self._matcher = checkpoint.matcher
+        self.chosen = {"step": checkpoint.provenance["step"], **checkpoint.provenance["metrics"]}
+
+    @torch.inference_mode()
+    def _encode_touch(self, touch: Array) -> Array:
+        return np.asarray(self._matcher.touch_code(torch.from_numpy(touch).flatten(1)).half.numpy())
+
+    @torch.inference_mode()
+    def _encode_photo(self, photo: Array) -> Array:
+        return np.asarray(self._matcher.photo_code(torch.from_numpy(photo)).half.numpy())
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        touches = torch.from_numpy(touch_codes)
+        return np.array([score_halves(self._matcher.head, touch[None], photo_codes) for touch in touches])
+
+
+def trained_checkpoint(setting: Setting, train: Features, validation: Features) -> Checkpoint:
+    """Train on features and keep the checkpoint in `setting.folder`; one that is there from the same fit is taken as
+    it is, an unfinished one gone on with.
+
+    The towers of the checkpoint are those of `frozen_matcher`: it serves as any other where they made the features.
+    Raises BadInput for features that no such towers make, Interrupted after Ctrl-C.
+    """
+    grasps = [grasp for part in (train, validation) for grasp in _grasps(part)]
+    objects = [tuple(sorted(set(part.object_ids))) for part in (train, validation)]
+    split = Split(setting.seed, train=objects[0], validation=objects[1], test=())
+    with _folder(setting.folder) as folder:
+        done, known = folder / f"late_fusion-{setting.seed}.safetensors", _both(train, validation)
+        trainer = Trainer(_config(setting, train), split, grasps, unfinished(done), SOURCE, known)
+        _require_fit(trainer.matcher, known)
+        towers = frozen_matcher(setting.config)
+        trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
+        trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
+        return finish(trainer, done, setting.quiet)
+
+
+def frozen_matcher(config: Config) -> Matcher:
+    """A matcher whose towers are to make features. What of them is random hangs on the configuration's own seed, not
+    on that of a head: one set of features serves heads of every seed."""
+    torch.manual_seed(config.training.seed)
+    return build_matcher(config).eval()
+
+
+def _config(setting: Setting, train: Features) -> Config:
+    matcher = dataclasses.replace(setting.config.matcher, fingers=train.touch.shape[1])
+    training = dataclasses.replace(setting.config.training, seed=setting.seed, freeze_towers=True)
+    return dataclasses.replace(setting.config, matcher=matcher, training=training)
+
+
+def _grasps(features: Features) -> Iterator[Grasp]:
+    """Grasps to draw pairs from; their files are names, which nobody opens."""
+    for grasp_id, object_id in zip(features.grasp_ids, features.object_ids, strict=True):
+        yield Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
+
+
+def _both(train: Features, validation: Features) -> Features:
+    return Features(
+        train.grasp_ids + validation.grasp_ids,
+        train.object_ids + validation.object_ids,
+        np.concatenate([train.touch, validation.touch]),
+        np.concatenate([train.photo, validation.photo]),
+    )
+
+
+@contextmanager
+def _folder(given: Path | None) -> Iterator[Path]:
+    if given is not None:
+        yield given
+        return
+    with tempfile.TemporaryDirectory() as temporary:
+        yield Path(temporary)
+
+
+def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
+    """Fingers, features of one finger, features of a photo."""
+    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.photo_tower.feature_count
+
+
+def _require_fit(matcher: Matcher, features: Features) -> None:
+    wanted, got = _feature_counts(matcher), (*features.touch.shape[1:], *features.photo.shape[1:])
+    if wanted != got:
+        raise BadInput(
+            f"late fusion takes features of its own towers, {wanted[1]} of a finger and {wanted[2]} of a photo "
+            f"({matcher.config.tower}, {matcher.config.tower_output}); got {got[1]} and {got[2]}; encode with these"
+        )

@@ -1,0 +1,84 @@
+"""What users run: candidates by the embedding, judged by the match logit; shares its training with late fusion."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retrieval.checkpoint import Checkpoint
+from retrieval.fusion import score_halves
+from retrieval.methods.base import Array, Setting
+from retrieval.methods.late_fusion import LateFusion
+
+SHARE = 0.25
+
+
+class PruneRerank(LateFusion):
+    """Search as `retrieve query` does: only the nearest photos by embedding are judged by match logit.
+
+    share: of the gallery that is judged. The others stand behind these, in the order of their embeddings. Photos are
+    taken for each grasp of a set and put together, as search does. A model without trained embeddings
+    (contrastive_weight = 0) judges every photo. A code is the half and, behind it, the embedding.
+    """
+
+    def __init__(self, setting: Setting, share: float = SHARE) -> None:
+        super().__init__(setting)
+        self.share = share
+
+    def _take(self, checkpoint: Checkpoint) -> None:
+        super()._take(checkpoint)
+        if checkpoint.config.training.contrastive_weight == 0:
+            self.share = 1.0
+        self.chosen["judged_share"] = self.share
+
+    @torch.inference_mode()
+    def _encode_touch(self, touch: Array) -> Array:
+        return np.concatenate(self._matcher.touch_code(torch.from_numpy(touch).flatten(1)), axis=1)
+
+    @torch.inference_mode()
+    def _encode_photo(self, photo: Array) -> Array:
+        return np.concatenate(self._matcher.photo_code(torch.from_numpy(photo)), axis=1)
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        touch_halves, halves, nearness = self._parts(touch_codes, photo_codes)
+        scores = []
+        for touch_half, near in zip(torch.from_numpy(touch_halves), nearness, strict=True):
+            rows = candidates(near[None], self._count(len(halves)))
+            scores.append(behind(near[None], rows, score_halves(self._matcher.head, touch_half[None], halves, rows)))
+        return np.array(scores)
+
+    def _score_sets(self, touch_codes: Array, photo_codes: Array, sets: NDArray[np.int64]) -> Array:
+        """As of one touch; but sets share touches, so that here all photos are judged, each once a touch."""
+        used, place = np.unique(sets, return_inverse=True)
+        touch_halves, halves, nearness = self._parts(touch_codes[used], photo_codes)
+        logits = super()._score(touch_halves, halves)
+        scores = []
+        for chosen in place.reshape(sets.shape):
+            rows = candidates(nearness[chosen], self._count(len(halves)))
+            summed = logits[np.ix_(chosen, rows)].sum(0, dtype=np.float64).astype(np.float32)
+            scores.append(behind(nearness[chosen], rows, summed))
+        return np.array(scores)
+
+    def _parts(self, touch_codes: Array, photo_codes: Array) -> tuple[Array, Array, Array]:
+        """Halves of touches and of photos, and cosines (T, N) of their embeddings."""
+        hidden = self._matcher.config.hidden
+        nearness = touch_codes[:, hidden:] @ photo_codes[:, hidden:].T
+        return touch_codes[:, :hidden], np.ascontiguousarray(photo_codes[:, :hidden]), nearness
+
+    def _count(self, photos: int) -> int:
+        return max(1, round(self.share * photos))
+
+
+def behind(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Array:
+    """Scores (N,) of all photos: logits of those at `rows`, all others below these by their mean cosine.
+
+    nearness (G, N): cosines of each grasp's embedding with each photo's; they are 1 at most.
+    """
+    scores = logits.min() - 1 - (1 - nearness.mean(0))
+    scores[rows] = logits
+    return np.asarray(scores)
+
+
+def candidates(nearness: Array, count: int) -> NDArray[np.int64]:
+    """The `count` nearest photos of each grasp, together; equals by row. nearness (G, N)."""
+    nearest = np.argsort(-nearness, axis=1, kind="stable")[:, :count]
+    return np.unique(nearest)

@@ -1,0 +1,64 @@
+"""How a method chooses its settings: by ranking on validation objects, never by its fit to the training objects."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.features import Features
+
+MOST_JUDGED = 512
+
+
+def judged_rows(validation: Features, most: int = MOST_JUDGED) -> NDArray[np.int64]:
+    """Rows of the grasps to choose by: of each object as many, evenly spaced, about `most` in all (2 at least)."""
+    each = max(most // (int(validation.owner.max()) + 1), 2)
+    parts = [np.flatnonzero(validation.owner == owner) for owner in range(int(validation.owner.max()) + 1)]
+    return np.concatenate([part[np.linspace(0, len(part) - 1, min(each, len(part))).astype(int)] for part in parts])
+
+
+def ranking_auc(
+    scores: NDArray[np.floating[Any]],
+    touch_owner: NDArray[np.int64],
+    photo_owner: NDArray[np.int64],
+    left_out: NDArray[np.bool_],
+) -> float:
+    """How often a photo of the touched object scores above one of another object; equals count half.
+
+    scores (T, N); left_out (T, N): photos taken in the row's own grasps, which do not count (where the object has no
+    other, they do). Mean over the pairs of a touch, over the touches of an object, over objects; a constant scorer
+    has exactly 0.5.
+    """
+    values = np.empty(len(scores))
+    for row, (score, owner) in enumerate(zip(scores, touch_owner, strict=True)):
+        same = photo_owner == owner
+        own = same & ~left_out[row]
+        others = np.sort(score[~same])
+        mine = score[own if own.any() else same]
+        below = np.searchsorted(others, mine, "left") + np.searchsorted(others, mine, "right")
+        values[row] = below.mean() / (2 * len(others))
+    return float(np.mean([values[touch_owner == owner].mean() for owner in np.unique(touch_owner)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """The validation grasps to choose by. Both methods of it give what the scores of their touches are worth."""
+
+    features: Features
+
+    def touches(self, scores: NDArray[np.floating[Any]]) -> float:
+        """Worth of scores (n, n) of every touch with every photo."""
+        return self.sets(scores, np.arange(len(self.features))[:, None])
+
+    def sets(self, scores: NDArray[np.floating[Any]], sets: NDArray[np.int64]) -> float:
+        """Worth of scores (S, n) of sets (S, G) of touches with every photo."""
+        left_out = np.zeros(scores.shape, dtype=np.bool_)
+        np.put_along_axis(left_out, sets, True, axis=1)
+        owner = self.features.owner
+        return ranking_auc(scores, owner[sets[:, 0]], owner, left_out)
+
+
+def judge(validation: Features) -> Judge:
+    """A judge by enough of the validation grasps."""
+    return Judge(validation.select(judged_rows(validation)))

@@ -1,0 +1,42 @@
+"""Features at mean 0 and variance 1 by the training grasps."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput
+
+CONSTANT = 1e-6
+"""A feature whose spread is below this share of its size is constant to float32, and dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standardiser:
+    """`(x - mean) / scale` of the features that vary. kept, mean, scale (F',): which, and their statistics."""
+
+    kept: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+    @classmethod
+    def fit(cls, x: NDArray[Any]) -> "Standardiser":
+        """Statistics of x (n, ...), flattened to (n, F) and reckoned in float64. Raises BadInput where none varies."""
+        x = _flat(x)
+        mean, scale = x.mean(0), x.std(0)
+        kept = np.flatnonzero(scale > CONSTANT * np.abs(x).max(0))
+        if not len(kept):
+            raise BadInput(
+                f"features must differ between grasps; all {x.shape[1]} are constant over {len(x)}; are the images?"
+            )
+        return cls(kept, mean[kept], scale[kept])
+
+    def __call__(self, x: NDArray[Any]) -> NDArray[np.float64]:
+        """Standardised features (n, F') of x (n, ...)."""
+        return (_flat(x)[:, self.kept] - self.mean) / self.scale
+
+
+def _flat(x: NDArray[Any]) -> NDArray[np.float64]:
+    x = np.asarray(x)
+    return np.asarray(x.reshape(len(x), int(np.prod(x.shape[1:]))), dtype=np.float64)

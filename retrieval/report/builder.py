@@ -1,0 +1,42 @@
+"""What every section of an evaluation's report is built with."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from retrieval.report.canvas import draw
+from retrieval.report.document import Block, Details, Picture
+from retrieval.report.galleries import Grasps
+from retrieval.report.results import Results, at_start, measure_label, method_label, percent
+
+
+class Builder:
+    """Results, the recording's grasps (none: no galleries) and the folder; figures are written on the way."""
+
+    def __init__(self, results: Results, grasps: Grasps, out: Path) -> None:
+        self.results, self.grasps, self.out = results, grasps, out
+        self.main = (results.learned or results.methods)[0]
+        self.figures: list[Path] = []
+
+    def picture(self, name: str, alt: str, caption: str, make: Callable[..., Any], *arguments: Any) -> Picture:
+        path = draw(self.out / "figures" / name, make, *arguments)
+        self.figures.append(path)
+        return Picture(f"figures/{name}", alt, caption)
+
+    def any(self, *measures: str) -> bool:
+        return any(self.results.summary(name, key) for name in self.results.methods for key in measures)
+
+    def values(self, measure: str) -> str:
+        """Values of all methods in words, for the text that stands for a figure."""
+        found = [(method_label(name), self.results.summary(name, measure)) for name in self.results.methods]
+        values = [f"{label} {percent(summary['value'][0])} %" for label, summary in found if summary]
+        chance = next((summary["chance"][0] for _, summary in found if summary), None)
+        return f"{measure_label(measure)}: {', '.join(values)}; chance {percent(chance)} %"
+
+    def each(self, what: str, show: Callable[[str], Iterator[Block]]) -> Iterator[Block]:
+        """Blocks of the main method, then folded those of the other ones that have `what`."""
+        for name in self.results.learned:
+            if self.results.data["methods"][name].get(what):
+                blocks = tuple(show(name))
+                folded = (Details(at_start(method_label(name)), blocks),) if blocks else ()
+                yield from blocks if name == self.main else folded

@@ -1,0 +1,106 @@
+"""How the report's figures look: colours that colour-blind readers tell apart, light background, files."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from retrieval.errors import RetrievalError
+
+Figure = Any
+Axes = Any
+
+FAINT = "#8a949e"
+PART_COLOURS = {"test": "#c8382e", "validation": "#9aa3ab", "train": "#2f6fb3"}
+FIGURE_DPI = 144
+# No $...$ formulas: an object may be called anything.
+_RC: Any = {
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#5b6672",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e9ec",
+    "lines.linewidth": 1.8,
+    "lines.markersize": 6,
+    "text.parse_math": False,
+}
+
+
+@dataclass(frozen=True)
+class Style:
+    """A method's colour, marker and line, the same in every figure."""
+
+    colour: str
+    marker: str
+    line: str = "-"
+
+
+# Okabe and Ito's palette for the main ones, and a marker each for who sees no colours.
+_STYLES = {
+    "late_fusion": Style("#0072b2", "o"),
+    "set_fusion": Style("#56b4e9", "s"),
+    "prune_rerank": Style("#009e73", "D"),
+    "contrastive": Style("#d55e00", "^"),
+    "contrastive_sigmoid": Style("#e69f00", "v"),
+    "cca": Style("#aa3377", "P"),
+    "plsca": Style("#6f4e37", "X"),
+    "chance": Style("#6b7580", ".", ":"),
+    "constant": Style("#aab2ba", "|", ":"),
+}
+
+
+def style_of(method: str) -> Style:
+    """The style of a method; one that is not known is black."""
+    return _STYLES.get(method, Style("#222222", "*"))
+
+
+def canvas(width_in: float, height_in: float) -> Figure:
+    """An empty figure."""
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+    return MatplotlibFigure((width_in, height_in), FIGURE_DPI, layout="constrained", facecolor="white")
+
+
+def percent_axis(panel: Axes, label: str) -> None:
+    """A vertical axis from 0 to 100 %."""
+    panel.set_ylim(0, 102)
+    panel.set_yticks(range(0, 101, 20))
+    panel.set_ylabel(label)
+
+
+def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
+    """Write the figure that `make(*arguments)` gives; a .jpg holds photographs, a .png holds lines.
+
+    Raises RetrievalError where matplotlib is missing.
+    """
+    try:
+        from matplotlib import rc_context
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+    except ImportError as error:
+        raise RetrievalError(
+            f"figures need matplotlib, and {error.name} is missing; run pip install 'touch-retrieval[evaluation]'"
+        ) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with rc_context(_RC), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
+        agg: Any = FigureCanvasAgg(make(*arguments))
+        agg.draw()
+    _write(path, np.asarray(agg.buffer_rgba()))
+    return path
+
+
+def _write(path: Path, samples: NDArray[np.uint8]) -> None:
+    """A plot has few colours: 256 of its own make the file three times smaller."""
+    image = Image.fromarray(np.ascontiguousarray(samples[..., :3]))
+    if path.suffix == ".jpg":
+        image.save(path, quality=86)
+    else:
+        image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)

@@ -1,0 +1,136 @@
+"""Sections that set the methods side by side, and say whether the result can be believed."""
+
+from collections.abc import Iterator
+
+from retrieval.report import galleries, plots, tables
+from retrieval.report.builder import Builder
+from retrieval.report.document import Block, Details, Listing, Text
+from retrieval.report.results import GRASPS
+
+INTERVALS = (
+    "Brackets hold 95 % intervals: a bootstrap that resamples objects, since queries of one object are alike. Every "
+    "value is the mean over objects of each object's mean, averaged over seeds where there are several. The interval "
+    "covers other objects of this kind; it does not cover another recording, split or rig. "
+    "Equal scores count by their expected rank, so a constant scorer gets exactly chance."
+)
+
+
+def side_by_side(builder: Builder) -> Iterator[Block | None]:
+    """The main measures of all methods."""
+    if builder.any(*plots.OVERVIEW):
+        shown = [key for key in plots.OVERVIEW if builder.any(key)]
+        yield builder.picture(
+            "overview.png",
+            f"Dots with intervals. {'. '.join(builder.values(key) for key in shown)}.",
+            "Value and 95 % interval of each method; dashed: chance in closed form.",
+            plots.overview,
+            builder.results,
+        )
+    yield tables.measures(builder.results, ("pair_accuracy", "pair_auc", "guesses_k5", "guesses_k10", "all_objects_k5"))
+    yield Text("Bold: the highest of a column, whether or not the next one is apart from it.")
+    yield Text(INTERVALS)
+
+
+def guess_curves(builder: Builder) -> Iterator[Block | None]:
+    """How often the object is found within N guesses."""
+    if not builder.any("guesses_k5", "guesses_k10"):
+        return
+    yield builder.picture(
+        "guess-curves.png",
+        f"Rising curves. {builder.values('guesses_k5')}. {builder.values('guesses_k10')}.",
+        "How often the object is found within N guesses, the true one among K − 1 others. Bands: 95 % intervals.",
+        plots.guess_curves,
+        builder.results,
+    )
+    for k in (5, 10):
+        if table := tables.guesses(builder.results, f"guesses_k{k}"):
+            yield Details(f"Numbers for {k} candidates", (table,))
+
+
+def grasps(builder: Builder) -> Iterator[Block | None]:
+    """What several grasps of one object add."""
+    keys = [f"guesses_k5_g{count}_p3" for count in GRASPS]
+    if builder.any(*keys):
+        yield builder.picture(
+            "grasps.png",
+            f"First guess against grasps in a query. {'. '.join(builder.values(k) for k in keys if builder.any(k))}.",
+            "A query of several grasps of one object against three photos of each of five objects; dashed: chance.",
+            plots.grasps,
+            builder.results,
+        )
+        yield tables.measures(builder.results, keys, [f"{count} grasp{'s' * (count > 1)}" for count in GRASPS])
+
+
+def time(builder: Builder) -> Iterator[Block | None]:
+    """Accuracy against run time, and every time."""
+    if builder.results.timings.get("methods"):
+        if builder.any("guesses_k5"):
+            yield builder.picture(
+                "time.png",
+                f"Accuracy against time on a logarithmic scale. {builder.values('guesses_k5')}. Times in the table.",
+                "Upper left is better. The grey steps join the methods that no other one beats in both; dashed: "
+                "chance.",
+                plots.accuracy_and_time,
+                builder.results,
+            )
+        yield tables.times(builder.results)
+
+
+def gallery(builder: Builder) -> Iterator[Block | None]:
+    """Ranks in the full gallery, both ways, and the protocols of ObjectFolder and TVL."""
+    ranks = ("recall_1", "recall_5", "recall_10", "mrr", "map")
+    both = ("objectfolder_touch_to_photo", "objectfolder_photo_to_touch")
+    short = ("R@1", "R@5", "R@10", "MRR", "mAP")
+    for text, keys, headings in (
+        ("From a touch to all photos of the unseen objects; any photo of the object is right.", ranks, short),
+        ("The other way: from a photo to all touches.", tuple(f"photo_to_touch_{key}" for key in ranks), short),
+        ("ObjectFolder's cross-sensory retrieval: mAP over all instances, those of the query's grasp too.", both, ()),
+        (
+            "Paired, as TVL does it: the whole test set is one batch, and only the photo of the same grasp is "
+            "right; mean of both directions.",
+            ("paired_top1", "paired_top5"),
+            (),
+        ),
+    ):
+        if table := tables.measures(builder.results, keys, headings):
+            yield Text(text)
+            yield table
+
+
+def comparisons(builder: Builder) -> Iterator[Block | None]:
+    """Paired differences between methods."""
+    if builder.results.data.get("comparisons"):
+        yield tables.comparisons(builder.results)
+
+
+# Can it be believed? --------------------------------------------------------------------------------
+
+
+def controls(builder: Builder) -> Iterator[Block | None]:
+    """What is left when the answer is taken out of the input."""
+    if builder.results.data.get("controls"):
+        yield Text("The same method after what could give the answer was taken away. Chance is what should be left.")
+        yield tables.controls(builder.results)
+
+
+def audit(builder: Builder) -> Iterator[Block | None]:
+    """What the parts of the split share."""
+    if not (found := builder.results.data.get("audit")):
+        return
+    yield Text(found["verdict"], warn=not found["clean"])
+    if examples := found["identical"]["examples"]:
+        yield Listing("\n".join("  =  ".join(places) for places in examples))
+    yield tables.audit(found)
+    if builder.grasps and any(frames["nearest"] for frames in found["frames"].values()):
+        gaps = [
+            f"{kind} {one['nearest'][0]['distance']:.2f}" for kind, one in found["frames"].items() if one["nearest"]
+        ]
+        yield builder.picture(
+            "nearest.jpg",
+            f"Test frames beside the nearest frames fitted or chosen on; grey levels apart: {', '.join(gaps)}.",
+            "The nearest frames on both sides of the split. Copies would look the same here; two light touches "
+            "look alike without being copies.",
+            galleries.nearest_frames,
+            found["frames"],
+            builder.grasps,
+        )

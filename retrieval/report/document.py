@@ -1,0 +1,171 @@
+"""A document of headings, paragraphs, tables and pictures, written as Markdown and as one HTML page.
+
+Both are made from the same blocks, so they cannot say different things.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jinja2
+from PIL import Image
+
+from retrieval.report.canvas import FIGURE_DPI
+from retrieval.report.pictures import data_uri
+
+_PAGE_DPI = 96
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph. warn: set apart, as something not to be overlooked."""
+
+    kind: ClassVar[str] = "text"
+    text: str
+    warn: bool = False
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Text in a fixed font, as it stands."""
+
+    kind: ClassVar[str] = "listing"
+    text: str
+
+    @classmethod
+    def of_json(cls, data: Any) -> "Listing":
+        """Data of JSON types, one item a line."""
+        return cls(json.dumps(data, indent=2, sort_keys=True, ensure_ascii=False))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of plain text. words: columns of sentences, not of numbers; bold: (row, column) of cells that stand out;
+    notes: paragraphs below."""
+
+    kind: ClassVar[str] = "table"
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+    words: frozenset[int] = frozenset()
+    bold: frozenset[tuple[int, int]] = frozenset()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture in a file under the document's folder. alt: what it shows, for those who cannot see it."""
+
+    kind: ClassVar[str] = "picture"
+    file: str
+    alt: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """Blocks that a page keeps folded until they are asked for."""
+
+    kind: ClassVar[str] = "details"
+    title: str
+    blocks: tuple["Block", ...]
+
+
+Block = Text | Listing | Table | Picture | Details
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it."""
+
+    title: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Document:
+    """A title, paragraphs on top, and sections."""
+
+    title: str
+    lead: tuple[Block, ...]
+    sections: tuple[Section, ...] = field(default=())
+
+
+# HTML ------------------------------------------------------------------------------------------------
+
+
+def to_html(document: Document, folder: Path) -> str:
+    """One page with every picture, read from under `folder`, inside it."""
+
+    def uri(file: str) -> str:
+        return data_uri((folder / file).read_bytes(), "png" if file.endswith(".png") else "jpeg")
+
+    def width(file: str) -> int:
+        """Of the figure on the page, so that letters have one size in all of them."""
+        with Image.open(folder / file) as image:
+            return round(image.width * _PAGE_DPI / FIGURE_DPI)
+
+    source = (resources.files("retrieval") / "templates" / "evaluation.html").read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(source).render(document=document, uri=uri, width=width, anchor=_anchor)
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+
+
+# Markdown --------------------------------------------------------------------------------------------
+
+
+def to_markdown(document: Document) -> str:
+    """The same as GitHub Markdown; pictures are links to their files."""
+    parts = [f"# {_plain(document.title)}", *_blocks(document.lead, 2)]
+    for section in document.sections:
+        parts += [f"## {_plain(section.title)}", *_blocks(section.blocks, 3)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
+    for block in blocks:
+        if isinstance(block, Details):
+            yield f"{'#' * level} {_plain(block.title)}"
+            yield from _blocks(block.blocks, level + 1)
+        else:
+            yield from _block(block)
+
+
+def _block(block: Text | Listing | Table | Picture) -> Iterator[str]:
+    if isinstance(block, Text):
+        yield f"> {_plain(block.text)}" if block.warn else _plain(block.text)
+    elif isinstance(block, Listing):
+        yield "\n".join(f"    {line}" for line in block.text.splitlines())
+    elif isinstance(block, Picture):
+        yield f"![{_plain(block.alt)}]({block.file})"
+        yield _plain(block.caption)
+    else:
+        yield _table(block)
+        yield from (_plain(note) for note in block.notes)
+
+
+def _table(table: Table) -> str:
+    lines = [_row(table.header), _row(tuple(_line(column in table.words | {0}) for column in range(len(table.header))))]
+    for number, row in enumerate(table.rows):
+        marked = [(_plain(cell), (number, column) in table.bold) for column, cell in enumerate(row)]
+        lines.append(_row(tuple(f"**{text}**" if bold else text for text, bold in marked)))
+    return "\n".join(lines)
+
+
+def _line(words: bool) -> str:
+    return "---" if words else "---:"
+
+
+def _row(cells: tuple[str, ...]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _plain(text: str) -> str:
+    """The text with what Markdown or HTML would take for markup made harmless, on one line."""
+    return re.sub(r"([\\`*_\[\]|<>&])", r"\\\1", " ".join(text.split()))

@@ -1,0 +1,118 @@
+"""The report of an evaluation: results.json and the recording's pictures in, Markdown, one HTML page and figures out.
+
+Every number comes from results.json or timings.json; nothing is measured here.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from retrieval.dataset import load_grasps
+from retrieval.report import comparing, looking, tables
+from retrieval.report.builder import Builder
+from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown
+from retrieval.report.results import at_start, measure_label, method_label, percent, read_results, with_interval
+
+PAPER = (
+    "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "
+    "of 64.3 % (chance 50 %) on its 18 unseen objects (Lin, Calandra, Levine: Learning to Identify Object Instances by "
+    "Touch, ICRA 2019). Other objects, other pictures: it is no rival to the numbers here."
+)
+SIMULATION = (
+    "This recording is simulated. It can show that the code works, how methods compare on the same data, and how "
+    "accuracy moves with objects, grasps and time. It cannot say how well any of them does on real sensors and real "
+    "objects: relief, material and light are drawn from a program, photo and touch come from one geometry without "
+    "wear, dirt or error of calibration, and objects differ only by what the program varies."
+)
+
+
+def write_report(out: Path, recording: Path | None) -> list[Path]:
+    """Write report.md, report.html and figures/ under `out` from its results.json (and timings.json where it is).
+
+    recording: where the pictures of the galleries are; None leaves the galleries out. Returns the files written.
+    Raises BadInput for results that cannot be read, DatasetError for a recording that cannot, RetrievalError where
+    matplotlib is missing.
+    """
+    results = read_results(out)
+    grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}
+    builder = Builder(results, grasps, out)
+    document = _document(builder)
+    text, page = out / "report.md", out / "report.html"
+    text.write_text(to_markdown(document), "utf-8")
+    page.write_text(to_html(document, out), "utf-8")
+    return [text, page, *builder.figures]
+
+
+def _document(builder: Builder) -> Document:
+    """The whole report; a section without anything to show is left out."""
+    sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
+    title = f"Which object was touched? Evaluation on {builder.results.data['recording']['path_name']}"
+    return Document(title, tuple(_lead(builder)), tuple(section for section in sections if section.blocks))
+
+
+def _lead(builder: Builder) -> Iterator[Block]:
+    data = builder.results.data
+    parts, recording = data["split"], data["recording"]
+    yield Text(
+        f"{recording['objects']} objects, {recording['grasps']:,} grasps, source: {recording['source']}. "
+        f"Fitted on {len(parts['train'])} objects, chosen and calibrated on {len(parts['validation'])}, judged on "
+        f"{len(parts['test'])} that nothing has seen. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
+    )
+    yield Text(_headline(builder))
+    if audit := data.get("audit"):
+        yield Text(f"Leakage audit: {audit['verdict']}", warn=not audit["clean"])
+    if builder.results.simulated:
+        yield Text(SIMULATION)
+    yield Text(PAPER)
+
+
+def _headline(builder: Builder) -> str:
+    keys = ("pair_accuracy", "guesses_k5", "guesses_k5_g5_p3")
+    found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]
+    told = [
+        f"{measure_label(key)}: {with_interval(summary)} (chance {percent(summary['chance'][0])})"
+        for key, summary in found
+    ]
+    return f"{at_start(method_label(builder.main))} on unseen objects, in percent. {at_start('; '.join(told))}."
+
+
+def _setting(builder: Builder) -> Iterator[Block | None]:
+    data = builder.results.data
+    setting, features, recording = data["setting"], data["setting"]["features"], data["recording"]
+    plain = {key: value for key, value in sorted(setting.items()) if isinstance(value, str | int | float)}
+    rows = (
+        ("recording", f"{recording['path_name']} ({recording['source']})"),
+        ("digest of the recording", recording["digest"]),
+        ("features", f"touch {features['touch']} x {features['fingers']} finger(s), photo {features['photo']}"),
+        ("digest of the features", features["digest"]),
+        ("seed of the split", str(data["split"]["seed"])),
+        *((key, f"{value:,}" if isinstance(value, int) else str(value)) for key, value in plain.items()),
+        ("software", f"touch-retrieval {data['software']}"),
+    )
+    yield Table(("setting", "value"), rows, words=frozenset({1}))
+    yield Details("Objects of each part", (tables.split(builder.results),))
+    yield Details("Configuration", (Listing.of_json(setting["config"]),))
+    if chosen := {name: one["chosen"] for name, one in data["methods"].items() if any(one.get("chosen") or ())}:
+        yield Details("Chosen on validation objects, for each seed", (Listing.of_json(chosen),))
+
+
+def _everything(builder: Builder) -> Iterator[Block | None]:
+    yield Details("Every measure of every method", (tables.everything(builder.results),))
+
+
+SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
+    "Methods side by side": comparing.side_by_side,
+    "Guess curves": comparing.guess_curves,
+    "More grasps of the same object": comparing.grasps,
+    "Accuracy and time": comparing.time,
+    "Full gallery": comparing.gallery,
+    "Differences between methods": comparing.comparisons,
+    "Controls": comparing.controls,
+    "Leakage audit": comparing.audit,
+    "Object by object": looking.objects,
+    "What was mistaken for what": looking.confusions,
+    "Best and worst queries": looking.examples,
+    "Calibration": looking.calibration,
+    "Is the object in the catalogue?": looking.reject,
+    "How this was made": _setting,
+    "Every number": _everything,
+}

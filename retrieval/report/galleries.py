@@ -1,0 +1,134 @@
+"""Figures of photographs: what an object was mistaken for, best and worst queries, the nearest frames of an audit.
+
+All pictures of a figure lie in one pair of axes, in units of a tile: many axes are slow to lay out.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from string import ascii_lowercase
+from typing import Any
+
+from retrieval.dataset import Grasp
+from retrieval.report.canvas import Axes, Figure, canvas
+from retrieval.report.pictures import thumbnail
+from retrieval.report.results import number, percent, short
+
+_TILE_PX = 150
+_RIGHT, _WRONG, _LINE = "#0a9d58", "#c8382e", "#c3cad1"
+_LETTERS = 21  # of a small label under a tile, a line
+
+Grasps = Mapping[str, Grasp]
+"""Grasps of the recording by grasp_id; what it lacks is left blank."""
+
+
+def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
+    """A row for each query: its gel images, then the photos in the order found, the true object framed green."""
+    fingers = max(
+        (len(grasps[query["grasp_id"]].touches) for query in queries if query["grasp_id"] in grasps), default=1
+    )
+    columns = fingers + 0.35 + max(len(query["ranked"]) for query in queries)
+    figure, panel = _sheet(columns, 1.4 * len(queries) - 0.1)
+    for column in range(fingers):
+        panel.text(column + 0.46, -0.12, f"finger {ascii_lowercase[column]}", ha="center", fontsize=8)
+    panel.text(fingers + 0.35, -0.12, "photos, most likely first", fontsize=8)
+    for row, query in enumerate(queries):
+        _example(panel, 1.4 * row, query, grasps, fingers)
+    return figure
+
+
+def _example(panel: Axes, top: float, query: Any, grasps: Grasps, fingers: int) -> None:
+    own = grasps.get(query["grasp_id"])
+    for column in range(fingers):
+        _tile(panel, column, top, own.touches[column] if own else None)
+    _label(panel, 0, top, f"{short(query['object_id'], 2 * _LETTERS + 4)}\nrank {number(query['true_rank'])}")
+    for place, name in enumerate(query["ranked"]):
+        shown, left = grasps.get(name), fingers + 0.35 + place
+        right = shown is not None and shown.object_id == query["object_id"]
+        _tile(panel, left, top, shown.photo if shown else None, _RIGHT if right else _LINE, 3 if right else 0.8)
+        _label(panel, left, top, f"{place + 1}. {_two_lines(shown.object_id if shown else name)}")
+
+
+def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
+    """Object and what it was taken for, side by side, with the share of its queries where that came first."""
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    figure, panel = _sheet(3.1 * columns - 0.4, 1.45 * rows - 0.15)
+    for place, pair in enumerate(pairs):
+        left, top = 3.1 * (place % columns), 1.45 * (place // columns)
+        _tile(panel, left, top, photo_of.get(pair["object_id"]))
+        _label(panel, left, top, _two_lines(pair["object_id"]))
+        panel.text(left + 1.33, top + 0.38, f"{percent(pair['share'], 0)} %", ha="center", va="bottom", fontsize=10)
+        panel.annotate(
+            "",
+            (left + 1.66, top + 0.5),
+            (left + 1.02, top + 0.5),
+            arrowprops={"arrowstyle": "-|>", "color": _WRONG, "lw": 1.5},
+        )
+        _tile(panel, left + 1.75, top, photo_of.get(pair["mistaken_for"]), _WRONG, 2)
+        _label(panel, left + 1.75, top, _two_lines(pair["mistaken_for"]))
+    return figure
+
+
+def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
+    """The nearest pairs of the audit, a row for each kind of frame: test frame beside the frame fitted or chosen on."""
+    kinds = [kind for kind in frames if frames[kind]["nearest"]]
+    shown = min(3, max(len(frames[kind]["nearest"]) for kind in kinds))
+    figure, panel = _sheet(2.35 * shown - 0.35, 1.5 * len(kinds) - 0.1)
+    for row, kind in enumerate(kinds):
+        for column, pair in enumerate(frames[kind]["nearest"][:shown]):
+            left, top = 2.35 * column, 1.5 * row
+            panel.text(left, top - 0.05, f"{kind}: {pair['distance']:.2f} grey levels apart", fontsize=8)
+            for side, part in enumerate(("test", "seen")):
+                grasp = grasps.get(pair[part])
+                _tile(panel, left + side, top, _frame(grasp, kind) if grasp else None)
+                _label(panel, left + side, top, f"{part}: {_two_lines(grasp.object_id if grasp else pair[part], 6)}")
+    return figure
+
+
+def _frame(grasp: Grasp, kind: str) -> Path:
+    return grasp.photo if kind == "photo" else grasp.touches[ascii_lowercase.index(kind[-1])]
+
+
+# Tiles -----------------------------------------------------------------------------------------------
+
+
+def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
+    """A figure of that many tiles, each 1.15 inch; y grows downwards."""
+    figure = canvas(1.15 * (width + 0.1), 1.15 * (height + 0.3))
+    figure.set_layout_engine("none")
+    panel = figure.add_axes((0, 0, 1, 1))
+    panel.set_axis_off()
+    panel.set(xlim=(-0.05, width + 0.05), ylim=(height, -0.3))
+    return figure, panel
+
+
+def _tile(panel: Axes, left: float, top: float, path: Path | None, frame: str = _LINE, width: float = 0.8) -> None:
+    """One picture in its own shape, centred in a tile of 0.92; blank where there is none."""
+    from matplotlib.patches import Rectangle
+
+    image = thumbnail(path, _TILE_PX) if path else None
+    high, wide = (1, 1) if image is None else image.shape[:2]
+    x, y = 0.92 * wide / max(high, wide), 0.92 * high / max(high, wide)
+    left, top = left + (0.92 - x) / 2, top + (0.92 - y) / 2
+    if image is None:
+        panel.text(left + x / 2, top + y / 2, "no picture", ha="center", va="center", fontsize=7, color="#5b6672")
+    else:
+        panel.imshow(image, extent=(left, left + x, top + y, top), interpolation="antialiased", aspect="auto", zorder=1)
+    fill = "none" if image is not None else "#eef1f4"
+    panel.add_patch(
+        Rectangle((left, top), x, y, facecolor=fill, edgecolor=frame, lw=width, zorder=2 if image is not None else 0)
+    )
+
+
+def _label(panel: Axes, left: float, top: float, text: str) -> None:
+    panel.text(left, top + 0.97, text, va="top", fontsize=6.5, linespacing=1.15)
+
+
+def _two_lines(name: str, taken: int = 3) -> str:
+    """The name on at most two lines, parted where it has a mark, its middle left out where it is longer."""
+    length = _LETTERS - taken
+    if len(name) <= length:
+        return name
+    marks = [at + 1 for at, letter in enumerate(name[:length]) if letter in "-_. " and len(name) - at - 1 <= length]
+    cut = marks[-1] if marks else length
+    return f"{name[:cut]}\n{short(name[cut:], length)}"

@@ -1,0 +1,37 @@
+"""Thumbnails of image files, and images inside a page."""
+
+import base64
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import ImageError
+from retrieval.images import read_rgb, resize
+
+Thumbnail = NDArray[np.uint8]
+"""(H, W, 3) red first."""
+
+
+def thumbnail(path: Path, px: int) -> Thumbnail | None:
+    """The image at `path`, its longer side at most `px`; None where it cannot be read."""
+    try:
+        image = read_rgb(path)
+    except ImageError:
+        return None
+    height, width = image.shape[:2]
+    scale = min(1.0, px / max(height, width))
+    image = resize(image, (max(1, round(height * scale)), max(1, round(width * scale))))
+    return np.rint(image * 255).astype(np.uint8)
+
+
+def jpeg(image: Thumbnail) -> bytes:
+    """The image as the bytes of a JPEG file."""
+    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return data.tobytes()
+
+
+def data_uri(data: bytes, kind: str) -> str:
+    """The bytes of an image file as an address that needs no file; kind is "jpeg" or "png"."""
+    return f"data:image/{kind};base64," + base64.b64encode(data).decode("ascii")

@@ -1,0 +1,304 @@
+"""Plots of an evaluation, one function each: results in, a matplotlib figure out."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.report.canvas import FAINT, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
+from retrieval.report.results import GRASPS, KNOW_NOTHING, Results, measure_label, method_label, percent, short
+
+OVERVIEW = ("pair_accuracy", "guesses_k5", "guesses_k10", "guesses_k5_g5_p3", "map")
+_LABELLED_OBJECTS = 130
+
+
+def overview(results: Results) -> Figure:
+    """A row for each method, a panel for each of the main measures: value, interval, chance."""
+    keys = [key for key in OVERVIEW if any(results.summary(name, key) for name in results.methods)]
+    figure = canvas(10.5, 0.9 + 0.32 * len(results.methods))
+    panels = figure.subplots(1, len(keys), sharey=True, squeeze=False)[0]
+    for panel, key in zip(panels, keys, strict=True):
+        _forest(panel, results, key)
+    panels[0].set_yticks(range(len(results.methods)), [method_label(name) for name in results.methods])
+    panels[0].invert_yaxis()
+    return figure
+
+
+def _forest(panel: Axes, results: Results, key: str) -> None:
+    for row, name in enumerate(results.methods):
+        if summary := results.summary(name, key):
+            value, low, high = _first(summary)
+            panel.plot([low, high], [row, row], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
+            panel.plot(value, row, style_of(name).marker, color=style_of(name).colour, ms=6.5)
+            panel.axvline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1, zorder=0)
+    panel.set_title(measure_label(key).replace(", ", "\n", 1), fontsize=9)
+    panel.set_xlabel("%")
+    panel.tick_params(axis="y", length=0)
+    panel.grid(axis="y", visible=False)
+
+
+def _first(summary: Any) -> tuple[float, float, float]:
+    """Value, low and high of the first place, in percent."""
+    value, low, high = (_percents(summary[key])[0] for key in ("value", "low", "high"))
+    return float(value), float(low), float(high)
+
+
+def _percents(shares: Sequence[float | None]) -> NDArray[np.float64]:
+    return 100 * np.array([math.nan if share is None else share for share in shares])
+
+
+def guess_curves(results: Results) -> Figure:
+    """Share of queries whose object is among the first N guesses, for 5 and for 10 candidates."""
+    figure = canvas(10.5, 4.6)
+    for panel, key in zip(figure.subplots(1, 2), ("guesses_k5", "guesses_k10"), strict=True):
+        for name in reversed(results.methods):
+            if summary := results.summary(name, key):
+                _curve(panel, name, summary)
+        panel.set_title(f"{key.removeprefix('guesses_k')} candidate objects")
+        panel.set_xlabel("guesses")
+        panel.xaxis.get_major_locator().set_params(integer=True)
+        percent_axis(panel, "object found within so many guesses, %")
+    _legend(figure, results.methods)
+    return figure
+
+
+def _curve(panel: Axes, name: str, summary: Any) -> None:
+    value, low, high = (_percents(summary[key]) for key in ("value", "low", "high"))
+    guesses, style = np.arange(1, len(value) + 1), style_of(name)
+    panel.plot(guesses, _percents(summary["chance"]), color=FAINT, ls="--", lw=1.2, zorder=1)
+    panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
+    if name not in KNOW_NOTHING:
+        panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
+
+
+def _legend(figure: Figure, names: Sequence[str], chance: bool = True) -> None:
+    """One legend on the right, in the order of the tables."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
+        for name, style in ((name, style_of(name)) for name in names)
+    ]
+    if chance:
+        handles.append(Line2D([], [], color=FAINT, ls="--", lw=1.2, label="chance, closed form"))
+    figure.legend(handles=handles, loc="outside right center", frameon=False)
+
+
+def grasps(results: Results) -> Figure:
+    """First guess of five against the number of grasps of the query, three photos of each candidate."""
+    figure = canvas(8, 4.4)
+    panel = figure.subplots()
+    names = [name for name in results.methods if any(results.summary(name, _of_grasps(count)) for count in GRASPS)]
+    for place, name in enumerate(names):
+        shift, style = 0.055 * (place - (len(names) - 1) / 2), style_of(name)
+        found = [(at, results.summary(name, _of_grasps(count))) for at, count in enumerate(GRASPS)]
+        points = np.array([(at + shift, *_first(summary)) for at, summary in found if summary])
+        panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
+        panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
+        for at, summary in found:
+            if summary:
+                panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=FAINT, ls="--", lw=1.2, zorder=1)
+    panel.set_xticks(range(len(GRASPS)), [str(count) for count in GRASPS])
+    panel.set_xlabel("grasps of the same object in one query")
+    percent_axis(panel, "right first guess among 5 objects, %")
+    _legend(figure, names)
+    return figure
+
+
+def _of_grasps(count: int) -> str:
+    return f"guesses_k5_g{count}_p3"
+
+
+# Objects ---------------------------------------------------------------------------------------------
+
+
+def objects_among_test(results: Results, method: str) -> Figure:
+    """First guess of five for every test object, candidates from test objects only."""
+    shares = results.data["methods"][method]["per_object"]["test_candidates"]
+    ranked = sorted(shares, key=lambda name: (-shares[name], name))
+    figure = canvas(10.5, 3.6)
+    panel = figure.subplots()
+    bars = [(name, shares[name], PART_COLOURS["test"]) for name in ranked]
+    _bars(panel, bars, results, "guesses_k5", method, letters=36)
+    return figure
+
+
+def objects_among_all(results: Results, method: str) -> Figure:
+    """First guess of five for every object, candidates from all objects; the parts of the split coloured apart."""
+    shares = results.data["methods"][method]["per_object"]["all_candidates"]
+    bars = [
+        (name, shares[name], PART_COLOURS[part])
+        for part in ("test", "validation", "train")
+        for name in sorted(set(results.data["split"][part]) & set(shares), key=lambda name: (-shares[name], name))
+    ]
+    figure = canvas(13, 3.8)
+    panel = figure.subplots()
+    _bars(panel, bars, results, "all_objects_k5", method, letters=24)
+    _legend_of_parts(panel)
+    return figure
+
+
+def _bars(
+    panel: Axes,
+    bars: Sequence[tuple[str, float, str]],
+    results: Results,
+    measure: str,
+    method: str,
+    letters: int,
+) -> None:
+    """Bars of (object, share, colour), names of at most so many letters, and the chance of the measure."""
+    panel.bar(range(len(bars)), [100 * share for _, share, _ in bars], 0.78, color=[colour for _, _, colour in bars])
+    if summary := results.summary(method, measure):
+        panel.axhline(100 * summary["chance"][0], color="#333333", ls="--", lw=1.2)
+        panel.text(len(bars) - 0.4, 100 * summary["chance"][0], " chance", va="center", fontsize=8)
+    if len(bars) <= _LABELLED_OBJECTS:
+        size = float(np.clip(700 / len(bars), 5.5, 8))
+        panel.set_xticks(range(len(bars)), [short(name, letters) for name, _, _ in bars], rotation=90, fontsize=size)
+    else:
+        panel.set_xticks([])
+        panel.set_xlabel(f"{len(bars)} objects")
+    panel.set_xlim(-0.7, len(bars) - 0.3)
+    panel.grid(axis="x", visible=False)
+    percent_axis(panel, "right first guess, %")
+
+
+def _legend_of_parts(panel: Axes) -> None:
+    from matplotlib.patches import Patch
+
+    names = {"test": "test: never seen", "validation": "validation: chosen on", "train": "train: fitted on"}
+    handles = [Patch(color=PART_COLOURS[part], label=label) for part, label in names.items()]
+    panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
+
+
+def among_test(results: Results) -> dict[str, dict[str, float]]:
+    """By method, then by test object: share of right first guesses among test objects."""
+    found = {name: results.data["methods"][name].get("per_object", {}) for name in results.learned}
+    return {name: shares["test_candidates"] for name, shares in found.items() if shares.get("test_candidates")}
+
+
+def objects_by_method(results: Results) -> Figure:
+    """Every test object against every method: are the hard ones hard for all?"""
+    shares = among_test(results)
+    names = list(shares)
+    objects = sorted(shares[names[0]], key=lambda item: (-shares[names[0]][item], item))
+    values = np.array([[100 * shares[name].get(item, math.nan) for name in names] for item in objects])
+    figure = canvas(3.2 + 0.95 * len(names), 1.6 + 0.24 * len(objects))
+    panel = figure.subplots()
+    image = panel.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    for (row, column), value in np.ndenumerate(values):
+        if len(objects) <= _LABELLED_OBJECTS and not math.isnan(value):
+            colour = "white" if value < 55 else "black"
+            panel.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
+    labels = [method_label(name).replace(", ", ",\n").replace(" + ", " +\n") for name in names]
+    panel.set_xticks(range(len(names)), labels, fontsize=8)
+    panel.set_yticks(range(len(objects)), [short(item, 40) for item in objects], fontsize=8)
+    panel.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
+    panel.grid(visible=False)
+    figure.colorbar(image, ax=panel, label="right first guess among 5 test objects, %", shrink=0.6)
+    return figure
+
+
+# Decisions -------------------------------------------------------------------------------------------
+
+RELIABILITIES = {
+    "pairs": "one touch, one photo, even odds",
+    "k5": "5 candidates, one grasp",
+    "k10": "10 candidates, one grasp",
+    "k5_g5": "5 candidates, five grasps",
+}
+
+
+def reliability(results: Results, method: str) -> Figure:
+    """Share of right answers against the probability that was given, on test objects; counts below."""
+    diagrams = results.data["methods"][method]["reliability"]
+    kinds = [kind for kind in RELIABILITIES if kind in diagrams]
+    figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
+    grid = figure.subplots(2, len(kinds), sharex=True, sharey="row", squeeze=False, height_ratios=[4, 1])
+    for column, kind in enumerate(kinds):
+        _diagram(grid[0][column], grid[1][column], diagrams[kind], style_of(method).colour)
+        grid[0][column].set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
+    percent_axis(grid[0][0], "right answers, %")
+    grid[1][0].set_ylabel("answers")
+    return figure
+
+
+def _logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
+    """Ticks of a logarithmic axis, so many times a power of ten, as plain numbers: matplotlib's own are formulas."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=steps, numticks=16))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _diagram(panel: Axes, counts: Axes, diagram: Any, colour: str) -> None:
+    bins = [found for found in diagram["bins"] if found["count"]]
+    said, found = _percents([one["probability"] for one in bins]), _percents([one["share"] for one in bins])
+    panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
+    panel.vlines(said, said, found, color=colour, lw=1, alpha=0.5)
+    panel.plot(said, found, "o-", color=colour, ms=5)
+    panel.set_xlim(-2, 102)
+    counts.bar(said, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
+    counts.set_yscale("log")
+    _logarithmic(counts.yaxis, (1,))
+    counts.set_xlabel("probability given, %")
+
+
+def reject(results: Results) -> Figure:
+    """Hits against false alarms of the decision that an object is in the catalogue."""
+    figure = canvas(6.6, 4)
+    panel = figure.subplots()
+    names = [name for name in results.methods if "reject" in results.data["methods"][name]]
+    for name in reversed(names):
+        points, style = 100 * np.array(results.data["methods"][name]["reject"]["roc"]), style_of(name)
+        panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
+        step = max(1, len(points) // 6)
+        panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
+    panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
+    panel.set(xlim=(-1, 101), ylim=(-1, 101), xlabel="accepted though its object is absent, %")
+    panel.set_ylabel("accepted where its object is there, %")
+    panel.set_aspect("equal", adjustable="box")
+    _legend(figure, names)
+    return figure
+
+
+# Time ------------------------------------------------------------------------------------------------
+
+
+def accuracy_and_time(results: Results, measure: str = "guesses_k5") -> Figure:
+    """First guess of five against the time of a query and against the time of fitting; upper left is better."""
+    figure = canvas(10.5, 4.4)
+    panels = figure.subplots(1, 2, sharey=True)
+    titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
+    for panel, (what, title) in zip(panels, titles.items(), strict=True):
+        points = _timed(results, measure, what)
+        for name, time, summary in points:
+            value, low, high = _first(summary)
+            panel.errorbar(
+                time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
+            )
+            panel.axhline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1.2, zorder=0)
+        _front(panel, [(time, _first(summary)[0]) for _, time, summary in points])
+        panel.set_xscale("log")
+        _logarithmic(panel.xaxis, (1, 2, 5))
+        panel.set_xlabel(title)
+    percent_axis(panels[0], "right first guess among 5 objects, %")
+    _legend(figure, results.methods)
+    return figure
+
+
+def _timed(results: Results, measure: str, what: str) -> list[tuple[str, float, Any]]:
+    found = [(name, results.time(name, what), results.summary(name, measure)) for name in results.methods]
+    return [(name, time, summary) for name, time, summary in found if time and summary]
+
+
+def _front(panel: Axes, points: Sequence[tuple[float, float]]) -> None:
+    """Steps through the methods that no other one beats in both time and accuracy."""
+    front: list[tuple[float, float]] = []
+    for time, value in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not front or value > front[-1][1]:
+            front.append((time, value))
+    if front:
+        panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)

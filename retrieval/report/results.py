@@ -1,0 +1,157 @@
+"""results.json and timings.json as the report reads them, and how numbers, measures and methods are called in it."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from retrieval.errors import BadInput
+
+SCHEMA_VERSION = 1
+NOTHING = "–"
+
+# Order of every table and figure. A method or measure that is not here comes last, under its own name.
+METHODS = {
+    "late_fusion": "late fusion",
+    "set_fusion": "set fusion",
+    "prune_rerank": "prune + rerank",
+    "contrastive": "contrastive, InfoNCE",
+    "contrastive_sigmoid": "contrastive, sigmoid",
+    "cca": "CCA",
+    "plsca": "PLS-CA",
+    "chance": "random scores",
+    "constant": "constant score",
+}
+KNOW_NOTHING = frozenset({"chance", "constant"})
+GRASPS = (1, 2, 3, 5, 8)
+MEASURES = {
+    "pair_accuracy": "pair accuracy",
+    "pair_auc": "pair AUC",
+    "guesses_k5": "first guess of 5",
+    "guesses_k10": "first guess of 10",
+    **{f"guesses_k5_g{count}_p3": f"first guess of 5, {count} grasp{'s' * (count > 1)}, 3 photos" for count in GRASPS},
+    "all_objects_k5": "first guess of 5, all objects",
+    **{
+        f"{prefix}{key}": f"{label}{way}"
+        for prefix, way in (("", ", touch to photo"), ("photo_to_touch_", ", photo to touch"))
+        for key, label in (
+            *((f"recall_{k}", f"R@{k}") for k in (1, 5, 10)),
+            ("mrr", "MRR"),
+            ("map", "mAP"),
+        )
+    },
+    "objectfolder_touch_to_photo": "mAP, touch to photo",
+    "objectfolder_photo_to_touch": "mAP, photo to touch",
+    "paired_top1": "top 1",
+    "paired_top5": "top 5",
+}
+
+Summary = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Results:
+    """An evaluation's results and timings, as they stand in the files."""
+
+    data: Mapping[str, Any]
+    timings: Mapping[str, Any]
+
+    @property
+    def methods(self) -> list[str]:
+        """The methods that were judged, in the order of METHODS."""
+        known = list(METHODS)
+        return sorted(self.data["methods"], key=lambda name: (known.index(name) if name in known else 99, name))
+
+    @property
+    def learned(self) -> list[str]:
+        """The methods that look at their input."""
+        return [name for name in self.methods if name not in KNOW_NOTHING]
+
+    def summary(self, method: str, measure: str) -> Summary | None:
+        """Value, interval, chance and basis of a measure; None where it was not taken."""
+        found: Summary | None = self.data["methods"].get(method, {}).get("measures", {}).get(measure)
+        return found
+
+    def time(self, method: str, what: str) -> float | None:
+        """A time of timings.json; None where it was not taken."""
+        found: float | None = self.timings.get("methods", {}).get(method, {}).get(what)
+        return found
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the recording comes from a simulated rig."""
+        return "simulat" in self.data["recording"]["source"].lower()
+
+
+def read_results(out: Path) -> Results:
+    """Read `out`/results.json, and `out`/timings.json where it is. Raises BadInput."""
+    data = _read(out / "results.json")
+    if (found := data.get("schema_version")) != SCHEMA_VERSION:
+        raise BadInput(
+            f"{out / 'results.json'} must have schema version {SCHEMA_VERSION}, got {found!r}; run `retrieve evaluate`"
+        )
+    timings = out / "timings.json"
+    return Results(data, _read(timings) if timings.exists() else {})
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve evaluate`") from error
+    if not isinstance(data, dict):
+        raise BadInput(f"{path} must hold a JSON object, got a {type(data).__name__}; run `retrieve evaluate`")
+    return data
+
+
+# Words -----------------------------------------------------------------------------------------------
+
+
+def method_label(name: str) -> str:
+    """What a method is called in the report."""
+    return METHODS.get(name, name.replace("_", " "))
+
+
+def at_start(label: str) -> str:
+    """The label as a sentence begins with it: CCA stays CCA."""
+    return label[:1].upper() + label[1:]
+
+
+def measure_label(name: str) -> str:
+    """What a measure is called in the report."""
+    return MEASURES.get(name, name.replace("_", " "))
+
+
+def percent(share: float | None, digits: int = 1) -> str:
+    """A share in percent, without the sign."""
+    return NOTHING if share is None else f"{100 * share:.{digits}f}"
+
+
+def with_interval(summary: Summary | None, place: int = 0) -> str:
+    """Value and interval in percent, as in "71.2 [65.0, 77.1]"."""
+    if summary is None or summary["value"][place] is None:
+        return NOTHING
+    low, high = percent(summary["low"][place]), percent(summary["high"][place])
+    return f"{percent(summary['value'][place])} [{low}, {high}]"
+
+
+def number(value: float | None) -> str:
+    """Three significant digits; whole numbers and all from 100 on without a point."""
+    if value is None:
+        return NOTHING
+    return f"{value:,.0f}" if abs(value) >= 99.95 or value == int(value) else f"{value:#.3g}"
+
+
+def file_name(name: str) -> str:
+    """The name with nothing in it that a path could trip over."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
+
+
+def short(name: str, length: int) -> str:
+    """The name, its middle left out where it is longer than `length`: the ends tell objects apart."""
+    if len(name) <= length:
+        return name
+    head = (length - 1) // 2
+    return f"{name[:head]}…{name[len(name) - (length - 1 - head) :]}"

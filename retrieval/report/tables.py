@@ -1,0 +1,258 @@
+"""Tables of an evaluation: results in, blocks of the document out."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from retrieval.report.document import Table
+from retrieval.report.results import (
+    NOTHING,
+    Results,
+    Summary,
+    measure_label,
+    method_label,
+    number,
+    percent,
+    with_interval,
+)
+
+Column = tuple[str, str, int]
+"""Heading, measure, place in the measure's list of values."""
+
+
+def measures(results: Results, keys: Sequence[str], headings: Sequence[str] = ()) -> Table | None:
+    """A row for each method and a column for each measure that was taken; None where none was.
+
+    headings: of the columns, where the measures' own labels would repeat themselves.
+    """
+    labels = headings or [measure_label(key) for key in keys]
+    return _table(results, [(label, key, 0) for label, key in zip(labels, keys, strict=True)])
+
+
+def guesses(results: Results, measure: str) -> Table | None:
+    """A guess curve in numbers: a column for each number of guesses."""
+    lengths = [len(found["value"]) for name in results.methods if (found := results.summary(name, measure))]
+    return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])
+
+
+def _table(results: Results, columns: Sequence[Column]) -> Table | None:
+    columns = [column for column in columns if any(results.summary(name, column[1]) for name in results.methods)]
+    if not columns:
+        return None
+    rows = [
+        (method_label(name), *(with_interval(results.summary(name, key), place) for _, key, place in columns))
+        for name in results.methods
+    ]
+    chance = ("chance, closed form", *(_chance(results, key, place) for _, key, place in columns))
+    return Table(
+        ("method, %", *(heading for heading, _, _ in columns)),
+        (*rows, chance),
+        tuple(_basis(results, list(dict.fromkeys(key for _, key, _ in columns)))),
+        bold=frozenset(_best(results, columns)),
+    )
+
+
+def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:
+    """The highest value of each column, where one is highest."""
+    found = []
+    for at, (_, key, place) in enumerate(columns, start=1):
+        values = {
+            row: summary["value"][place]
+            for row, name in enumerate(results.methods)
+            if (summary := results.summary(name, key)) and summary["value"][place] is not None
+        }
+        highest = [row for row, value in values.items() if value == max(values.values())]
+        if len(highest) == 1 < len(values):
+            found.append((highest[0], at))
+    return found
+
+
+def _chance(results: Results, key: str, place: int) -> str:
+    shares = {percent(found["chance"][place]) for name in results.methods if (found := results.summary(name, key))}
+    return " or ".join(sorted(shares)) or NOTHING
+
+
+def _basis(results: Results, keys: Sequence[str]) -> list[str]:
+    """Queries, objects and gallery of the columns, those of one basis named together."""
+    bases: dict[str, list[str]] = {}
+    for key in keys:
+        for name in results.methods:
+            if found := results.summary(name, key):
+                labels = bases.setdefault(basis(found), [])
+                if measure_label(key) not in labels:
+                    labels.append(measure_label(key))
+    if len(bases) == 1:
+        return list(bases)
+    return [f"{'; '.join(labels)}: {text}" for text, labels in bases.items()]
+
+
+def basis(summary: Summary) -> str:
+    """What a measure was taken over, in words."""
+    return f"{summary['queries']:,} queries of {summary['objects']} objects. Gallery: {summary['gallery']}."
+
+
+def everything(results: Results) -> Table:
+    """Every measure of every method with interval, chance, queries, objects, seeds and gallery."""
+    known = [key for name in results.methods for key in results.data["methods"][name].get("measures", {})]
+    keys = sorted(set(known), key=lambda key: known.index(key))
+    rows = [
+        (method_label(name), measure_label(key), *_full_row(found))
+        for key in keys
+        for name in results.methods
+        if (found := results.summary(name, key))
+    ]
+    header = ("method", "measure", "value [interval], %", "chance, %", "by seed, %", "queries", "objects", "gallery")
+    return Table(header, tuple(rows), words=frozenset({1, 7}))
+
+
+def _full_row(summary: Summary) -> tuple[str, ...]:
+    places = range(len(summary["value"]))
+    return (
+        "; ".join(with_interval(summary, place) for place in places),
+        "; ".join(percent(share) for share in summary["chance"]),
+        ", ".join(percent(values[0]) for values in summary["by_seed"]),
+        f"{summary['queries']:,}",
+        str(summary["objects"]),
+        summary["gallery"],
+    )
+
+
+def comparisons(results: Results) -> Table:
+    """Paired differences on the same queries."""
+    rows = [
+        (
+            f"{method_label(one['a'])} − {method_label(one['b'])}",
+            measure_label(one["measure"]),
+            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]",
+            probability(one["p"]),
+        )
+        for one in results.data["comparisons"]
+    ]
+    note = (
+        "Same queries for both. Interval: bootstrap over objects; p: sign flips of the objects' differences, two-sided."
+    )
+    return Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1}))
+
+
+def probability(value: float) -> str:
+    """A p-value: never 0."""
+    return "< 0.0001" if value < 0.0001 else f"{value:.2g}" if value < 0.1 else f"{value:.2f}"
+
+
+def controls(results: Results) -> Table:
+    """What late fusion gives when the answer is taken out of its input, and whether that is chance."""
+    keys = ("pair_accuracy", "guesses_k5")
+    rows = [
+        (
+            name,
+            control["what"],
+            *(with_interval(control["measures"].get(key)) for key in keys),
+            *(_at_chance(control["measures"].get(key)) for key in keys[:1]),
+        )
+        for name, control in results.data["controls"].items()
+    ]
+    real = tuple(with_interval(results.summary("late_fusion", key)) for key in keys)
+    rows.insert(0, ("the result", "late fusion as it is", *real, ""))
+    header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
+    return Table(header, tuple(rows), words=frozenset({1}))
+
+
+def _at_chance(summary: Summary | None) -> str:
+    if summary is None:
+        return NOTHING
+    return "yes" if summary["low"][0] <= summary["chance"][0] <= summary["high"][0] else "no"
+
+
+def rejects(results: Results) -> Table:
+    """The decision that the object is in the catalogue."""
+    found = {name: results.data["methods"][name]["reject"] for name in results.methods if _has(results, name, "reject")}
+    rows = [
+        (
+            method_label(name),
+            with_interval(one["auroc"]),
+            with_interval(one["balanced_accuracy"]),
+            f"{one['threshold']:+.2f}",
+        )
+        for name, one in found.items()
+    ]
+    first = next(iter(found.values()))["auroc"]
+    header = ("method", "AUROC, %", "balanced accuracy, %", "threshold")
+    note = f"{basis(first)} Chance is 50 %. The threshold was chosen on validation objects."
+    return Table(header, tuple(rows), (note,))
+
+
+def _has(results: Results, name: str, what: str) -> bool:
+    return bool(results.data["methods"][name].get(what))
+
+
+def calibrations(results: Results, kinds: Mapping[str, str]) -> Table:
+    """Expected calibration errors."""
+    found = {name: results.data["methods"][name].get("reliability") for name in results.methods}
+    rows = [
+        (method_label(name), *(_errors(diagrams.get(kind)) for kind in kinds))
+        for name, diagrams in found.items()
+        if diagrams
+    ]
+    note = (
+        "On test objects; fitted on validation objects. In brackets: the pairs' probability moved by the prior 1/K, "
+        "which does not know that exactly one candidate is true."
+    )
+    return Table(("expected calibration error, %", *kinds.values()), tuple(rows), (note,))
+
+
+def _errors(diagram: Any) -> str:
+    if diagram is None:
+        return NOTHING
+    alone = diagram.get("ece_of_pairs")
+    return percent(diagram["ece"]) + (f" ({percent(alone)})" if alone is not None else "")
+
+
+def times(results: Results) -> Table:
+    """How long each method takes."""
+    columns = {
+        "fit_s": "fit, s",
+        "encode_touch_ms": "encode a touch, ms",
+        "encode_photo_ms": "encode a photo, ms",
+        "score_us_per_photo": "score a photo, µs",
+        "query_ms": "a query, ms",
+    }
+    rows = [
+        (method_label(name), *(number(results.time(name, key)) for key in columns))
+        for name in results.methods
+        if name in results.timings.get("methods", {})
+    ]
+    return Table(("method", *columns.values()), tuple(rows), (_machine(results.timings),))
+
+
+def _machine(timings: Any) -> str:
+    towers, machine = timings.get("encode", {}), timings.get("machine", {})
+    return (
+        f"On {machine.get('cpus', NOTHING)} CPU(s) with {machine.get('threads', NOTHING)} thread(s). Times of the "
+        "methods alone: one query is one touch against the whole gallery, features given. The towers, shared "
+        f"by all methods, take {number(towers.get('touch_ms'))} ms for a touch and {number(towers.get('photo_ms'))} ms "
+        "for a photo."
+    )
+
+
+def split(results: Results) -> Table:
+    """Objects of each part."""
+    found = results.data["split"]
+    rows = tuple(
+        (part, str(len(found[part])), ", ".join(sorted(found[part]))) for part in ("train", "validation", "test")
+    )
+    return Table(("part", "objects", "which"), rows, words=frozenset({2}))
+
+
+def audit(found: Any) -> Table:
+    """Distances from the test frames to frames fitted or chosen on, beside those within an object."""
+    points = [f"{100 * share:g} %" if share else "nearest" for share in found["quantiles"]]
+    rows = []
+    for kind, frames in found["frames"].items():
+        for key, what in (("to_seen", "to training and validation objects"), ("within_object", "to its own object")):
+            values = [f"{value:.2f}" for value in frames[key] or ()] or [NOTHING] * len(points)
+            close = f"{frames['close']} of {frames['test']:,}" if key == "to_seen" else ""
+            rows.append((f"{kind}, {what}", *values, close))
+    return Table(
+        ("nearest frame of each test frame", *points, f"closer than {found['threshold']}"),
+        tuple(rows),
+        (f"Quantiles of the distance, in {found['unit']}.",),
+    )

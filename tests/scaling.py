@@ -1,0 +1,169 @@
+"""How accuracy on unseen objects grows with the number of training objects, and with the grasps of each.
+
+    python -m tests.scaling RECORDING UNSEEN --out FOLDER --preset mobilenet --init WEIGHTS
+
+RECORDING gives training and validation objects, UNSEEN is a recording of other objects; all of its touches are judged.
+Training sets are nested: 20 objects are among the 80. Writes scaling.json and scaling.png in FOLDER; what is fitted
+already, and features, are used again.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from retrieval.config import Config, load_config
+from retrieval.dataset import data_digest, load_grasps
+from retrieval.evaluation import protocols
+from retrieval.evaluation.calibrate import calibrate
+from retrieval.evaluation.intervals import summarise
+from retrieval.evaluation.table import Measure, ScoreTable
+from retrieval.features import Features, encode_recording
+from retrieval.methods import METHODS, build_method
+from retrieval.methods.base import Method, Setting
+from retrieval.train import build_matcher
+
+LINES = ("-", "--", "-.")
+SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure every point, then write the table and the plot."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("unseen", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--preset", default="mobilenet")
+    parser.add_argument("--init", default="imagenet", help="first weights of the towers")
+    parser.add_argument("--iterations", type=int, default=1000)
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["late_fusion", "cca"])
+    parser.add_argument("--objects", type=int, nargs="+", default=[20, 80, 320, 1280])
+    parser.add_argument("--grasps", type=int, nargs="+", default=[1, 2, 4], help="of each object, at most")
+    parser.add_argument("--validation", type=int, default=100, help="objects to choose and calibrate by")
+    parser.add_argument("--cache", type=Path, help="folder where features are kept (default: FOLDER/features)")
+    arguments = parser.parse_args(argv)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    found = measure(arguments)
+    (arguments.out / "scaling.json").write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
+    print(table(found["points"]))
+    plot(found["points"]).savefig(arguments.out / "scaling.png", dpi=110)
+    return 0
+
+
+def measure(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Fit and judge every training set: each number of objects with all grasps, then all objects with fewer."""
+    config = _config(arguments)
+    cache = arguments.cache or arguments.out / "features"
+    seen, seen_digest = _features(arguments.recording, config, cache)
+    unseen, unseen_digest = _features(arguments.unseen, config, cache)
+    names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
+    validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
+    most = max(arguments.grasps)
+    sizes = sorted({min(count, len(pool)) for count in arguments.objects})
+    asked = [(count, most) for count in sizes] + [(sizes[-1], grasps) for grasps in arguments.grasps if grasps < most]
+    points = []
+    for count, grasps in asked:
+        train = first_grasps(seen.of_objects(pool[:count]), grasps)
+        setting = Setting(config, folder=arguments.out / f"{count}-objects-{grasps}-grasps")
+        for name in arguments.methods:
+            method = build_method(name, setting)
+            method.fit(train, validation)
+            size = {"method": name, "objects": count, "grasps": grasps, "touches": len(train)}
+            points.append(size | judge(method, validation, unseen))
+            print(table(points[-1:]).splitlines()[-1], flush=True)
+    return {
+        "preset": arguments.preset,
+        "iterations": config.training.iterations,
+        "recording": seen_digest,
+        "unseen": unseen_digest,
+        "points": points,
+    }
+
+
+def _config(arguments: argparse.Namespace) -> Config:
+    config = load_config(arguments.preset)
+    training = dataclasses.replace(config.training, init=arguments.init, iterations=arguments.iterations)
+    return dataclasses.replace(config, training=training)
+
+
+def _features(recording: Path, config: Config, cache: Path) -> tuple[Features, str]:
+    grasps = load_grasps(recording)
+    return encode_recording(grasps, build_matcher(config).eval(), config, cache), data_digest(grasps)
+
+
+def first_grasps(features: Features, most: int) -> Features:
+    """The first grasps of each object, at most so many."""
+    place = [features.object_ids[:row].count(name) for row, name in enumerate(features.object_ids)]
+    return features.select(np.flatnonzero(np.array(place) < most))
+
+
+def judge(method: Method, validation: Features, unseen: Features) -> dict[str, Any]:
+    """Summaries of the measures on unseen objects, by name."""
+    fitted = calibrate({1: scored(method, validation)}, [], seed=0)
+    test = scored(method, unseen)
+    measures: dict[str, Measure] = {"pair_accuracy": protocols.pair_accuracy(test, fitted.pairs[1])}
+    measures |= {f"guesses_k{k}": protocols.k_way(test, k) for k in (5, 10)}
+    return {name: summarise([measure]) for name, measure in measures.items()}
+
+
+def scored(method: Method, features: Features) -> ScoreTable:
+    """Every touch with every photo."""
+    scores = method.score(method.encode_touch(features.touch), method.encode_photo(features.photo))
+    return ScoreTable(scores, features.owner, features.owner, np.eye(len(features), dtype=bool))
+
+
+def table(points: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table of the points."""
+    lines = [
+        "| method | training objects | grasps of each | " + " | ".join(SHOWN.values()) + " |",
+        "|---|---|---|" + "---|" * len(SHOWN),
+    ]
+    for point in points:
+        cells = [_cell(point[name]) for name in SHOWN]
+        lines.append(f"| {point['method']} | {point['objects']:,} | {point['grasps']} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(summary: dict[str, Any]) -> str:
+    return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
+
+
+def plot(points: Sequence[dict[str, Any]]) -> Figure:
+    """Two panels: against objects at the most grasps, against grasps at the most objects; a line style a method."""
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    grasps, objects = max(point["grasps"] for point in points), max(point["objects"] for point in points)
+    _panel(left, [point for point in points if point["grasps"] == grasps], "objects")
+    _panel(right, [point for point in points if point["objects"] == objects], "grasps")
+    left.set(xlabel=f"training objects, {grasps} grasps of each", ylabel="share right, unseen objects", ylim=(0, 1))
+    right.set(xlabel=f"grasps of each of {objects:,} training objects")
+    right.legend(frameon=False, loc="lower right", fontsize="small")
+    return figure
+
+
+def _panel(axes: Axes, points: Sequence[dict[str, Any]], key: str) -> None:
+    methods = list(dict.fromkeys(point["method"] for point in points))
+    for (name, label), colour in zip(SHOWN.items(), ("#0072b2", "#d55e00", "#009e73"), strict=True):
+        for method, style in zip(methods, LINES, strict=False):
+            own = sorted((point for point in points if point["method"] == method), key=lambda point: int(point[key]))
+            value, low, high = (np.array([point[name][part][0] for point in own]) for part in ("value", "low", "high"))
+            words = f"{label}, {method.replace('_', ' ')}"
+            bars = [value - low, high - value]
+            x = [point[key] for point in own]
+            axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, linestyle=style, label=words)
+        axes.axhline(points[0][name]["chance"][0], color=colour, linestyle=":", linewidth=1)
+    ticks = sorted({point[key] for point in points})
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [f"{count:,}" for count in ticks])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,298 @@
+"""Canonical correlations against closed forms, plain loops and scikit-learn, and where scikit-learn's break."""
+
+import warnings
+
+import numpy as np
+import pytest
+import scipy.linalg
+from sklearn.cross_decomposition import CCA
+
+from retrieval.config import Config
+from retrieval.errors import BadInput, NumericalError
+from retrieval.features import Features
+from retrieval.methods.base import Setting
+from retrieval.methods.cca import Canonical, Cca, canonical, cosine, decompose, unit_rows
+from retrieval.methods.plsca import Plsca, next_of_object
+from retrieval.methods.standardise import Standardiser
+
+
+def linked(rhos, n=200, touch=12, photo=10, seed=0):
+    """Two views whose sample canonical correlations are exactly `rhos` and 0: mixed orthogonal columns."""
+    rng = np.random.default_rng(seed)
+    columns = np.column_stack([np.ones(n), rng.standard_normal((n, touch + photo))])
+    basis = np.linalg.qr(columns)[0][:, 1:] * np.sqrt(n)
+    first, second = basis[:, :touch], basis[:, touch:].copy()
+    rhos = np.asarray(rhos)
+    second[:, : len(rhos)] = rhos * first[:, : len(rhos)] + np.sqrt(1 - rhos**2) * second[:, : len(rhos)]
+    return first @ rng.standard_normal((touch, touch)), second @ rng.standard_normal((photo, photo))
+
+
+def paired(x, y, ridge=0.0) -> Canonical:
+    return canonical(decompose(x), decompose(y), np.arange(len(x)), ridge)
+
+
+def variates(found, x, y):
+    return Standardiser.fit(x)(x) @ found.touch_weights, Standardiser.fit(y)(y) @ found.photo_weights
+
+
+def correlation(a, b):
+    return np.corrcoef(a, b)[0, 1]
+
+
+def sklearn_cca(x, y, components, **options):
+    """Correlations that scikit-learn's variates have, and what it warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        a, b = CCA(components, **options).fit(x, y).transform(x, y)
+        rho = np.array([correlation(a[:, i], b[:, i]) for i in range(components)])
+    return rho, [str(warning.message) for warning in caught]
+
+
+def test_noise_correlates_in_sample_and_not_on_held_out_items():
+    """50 + 50 features of 60 items span everything: the training correlation says nothing."""
+    rng = np.random.default_rng(0)
+    x, y = rng.standard_normal((60, 50)), rng.standard_normal((60, 50))
+    found = paired(x, y)
+    fresh = rng.standard_normal((2000, 50)), rng.standard_normal((2000, 50))
+    a = Standardiser.fit(x)(fresh[0]) @ found.touch_weights
+    b = Standardiser.fit(y)(fresh[1]) @ found.photo_weights
+    held_out = [correlation(a[:, i], b[:, i]) for i in range(10)]
+    assert (found.correlations[:40] > 0.999).all()
+    assert np.abs(held_out).max() < 0.1  # four standard errors of 2,000 items
+
+
+def test_planted_correlations_are_recovered():
+    rhos = [0.95, 0.9, 0.8, 0.3]
+    x, y = linked(rhos)
+    found = paired(x, y)
+    np.testing.assert_allclose(found.correlations[:4], rhos, atol=1e-6)
+    np.testing.assert_allclose(found.correlations[4:], 0, atol=1e-6)
+    a, b = variates(found, x, y)
+    np.testing.assert_allclose([correlation(a[:, i], b[:, i]) for i in range(4)], rhos, atol=1e-6)
+    np.testing.assert_allclose(a.T @ a / len(a), np.eye(10), atol=1e-6)  # uncorrelated, variance 1
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.1])
+def test_it_solves_the_eigenproblem_of_the_covariances(ridge):
+    """(C_xx + ridge)^-1/2 C_xy (C_yy + ridge)^-1/2 on standardised features, whose mean variance is 1."""
+    x, y = (Standardiser.fit(view)(view) for view in linked([0.9, 0.5], n=80, touch=5, photo=4, seed=3))
+    roots = [np.linalg.inv(scipy.linalg.sqrtm(v.T @ v / len(v) + ridge * np.eye(v.shape[1]))) for v in (x, y)]
+    expected = np.linalg.svd(roots[0] @ (x.T @ y / len(x)) @ roots[1])[1]
+    np.testing.assert_allclose(paired(x, y, ridge).correlations, expected, atol=1e-9)
+
+
+def test_it_is_what_scikit_learn_finds_where_that_is_well_posed():
+    x, y = linked([0.95, 0.8, 0.6], n=300)
+    rho, messages = sklearn_cca(x, y, 3)
+    assert not messages
+    np.testing.assert_allclose(paired(x, y).correlations[:3], rho, atol=1e-4)  # its power iteration stops at 1e-6
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.5])
+def test_pairing_by_object_is_what_every_pair_enumerated_gives(ridge):
+    """Objects with 1 to 6 grasps; each pair of an object with m grasps weighs 1 / m."""
+    rng = np.random.default_rng(5)
+    owner = np.repeat(np.arange(9), [1, 2, 3, 6, 4, 4, 2, 5, 6])[rng.permutation(33)]
+    latent = rng.standard_normal((9, 3))[owner]
+    x, y = (latent @ rng.standard_normal((3, d)) + rng.standard_normal((33, d)) for d in (4, 5))
+    found = canonical(decompose(x), decompose(y), owner, ridge)
+    x, y = Standardiser.fit(x)(x), Standardiser.fit(y)(y)
+    cross, touch_own, photo_own = np.zeros((4, 5)), np.zeros((4, 4)), np.zeros((5, 5))
+    for i in range(33):
+        for j in range(33):
+            if owner[i] == owner[j]:
+                weight = 1 / np.sum(owner == owner[i]) / 33
+                cross += weight * np.outer(x[i], y[j])
+                touch_own += weight * np.outer(x[i], x[i])
+                photo_own += weight * np.outer(y[j], y[j])
+    roots = [np.linalg.inv(scipy.linalg.sqrtm(own + ridge * np.eye(len(own)))) for own in (touch_own, photo_own)]
+    expected = np.linalg.svd(roots[0] @ cross @ roots[1])[1]
+    np.testing.assert_allclose(found.correlations, expected, atol=1e-9)
+
+
+def spoiled(name, x):
+    """The same information, badly put."""
+    rng = np.random.default_rng(9)
+    return {
+        "duplicated": lambda: np.column_stack([x, x, 3 * x[:, :4] - 7]),
+        "constant": lambda: np.column_stack([x, np.ones(len(x)), np.full(len(x), 0.1), np.zeros(len(x))]),
+        "collinear": lambda: np.column_stack([x, x @ rng.standard_normal((x.shape[1], 30))]),
+        "nearly duplicated": lambda: np.column_stack([x, x[:, :6] + 1e-8 * rng.standard_normal((len(x), 6))]),
+        "scaled 1e-6 to 1e6": lambda: x * np.logspace(-6, 6, x.shape[1]),
+        "far from 0": lambda: x + 1e4,
+    }[name]()
+
+
+SPOILED = ["duplicated", "constant", "collinear", "nearly duplicated", "scaled 1e-6 to 1e6", "far from 0"]
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_features_badly_put_give_the_same_correlations(name):
+    rhos = [0.95, 0.9, 0.8]
+    x, y = linked(rhos)
+    found = paired(spoiled(name, x), y)
+    np.testing.assert_allclose(found.correlations[:3], rhos, atol=1e-6)
+    assert len(found.correlations) == 10  # the ranks are 12 and 10, whatever was added
+    assert np.abs(found.touch_weights).max() < 100
+
+
+@pytest.mark.parametrize("name", SPOILED)
+@pytest.mark.parametrize("ridge", [0.0, 1e-3, 100.0])
+def test_fewer_items_than_features_give_finite_answers(name, ridge):
+    rng = np.random.default_rng(2)
+    x, y = spoiled(name, rng.standard_normal((30, 40))), rng.standard_normal((30, 60))
+    found = paired(x, y, ridge)
+    assert len(found.correlations) == 29
+    assert all(np.isfinite(part).all() for part in (found.correlations, found.touch_weights, found.photo_weights))
+    assert ((found.correlations >= 0) & (found.correlations <= 1)).all()
+
+
+def test_the_scale_of_a_column_changes_nothing_where_normal_equations_break():
+    """Whitening by the eigenvalues of X'X, as is common, squares a condition number of 1e12 past float64."""
+    rhos = [0.95, 0.9, 0.8]
+    x, y = linked(rhos)
+    scaled = spoiled("scaled 1e-6 to 1e6", x)
+    whitened = []
+    for view in (scaled - scaled.mean(0), y - y.mean(0)):
+        values, vectors = np.linalg.eigh(view.T @ view)
+        kept = values > values.max() * len(values) * np.finfo(float).eps
+        whitened.append(view @ vectors[:, kept] / np.sqrt(values[kept]))
+    naive = np.linalg.svd(whitened[0].T @ whitened[1])[1]
+    assert abs(naive[2] - 0.8) > 0.05
+    np.testing.assert_allclose(paired(scaled, y).correlations, paired(x, y).correlations, atol=1e-9)
+
+
+def test_scikit_learn_loses_correlations_to_duplicates_where_ours_keeps_them():
+    x, y = linked([0.95, 0.9, 0.8])
+    rng = np.random.default_rng(1)
+    spoiled = np.column_stack([x, x, x[:, :1] + 1e-7 * rng.standard_normal((200, 1)), np.ones(200)])
+    rho, _ = sklearn_cca(spoiled, y, 3)
+    assert abs(rho[0] - 0.95) > 0.005
+    np.testing.assert_allclose(paired(spoiled, y).correlations[:3], [0.95, 0.9, 0.8], atol=1e-5)
+
+
+def test_scikit_learn_loses_correlations_to_units_where_ours_keeps_them():
+    x, y = linked([0.95, 0.9, 0.8])
+    scaled = x * np.logspace(-6, 6, 12)
+    rho, _ = sklearn_cca(scaled, y, 3, scale=False)
+    assert abs(rho[2] - 0.8) > 0.05
+    np.testing.assert_allclose(paired(scaled, y).correlations[:3], [0.95, 0.9, 0.8], atol=1e-6)
+
+
+def test_scikit_learn_gives_components_beyond_the_rank_where_ours_gives_fewer():
+    rng = np.random.default_rng(4)
+    latent = rng.standard_normal((100, 3))
+    x = latent @ rng.standard_normal((3, 8))
+    y = latent @ rng.standard_normal((3, 8)) + 0.1 * rng.standard_normal((100, 8))
+    rho, _ = sklearn_cca(x, y, 5)
+    assert not (rho[3:] > 0.5).any()  # two of five dimensions are rounding, and cosine would count them in full
+    assert len(paired(x, y).correlations) == 3
+
+
+def test_a_view_in_which_nothing_varies_is_refused():
+    with pytest.raises(BadInput, match="all 4 are constant over 50"):
+        decompose(np.ones((50, 4)))
+
+
+def test_equal_correlations_are_found_as_one_subspace():
+    """Any rotation of it is right, so the planes are compared by their principal angles, not by columns."""
+    x, y = linked([0.9, 0.9, 0.4], n=300)
+    a, _ = variates(paired(x, y), x, y)
+    more, _ = variates(paired(spoiled("collinear", x), y), spoiled("collinear", x), y)
+    assert np.max(scipy.linalg.subspace_angles(a[:, :2], more[:, :2])) < 1e-6
+
+
+def test_signs_are_fixed_by_the_largest_weight_and_the_same_for_both_views():
+    x, y = linked([0.95, 0.7, 0.5])
+    found = paired(x, y)
+    both = np.concatenate([found.touch_weights, found.photo_weights])
+    assert (both[np.abs(both).argmax(0), range(10)] > 0).all()
+    turned = paired(-x, y)
+    sign = np.sign(np.sum(turned.touch_weights * -found.touch_weights, axis=0))[:3]
+    np.testing.assert_allclose(turned.photo_weights[:, :3], found.photo_weights[:, :3] * sign, atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_refused(bad):
+    x = np.ones((10, 3))
+    x[4, 1] = bad
+    with pytest.raises(NumericalError, match="finite"):
+        decompose(x)
+
+
+def test_a_negative_ridge_and_rows_without_an_owner_are_refused():
+    x, y = (decompose(view) for view in linked([0.5]))
+    with pytest.raises(BadInput, match="ridge -1"):
+        canonical(x, y, np.arange(200), -1.0)
+    with pytest.raises(BadInput, match="199 owners"):
+        canonical(x, y, np.arange(199))
+
+
+def test_where_the_fast_decomposition_fails_the_slow_one_answers(monkeypatch):
+    x, y = linked([0.95, 0.9, 0.8])
+    expected = paired(x, y).correlations
+
+    def failing(*args, **options):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(np.linalg, "svd", failing)
+    np.testing.assert_allclose(paired(x, y).correlations, expected, atol=1e-12)
+
+
+def first_hits(touch, photo):
+    return np.mean(cosine(unit_rows(touch), unit_rows(photo)).argmax(1) == np.arange(len(touch)))
+
+
+def test_cosine_needs_dimensions_weighted_by_their_correlation():
+    """Of 60 canonical dimensions 6 are real; unweighted, the other 54 drown them."""
+    rng = np.random.default_rng(7)
+    maps = rng.standard_normal((6, 60)), rng.standard_normal((6, 60))
+
+    def views(n):
+        latent = rng.standard_normal((n, 6))
+        return [latent @ part + rng.standard_normal((n, 60)) * 1.5 for part in maps]
+
+    x, y = views(300)
+    found = paired(x, y, ridge=1e-3)
+    new_x, new_y = views(200)
+    a, b = Standardiser.fit(x)(new_x) @ found.touch_weights, Standardiser.fit(y)(new_y) @ found.photo_weights
+    weights = found.correlations**4
+    assert first_hits(a, b) < 0.6 * first_hits(a * weights, b * weights)
+
+
+def features(objects, each, seed, name, touch=8, photo=10, noise=0.3):
+    """Touch and photo features that are linear in three numbers of the object, and noise."""
+    world, rng = np.random.default_rng(77), np.random.default_rng(seed)
+    maps = world.standard_normal((3, 2 * touch)), world.standard_normal((3, photo))
+    latent = np.repeat(rng.standard_normal((objects, 3)), each, axis=0)
+    n = objects * each
+    views = [(latent @ m + noise * rng.standard_normal((n, m.shape[1]))).astype(np.float32) for m in maps]
+    return Features(
+        tuple(f"{name}{row}" for row in range(n)),
+        tuple(f"{name}{row // each}" for row in range(n)),
+        views[0].reshape(n, 2, touch),
+        views[1],
+    )
+
+
+@pytest.mark.parametrize("method", [Cca, Plsca])
+def test_what_was_chosen_is_said_and_never_exceeds_what_there_is(method):
+    fitted = method(Setting(Config()))
+    fitted.fit(features(6, 5, 0, "train"), features(4, 5, 1, "validation"))
+    chosen = fitted.chosen
+    assert 1 <= chosen["components"] <= chosen["most_components"]
+    assert chosen["validation_auc"] > 0.8
+    if method is Cca:
+        assert chosen["most_components"] == 5  # one less than the training objects
+        assert chosen["rank"] == {"touch": 16, "photo": 10}
+
+
+def test_one_grasp_for_each_object_is_plain_canonical_correlation_and_can_be_fitted():
+    fitted = Cca(Setting(Config()))
+    fitted.fit(features(30, 1, 0, "train"), features(5, 1, 1, "validation"))
+    assert fitted.chosen["validation_auc"] > 0.8
+
+
+def test_a_touch_is_paired_with_the_photo_of_the_next_grasp():
+    owner = np.array([0, 1, 0, 0, 2, 1])
+    assert next_of_object(owner).tolist() == [2, 5, 3, 0, 4, 1]

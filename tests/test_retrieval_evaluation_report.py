@@ -1,0 +1,333 @@
+"""The report of an evaluation: its numbers are those of results.json, its page needs nothing outside itself, and
+whatever was not measured, or is called strangely, leaves it whole."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+
+import pytest
+from PIL import Image
+
+from retrieval.errors import BadInput, DatasetError
+from retrieval.report import write_report
+from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
+from retrieval.report.results import at_start, number, percent, short, with_interval
+from retrieval.report.tables import probability
+from tests import synthetic
+from tests.made_up_evaluation import write_made_up
+
+FEW = ("late_fusion", "cca", "chance")
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the text."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.text, self._inside = [], "", ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        self._inside = tag
+
+    def handle_data(self, data):
+        if self._inside != "style":
+            self.text += data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return synthetic.write_recording(tmp_path_factory.mktemp("r") / "recording", synthetic.make_objects(12), 3)
+
+
+@pytest.fixture(scope="module")
+def made(folder, tmp_path_factory):
+    """(files, folder) of a whole report."""
+    out = write_made_up(folder, tmp_path_factory.mktemp("out") / "report", FEW)
+    return write_report(out, folder), out
+
+
+@pytest.fixture
+def words_only(monkeypatch):
+    """Figures of one pixel, where a test reads the words."""
+
+    def draw(path, make, *arguments):
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (1, 1)).save(path)
+        return path
+
+    monkeypatch.setattr("retrieval.report.builder.draw", draw)
+
+
+def remake(made, tmp_path, recording=None, change=None):
+    """The report once more, without pictures unless asked for, after `change(results)`."""
+    results = json.loads((made[1] / "results.json").read_text())
+    if change:
+        change(results)
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    files = write_report(tmp_path, recording)
+    return (tmp_path / "report.html").read_text("utf-8"), (tmp_path / "report.md").read_text("utf-8"), files
+
+
+def test_it_writes_what_it_says_and_every_figure_opens(made):
+    files, out = made
+    assert files[:2] == [out / "report.md", out / "report.html"]
+    figures = set(files[2:])
+    assert figures == set((out / "figures").iterdir())
+    names = {path.name for path in figures}
+    assert {"overview.png", "guess-curves.png", "grasps.png", "time.png", "reject.png", "nearest.jpg"} <= names
+    for method in ("late_fusion", "cca"):
+        assert {f"objects-test-{method}.png", f"objects-all-{method}.png", f"confusions-{method}.jpg"} <= names
+        assert {f"best-{method}.jpg", f"worst-{method}.jpg", f"reliability-{method}.png"} <= names
+    for path in figures:
+        with Image.open(path) as image:
+            image.load()
+            assert 500 < image.width < 2500
+
+
+def test_the_page_needs_nothing_outside_itself_and_every_picture_has_words(made):
+    files, out = made
+    page = Page((out / "report.html").read_text("utf-8"))
+    assert {tag for tag, _ in page.tags}.isdisjoint({"script", "link", "iframe", "object"})
+    assert len(page.all("img")) == len(files) - 2
+    for image in page.all("img"):
+        assert image["src"].startswith(("data:image/png;base64,", "data:image/jpeg;base64,"))
+        assert len(image["alt"]) > 20
+    targets = {attributes["id"] for _, attributes in page.tags if "id" in attributes}
+    assert {link["href"] for link in page.all("a")} == {f"#{name}" for name in targets}
+
+
+def test_every_measure_of_every_method_is_printed_with_interval_chance_and_basis(made):
+    _, out = made
+    results = json.loads((out / "results.json").read_text())
+    page, text = Page((out / "report.html").read_text("utf-8")).text, (out / "report.md").read_text("utf-8")
+    for method in results["methods"].values():
+        for summary in method["measures"].values():
+            cell = f"{100 * summary['value'][0]:.1f} [{100 * summary['low'][0]:.1f}, {100 * summary['high'][0]:.1f}]"
+            assert cell in page
+            assert cell.replace("[", r"\[").replace("]", r"\]") in text
+            assert summary["gallery"] in page
+    assert "792 queries of 18 objects" in page
+
+
+@pytest.mark.usefixtures("words_only")
+def test_nothing_is_computed_anew(made, tmp_path):
+    """A value that contradicts all others is printed as it stands."""
+
+    def change(results):
+        results["methods"]["cca"]["measures"]["pair_accuracy"] |= {"value": [0.12345], "low": [0.9], "high": [0.1]}
+
+    page, text, _ = remake(made, tmp_path, change=change)
+    assert "12.3 [90.0, 10.0]" in page
+    assert r"12.3 \[90.0, 10.0\]" in text
+
+
+@pytest.mark.usefixtures("words_only")
+def test_the_best_of_a_column_is_bold_and_equals_are_not(made, tmp_path):
+    def change(results):
+        for name, share in (("late_fusion", 0.7), ("cca", 0.7), ("chance", 0.5)):
+            results["methods"][name]["measures"]["pair_accuracy"]["value"] = [share]
+            results["methods"][name]["measures"]["pair_auc"]["value"] = [share + 0.1 * (name == "cca")]
+
+    rows = remake(made, tmp_path, change=change)[1].splitlines()
+    cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
+    assert cca[1].startswith("70.0")
+    assert cca[2].startswith("**80.0")
+
+
+@pytest.mark.usefixtures("words_only")
+def test_the_papers_figure_stands_beside_as_its_own_and_simulation_is_named(made, tmp_path):
+    page, _, _ = remake(made, tmp_path)
+    assert "64.3 %" in page
+    assert "no rival" in page
+    assert "This recording is simulated." in page
+
+    def real(results):
+        results["recording"]["source"] = "billets"
+
+    assert "This recording is simulated." not in remake(made, tmp_path, change=real)[0]
+
+
+@pytest.mark.usefixtures("words_only")
+def test_a_control_says_whether_chance_lies_in_its_interval(made, tmp_path):
+    def change(results):
+        results["controls"]["before"]["measures"]["pair_accuracy"] |= {"low": [0.51], "chance": [0.5], "high": [0.6]}
+        results["controls"]["shuffled"]["measures"]["pair_accuracy"] |= {"low": [0.49], "chance": [0.5], "high": [0.6]}
+
+    rows = remake(made, tmp_path, change=change)[1].splitlines()
+    assert next(row for row in rows if row.startswith("| before |")).endswith("| no |")
+    assert next(row for row in rows if row.startswith("| shuffled |")).endswith("| yes |")
+
+
+@pytest.mark.usefixtures("words_only")
+def test_leakage_is_set_apart(made, tmp_path):
+    def change(results):
+        results["audit"] |= {"clean": False, "verdict": "Leakage is possible: 3 file(s)."}
+        results["audit"]["identical"] = {"count": 1, "examples": [["test: a photo", "train: b photo"]]}
+
+    page, text, _ = remake(made, tmp_path, change=change)
+    assert '<p class="warn">Leakage audit: Leakage is possible: 3 file(s).</p>' in page
+    assert "> Leakage audit: Leakage is possible" in text
+    assert "test: a photo  =  train: b photo" in page
+
+
+def test_what_was_not_measured_is_left_out(made, tmp_path):
+    def change(results):
+        for method in results["methods"].values():
+            for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "chosen"):
+                method.pop(what)
+            method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
+        results |= {"controls": {}, "comparisons": []}
+        results.pop("audit")
+
+    _, text, files = remake(made, tmp_path, change=change)
+    assert [path.name for path in files[2:]] == ["overview.png"]
+    for heading in (
+        "Guess curves",
+        "Controls",
+        "Leakage audit",
+        "Object by object",
+        "Calibration",
+        "Accuracy and time",
+    ):
+        assert f"## {heading}" not in text
+    assert "## Methods side by side" in text
+
+
+def test_a_recording_of_few_objects_has_no_shares_by_object(made, tmp_path):
+    """Fewer test objects than candidates."""
+
+    def change(results):
+        for method in results["methods"].values():
+            method["per_object"] = {"test_candidates": {}, "all_candidates": {}}
+            method["measures"] = {"map": method["measures"]["map"]}
+
+    _, text, files = remake(made, tmp_path, change=change)
+    assert "## Object by object" not in text
+    assert {path.name for path in files[2:]} >= {"overview.png", "reject.png"}
+
+
+def test_values_that_could_not_be_taken_are_dashes(made, tmp_path):
+    def change(results):
+        results["methods"]["cca"]["measures"].pop("pair_auc")
+        results["methods"]["cca"]["measures"]["guesses_k5"] |= {key: [None] * 5 for key in ("value", "low", "high")}
+
+    rows = remake(made, tmp_path, change=change)[1].splitlines()
+    cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
+    assert (cca[2], cca[3]) == ("–", "–")
+
+
+def test_a_method_and_a_measure_that_the_report_does_not_know_are_shown_under_their_names(made, tmp_path):
+    def change(results):
+        new = json.loads(json.dumps(results["methods"]["cca"]))
+        new["measures"]["brand_new_measure"] = new["measures"]["pair_accuracy"]
+        results["methods"]["brand/new_method"] = new
+
+    page, _, files = remake(made, tmp_path, change=change)
+    assert "brand/new method" in page
+    assert "brand new measure" in page
+    assert "objects-test-brand-new_method.png" in {path.name for path in files}
+
+
+@pytest.mark.parametrize("methods", [("chance",), ("late_fusion",), ("chance", "constant")])
+def test_one_method_is_enough(folder, tmp_path, methods):
+    out = write_made_up(folder, tmp_path, methods)
+    assert write_report(out, None)
+
+
+def rename(results, old, new):
+    return json.loads(json.dumps(results).replace(json.dumps(old)[1:-1], json.dumps(new)[1:-1]))
+
+
+@pytest.mark.parametrize(
+    "name", ["<script>alert(1)</script>", "$\\frac{1}$ | *x* [y](z)", "x" * 400, "mug 茶碗 🍵 100 %d {} a&b"]
+)
+def test_any_name_of_an_object_is_harmless(made, tmp_path, name):
+    results = json.loads((made[1] / "results.json").read_text())
+    changed = rename(results, results["split"]["test"][0], name)
+    page, text, _ = remake(made, tmp_path, change=lambda results: (results.clear(), results.update(changed)))
+    assert not Page(page).all("script")
+    assert name in Page(page).text
+    for line in text.splitlines():
+        assert not re.search(r"(?<!\\)<script", line)
+
+
+def test_a_picture_that_has_gone_leaves_a_blank(made, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    for path in (copy / "images").glob("*photo*"):
+        path.unlink()
+    _, _, files = remake(made, tmp_path, recording=copy)
+    assert any(path.name.startswith("confusions") for path in files)
+
+
+@pytest.mark.usefixtures("words_only")
+def test_without_the_recording_there_are_no_galleries(made, tmp_path):
+    page, _, files = remake(made, tmp_path)
+    assert not [path for path in files if path.suffix == ".jpg"]
+    assert "The pictures need the recording" in page
+
+
+@pytest.mark.usefixtures("words_only")
+def test_two_reports_of_the_same_results_are_equal(made, tmp_path):
+    first = remake(made, tmp_path)[:2]
+    assert remake(made, tmp_path)[:2] == first
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", '{"schema_version": 99}'])
+def test_results_that_cannot_be_read_are_one_clear_error(tmp_path, text):
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(BadInput, match="retrieve evaluate"):
+        write_report(tmp_path, None)
+
+
+def test_missing_results_and_a_missing_recording_are_clear_errors(made, tmp_path):
+    with pytest.raises(BadInput, match=r"results\.json"):
+        write_report(tmp_path, None)
+    with pytest.raises(DatasetError):
+        write_report(made[1], tmp_path / "nowhere")
+
+
+# Words -----------------------------------------------------------------------------------------------
+
+
+def test_numbers_are_written_for_readers():
+    assert [number(value) for value in (None, 0.0, 3.0, 4.004, 0.0361, 99.95, 123.4, 12345.6)] == [
+        *("–", "0", "3", "4.00", "0.0361", "100", "123", "12,346")
+    ]
+    assert [percent(0.71249), percent(None), percent(0.5, 0)] == ["71.2", "–", "50"]
+    assert with_interval({"value": [0.5], "low": [0.4], "high": [0.625]}) == "50.0 [40.0, 62.5]"
+    assert with_interval(None) == "–"
+    assert [probability(p) for p in (0.0, 0.00012, 0.0512, 0.5)] == ["< 0.0001", "0.00012", "0.051", "0.50"]
+
+
+def test_a_long_name_keeps_both_ends():
+    assert short("abcdef", 6) == "abcdef"
+    assert short("abcdefgh", 5) == "ab…gh"
+    assert [at_start("late fusion"), at_start("CCA"), at_start("")] == ["Late fusion", "CCA", ""]
+
+
+def test_markdown_and_html_say_the_same(tmp_path):
+    Image.new("RGB", (144, 10)).save(tmp_path / "p.png")
+    table = Table(
+        ("a", "b", "c"), (("1|2", "3", "x"), ("<4>", "5", "y")), ("note",), frozenset({2}), frozenset({(1, 1)})
+    )
+    blocks = (Text("one *two*", warn=True), table, Listing("{\n}"), Details("more", (Text("inside"),)))
+    document = Document("T", (Text("lead"),), (Section("S", (*blocks, Picture("p.png", "alt", "caption"))),))
+    assert to_markdown(document) == (
+        "# T\n\nlead\n\n## S\n\n> one \\*two\\*\n\n| a | b | c |\n| --- | ---: | --- |\n| 1\\|2 | 3 | x |\n"
+        "| \\<4\\> | **5** | y |\n\nnote\n\n    {\n    }\n\n### more\n\ninside\n\n![alt](p.png)\n\ncaption\n"
+    )
+    page = to_html(document, tmp_path)
+    for part in (
+        '<p class="warn">one *two*</p>',
+        "<strong>5</strong>",
+        "&lt;4&gt;",
+        "<summary>more</summary>",
+        'width="96"',
+    ):
+        assert part in page

@@ -1,0 +1,191 @@
+"""Features of frozen towers: what they are, that they are encoded once, and what stands for a touch in a control."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval.dataset import load_grasps
+from retrieval.errors import BadInput, DatasetError
+from retrieval.features import Features, blurred, by_image, encode_recording
+from retrieval.train import build_matcher
+from tests.conftest import TINY
+
+
+@pytest.fixture(scope="module")
+def grasps(recording):
+    return load_grasps(recording)[:9]
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    torch.manual_seed(0)
+    return build_matcher(TINY)
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How many images have gone through the towers."""
+    counts = {"touch_features": 0, "photo_features": 0}
+    for name in counts:
+        real = getattr(__import__("retrieval.features", fromlist=[name]), name)
+
+        def counting(matcher, items, name=name, real=real):
+            items = list(items)
+            counts[name] += len(items)
+            return real(matcher, items)
+
+        monkeypatch.setattr(f"retrieval.features.{name}", counting)
+    return counts
+
+
+def test_a_row_holds_what_the_towers_say_of_that_grasp_alone(grasps, matcher):
+    features = encode_recording(grasps, matcher, TINY, None, quiet=True)
+    assert features.grasp_ids == tuple(grasp.grasp_id for grasp in grasps)
+    assert features.object_ids == tuple(grasp.object_id for grasp in grasps)
+    load = TINY.preprocessing
+    with torch.inference_mode():
+        for row in (0, 5):
+            fingers = np.stack([load.load_touch(path) for path in grasps[row].touches])
+            photo = load.load_photo(grasps[row].photo)[None]
+            touch = matcher.touch_tower(torch.from_numpy(fingers).permute(0, 3, 1, 2))
+            seen = matcher.photo_tower(torch.from_numpy(photo).permute(0, 3, 1, 2))
+            # float32, summed in another order in a batch of another size
+            np.testing.assert_allclose(features.touch[row], touch, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(features.photo[row], seen[0], rtol=1e-4, atol=1e-5)
+
+
+def test_a_second_run_reads_and_encodes_nothing(grasps, matcher, tmp_path, counted):
+    first = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    assert counted == {"touch_features": 9, "photo_features": 9}
+    again = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    assert counted == {"touch_features": 9, "photo_features": 9}
+    assert again.digest == first.digest
+
+
+def test_a_run_that_was_stopped_keeps_its_finished_parts(grasps, matcher, tmp_path, counted, monkeypatch):
+    whole = encode_recording(grasps, matcher, TINY, None, quiet=True)
+    monkeypatch.setattr("retrieval.features._PART", 4)
+    with monkeypatch.context() as during:
+        during.setattr("retrieval.images.Preprocessing.load_photo", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    assert len(list(tmp_path.iterdir())) == 3  # of 4, 4 and 1 touches; no photo was finished
+    counted.update(touch_features=0, photo_features=0)
+    resumed = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    assert counted == {"touch_features": 0, "photo_features": 9}
+    np.testing.assert_allclose(resumed.touch, whole.touch, rtol=1e-4, atol=1e-5)  # batches of another size
+    np.testing.assert_allclose(resumed.photo, whole.photo, rtol=1e-4, atol=1e-5)
+
+
+def test_a_damaged_part_is_encoded_again_and_said(grasps, matcher, tmp_path, counted, caplog):
+    first = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    touches = next(tmp_path.glob("touch-*"))
+    data = bytearray(touches.read_bytes())
+    data[-1] ^= 1
+    touches.write_bytes(data)
+    again = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    assert (counted["touch_features"], counted["photo_features"]) == (18, 9)
+    assert again.digest == first.digest
+    assert "encoded again" in caplog.text
+
+
+def test_other_weights_preprocessing_or_images_are_never_taken_for_these(grasps, matcher, tmp_path, counted):
+    encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
+    torch.manual_seed(1)
+    smaller = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, touch_px=40))
+    other = [dataclasses.replace(grasp, photo=grasps[row - 1].photo) for row, grasp in enumerate(grasps)]
+    for count, (items, towers, config) in enumerate(
+        [(grasps, build_matcher(TINY), TINY), (grasps, matcher, smaller), (other, matcher, TINY)], start=2
+    ):
+        encode_recording(items, towers, config, tmp_path, quiet=True)
+        assert counted["photo_features"] == 9 * count
+
+
+def test_a_photo_file_that_grasps_share_is_encoded_once(grasps, matcher, counted):
+    shared = [dataclasses.replace(grasp, photo=grasps[0].photo) for grasp in grasps[:3]]
+    features = encode_recording(shared, matcher, TINY, None, quiet=True)
+    assert counted["photo_features"] == 1
+    assert features.photo.shape[0] == 3
+    np.testing.assert_array_equal(features.photo[0], features.photo[2])
+
+
+def test_what_stands_for_a_touch_changes_the_touch_alone(grasps, matcher, tmp_path, counted):
+    made = {
+        variant: encode_recording(grasps, matcher, TINY, tmp_path, variant=variant, quiet=True)
+        for variant in ("touch", "blurred", "before")
+    }
+    assert counted == {"touch_features": 27, "photo_features": 9}
+    for variant in ("blurred", "before"):
+        np.testing.assert_array_equal(made[variant].photo, made["touch"].photo)
+        assert np.abs(made[variant].touch - made["touch"].touch).max() > 0.01
+    shown = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
+    before = encode_recording(shown, matcher, TINY, None, quiet=True)
+    np.testing.assert_array_equal(made["before"].touch, before.touch)
+
+
+def test_frames_from_before_the_contact_must_be_there_to_be_shown(grasps, matcher):
+    lacking = [dataclasses.replace(grasp, backgrounds=()) for grasp in grasps]
+    with pytest.raises(DatasetError, match="before the contact"):
+        encode_recording(lacking, matcher, TINY, None, variant="before", quiet=True)
+    with pytest.raises(BadInput, match="touch, blurred, before; got 'after'"):
+        encode_recording(grasps, matcher, TINY, None, variant="after", quiet=True)
+
+
+def test_a_blur_keeps_colour_and_size_and_nothing_fine():
+    image = np.full((60, 80, 3), 0.25, dtype=np.float32)
+    image[::2] += 0.5  # stripes a pixel wide, mean 0.5
+    plain = blurred(image)
+    assert plain.shape == image.shape
+    np.testing.assert_allclose(plain, 0.5, atol=0.02)
+    halves = np.zeros((60, 80, 3), dtype=np.float32)
+    halves[:, 40:] = 1  # what is coarse stays
+    assert blurred(halves)[:, :10].max() < 0.1
+    assert blurred(halves)[:, -10:].min() > 0.9
+
+
+def some_features():
+    touch = np.arange(24, dtype=np.float32).reshape(4, 2, 3)
+    return Features(("a", "b", "c", "d"), ("mug", "can", "mug", "box"), touch, touch[:, 0] + 100)
+
+
+def test_objects_are_numbered_by_their_sorted_names():
+    assert some_features().owner.tolist() == [2, 1, 2, 0]
+
+
+def test_selected_rows_are_those_asked_for_in_that_order():
+    part = some_features().select(np.array([3, 0]))
+    assert (part.grasp_ids, part.object_ids) == (("d", "a"), ("box", "mug"))
+    assert part.touch[:, 0, 0].tolist() == [18, 0]
+    assert part.photo[:, 0].tolist() == [118, 100]
+    assert some_features().of_objects(["mug", "spoon"]).grasp_ids == ("a", "c")
+
+
+def test_equal_features_have_equal_digests_and_others_have_not():
+    one = some_features()
+    assert one.digest == some_features().digest
+    renamed = dataclasses.replace(one, object_ids=("mug", "can", "mug", "can"))
+    moved = dataclasses.replace(one, photo=one.photo + np.float32(1e-3))
+    assert len({one.digest, renamed.digest, moved.digest, one.select(np.array([1, 0, 2, 3])).digest}) == 4
+
+
+@pytest.mark.parametrize(
+    ("touch", "photo"),
+    [
+        (np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)),
+        (np.zeros((4, 2, 3), np.float32), np.zeros((3, 3), np.float32)),
+        (np.zeros((4, 2, 3)), np.zeros((4, 3), np.float32)),
+    ],
+)
+def test_features_of_another_shape_or_type_are_refused(touch, photo):
+    with pytest.raises(BadInput, match="features must be"):
+        Features(("a", "b", "c", "d"), ("m",) * 4, touch, photo)
+
+
+def test_features_are_found_by_grasp_and_by_photo_file(grasps, matcher):
+    features = encode_recording(grasps, matcher, TINY, None, quiet=True)
+    known = by_image(grasps[2:4], features, torch.device("cpu"))
+    assert set(known) == {grasp.grasp_id for grasp in grasps[2:4]} | {grasp.photo for grasp in grasps[2:4]}
+    np.testing.assert_array_equal(known[grasps[3].grasp_id], features.touch[3].ravel())
+    np.testing.assert_array_equal(known[grasps[2].photo], features.photo[2])

@@ -1,0 +1,248 @@
+"""Late fusion in the harness is what `retrieve train` trains and `retrieve query` runs, on features for images."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval.batches import one_thread
+from retrieval.checkpoint import load_checkpoint
+from retrieval.dataset import load_grasps, make_split
+from retrieval.errors import BadInput, Interrupted
+from retrieval.features import Features, encode_recording
+from retrieval.finish import unfinished
+from retrieval.methods.base import Setting
+from retrieval.methods.late_fusion import LateFusion
+from retrieval.methods.prune_rerank import PruneRerank, candidates
+from retrieval.train import Trainer, build_matcher, state_path, train
+from tests.conftest import TINY
+
+FROZEN = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, freeze_towers=True))
+
+
+def with_training(config, **changes):
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, **changes))
+
+
+@pytest.fixture(scope="module")
+def split(recording):
+    return make_split(load_grasps(recording), validation=0.25, test=0.2, seed=0)
+
+
+@pytest.fixture(scope="module")
+def features(recording):
+    torch.manual_seed(FROZEN.training.seed)
+    return encode_recording(load_grasps(recording), build_matcher(FROZEN), FROZEN, None, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def parts(features, split):
+    return tuple(features.of_objects(part) for part in (split.train, split.validation, split.test))
+
+
+@pytest.fixture(scope="module")
+def fitted(parts, tmp_path_factory):
+    return fit(LateFusion, parts, tmp_path_factory.mktemp("fits"))
+
+
+def fit(method, parts, folder, config=FROZEN):
+    made = method(Setting(config, folder=folder))
+    made.fit(*parts[:2])
+    return made
+
+
+def codes(method, part):
+    return method.encode_touch(part.touch), method.encode_photo(part.photo)
+
+
+def no_training(monkeypatch):
+    monkeypatch.setattr(Trainer, "run", lambda *_: pytest.fail("trained"))
+
+
+@torch.inference_mode()
+def two_loops(matcher, part):
+    """Match logits of every touch with every photo, pair by pair."""
+    table = np.empty((len(part), len(part)))
+    for row, touch in enumerate(part.touch):
+        for column, photo in enumerate(part.photo):
+            touched = matcher.touch_code(torch.from_numpy(touch).reshape(1, -1))
+            seen = matcher.photo_code(torch.from_numpy(photo)[None])
+            table[row, column] = matcher.head(touched.half, seen.half).item()
+    return table
+
+
+def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
+    matcher = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors").matcher
+    expected = two_loops(matcher, parts[2])
+    np.testing.assert_allclose(fitted.score(*codes(fitted, parts[2])), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_set_of_grasps_scores_the_sum_of_its_logits(fitted, parts):
+    touch, photo = codes(fitted, parts[2])
+    sets = np.array([[0, 1], [4, 2]])
+    single = fitted.score(touch, photo).astype(np.float64)
+    expected = np.array([single[0] + single[1], single[4] + single[2]])
+    np.testing.assert_allclose(fitted.score_sets(touch, photo, sets), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_harness_trains_what_the_command_line_trains(recording, split, fitted, tmp_path):
+    ours = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors")
+    theirs = train(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
+    assert (ours.provenance["step"], ours.config) == (theirs.provenance["step"], theirs.config)
+    for name, weight in theirs.matcher.state_dict().items():
+        # The same steps on features that were encoded in batches of another size.
+        torch.testing.assert_close(ours.matcher.state_dict()[name], weight, rtol=1e-3, atol=2e-4)
+
+
+def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue, tmp_path):
+    from retrieval.build import build_index
+
+    report = build_index(
+        catalogue, load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors"), tmp_path / "index"
+    )
+    assert report.to_dict()["photos"] == 24
+
+
+def test_what_is_finished_is_not_trained_again(fitted, parts, monkeypatch):
+    no_training(monkeypatch)
+    again = fit(LateFusion, parts, fitted.setting.folder)
+    assert again.chosen == fitted.chosen
+    np.testing.assert_array_equal(again.score(*codes(again, parts[2])), fitted.score(*codes(fitted, parts[2])))
+    assert fit(PruneRerank, parts, fitted.setting.folder).chosen["step"] == fitted.chosen["step"]
+
+
+def test_another_setting_or_other_features_are_trained_anew(parts, tmp_path):
+    first = fit(LateFusion, parts, tmp_path)
+    slower = with_training(FROZEN, learning_rate=1e-4)
+    assert fit(LateFusion, parts, tmp_path, slower).chosen != first.chosen
+    back = fit(LateFusion, parts, tmp_path)
+    assert back.chosen == first.chosen
+    moved = dataclasses.replace(parts[0], touch=parts[0].touch + 1)
+    assert fit(LateFusion, (moved, *parts[1:]), tmp_path).chosen != first.chosen
+
+
+def stopped(parts, folder, monkeypatch, config=FROZEN):
+    """A fit that a power cut ends in its fourth step, after the state of the third is on disk."""
+    step = Trainer.train_step
+
+    def failing(self, loaded):
+        if self.step == 3:
+            raise Interrupted("power cut")
+        return step(self, loaded)
+
+    with monkeypatch.context() as during:
+        during.setattr(Trainer, "train_step", failing)
+        with pytest.raises(Interrupted):
+            fit(LateFusion, parts, folder, config)
+    assert state_path(unfinished(folder / "late_fusion-0.safetensors")).is_file()
+    assert not (folder / "late_fusion-0.safetensors").exists()
+
+
+def test_a_fit_that_was_stopped_goes_on_and_ends_bit_for_bit_alike(fitted, parts, tmp_path, monkeypatch):
+    stopped(parts, tmp_path, monkeypatch)
+    fit(LateFusion, parts, tmp_path)
+    done = tmp_path / "late_fusion-0.safetensors"
+    assert done.read_bytes() == (fitted.setting.folder / done.name).read_bytes()
+    assert not state_path(unfinished(done)).exists()
+
+
+def test_what_another_fit_left_unfinished_makes_room(fitted, parts, tmp_path, monkeypatch):
+    stopped(parts, tmp_path, monkeypatch, with_training(FROZEN, learning_rate=1e-4))
+    assert fit(LateFusion, parts, tmp_path).chosen == fitted.chosen
+
+
+def test_no_folder_keeps_nothing_and_comes_out_alike(fitted, parts):
+    alone = fit(LateFusion, parts, None)
+    np.testing.assert_array_equal(alone.score(*codes(alone, parts[2])), fitted.score(*codes(fitted, parts[2])))
+
+
+def test_seeds_come_out_apart(parts, tmp_path):
+    methods = [LateFusion(Setting(FROZEN, seed=seed, folder=tmp_path)) for seed in (0, 1)]
+    for method in methods:
+        method.fit(*parts[:2])
+    first, second = (method.score(*codes(method, parts[2])) for method in methods)
+    assert np.abs(first - second).max() > 1e-3
+    assert {path.name for path in tmp_path.glob("*.safetensors")} == {f"late_fusion-{n}.safetensors" for n in (0, 1)}
+
+
+@pytest.mark.parametrize("method", [LateFusion, PruneRerank])
+def test_a_method_of_a_checkpoint_needs_no_fit_and_scores_alike(method, fitted, parts, monkeypatch):
+    no_training(monkeypatch)
+    checkpoint = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors")
+    given = method.of_checkpoint(checkpoint, Setting(FROZEN))
+    expected = fit(method, parts, fitted.setting.folder)
+    np.testing.assert_array_equal(given.score(*codes(given, parts[2])), expected.score(*codes(expected, parts[2])))
+    with pytest.raises(BadInput, match="as fitted on"):
+        given.encode_touch(parts[2].touch[:, :1])
+
+
+def test_features_of_other_towers_are_refused(parts):
+    cut = [dataclasses.replace(part, photo=part.photo[:, :100]) for part in parts]
+    with pytest.raises(BadInput, match=r"256 of a photo .*; got 256 and 100"):
+        fit(LateFusion, cut, None)
+
+
+def test_a_fit_on_features_reads_no_image(parts, tmp_path, monkeypatch):
+    monkeypatch.setattr("retrieval.batches.touch_features", lambda *_: pytest.fail("read an image"))
+    monkeypatch.setattr("retrieval.batches.photo_features", lambda *_: pytest.fail("read an image"))
+    fit(LateFusion, parts, tmp_path)
+
+
+def expected_pruned(logits, nearness, count):
+    """Two loops: the nearest photos of any grasp of the set by their summed logit, the others below, by nearness."""
+    judged = set()
+    for near in nearness:
+        judged |= set(sorted(range(len(near)), key=lambda column: (-near[column], column))[:count])
+    mean = nearness.mean(0)
+    rest = [column for column in range(len(mean)) if column not in judged]
+    return sorted(judged, key=lambda column: -logits[column]) + sorted(rest, key=lambda column: -mean[column])
+
+
+@pytest.mark.parametrize("grasps", [1, 2, 3])
+def test_pruning_ranks_candidates_by_logit_and_the_rest_behind_by_embedding(grasps, fitted, parts):
+    every = Features(
+        parts[0].grasp_ids + parts[2].grasp_ids,
+        parts[0].object_ids + parts[2].object_ids,
+        np.concatenate([parts[0].touch, parts[2].touch]),
+        np.concatenate([parts[0].photo, parts[2].photo]),
+    )
+    method = fit(PruneRerank, parts, fitted.setting.folder)
+    matcher = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors").matcher
+    with torch.inference_mode():
+        touch = matcher.touch_code(torch.from_numpy(every.touch).flatten(1)).embedding
+        nearness = (touch @ matcher.photo_code(torch.from_numpy(every.photo)).embedding.T).numpy()
+    logits = fitted.score(*codes(fitted, every))
+    sets = np.arange(4 * grasps).reshape(4, grasps)
+    scores = method.score_sets(*codes(method, every), sets)
+    count = round(0.25 * len(every))
+    for row, chosen in enumerate(sets):
+        ranked = np.argsort(-scores[row], kind="stable").tolist()
+        assert ranked == expected_pruned(logits[chosen].sum(0, dtype=np.float64), nearness[chosen], count)
+    if grasps == 1:
+        np.testing.assert_allclose(method.score(*codes(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
+
+
+def test_judging_every_photo_is_late_fusion(fitted, parts):
+    method = PruneRerank(fitted.setting, share=1.0)
+    method.fit(*parts[:2])
+    np.testing.assert_array_equal(method.score(*codes(method, parts[2])), fitted.score(*codes(fitted, parts[2])))
+
+
+def test_a_model_without_trained_embeddings_judges_every_photo(parts, tmp_path):
+    method = fit(PruneRerank, parts, tmp_path, with_training(FROZEN, contrastive_weight=0.0))
+    assert method.chosen["judged_share"] == 1.0
+    late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, contrastive_weight=0.0))
+    np.testing.assert_array_equal(method.score(*codes(method, parts[2])), late.score(*codes(late, parts[2])))
+
+
+def test_equally_near_photos_are_taken_by_row():
+    nearness = np.array([[0.5, 0.9, 0.5, 0.5], [0.1, 0.1, 0.1, 0.3]], dtype=np.float32)
+    assert candidates(nearness, 2).tolist() == [0, 1, 3]
+
+
+def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():
+    before = torch.get_num_threads()
+    with one_thread():
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == before

@@ -1,0 +1,253 @@
+"""What every method owes the harness: one behaviour suite over the table of methods."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from retrieval.config import Config, MatcherConfig, TrainingConfig
+from retrieval.errors import BadInput, ConfigError, NumericalError
+from retrieval.features import Features
+from retrieval.methods import METHODS, build_method
+from retrieval.methods.base import Method, Setting
+from retrieval.methods.selection import judge, judged_rows, ranking_auc
+from retrieval.methods.standardise import Standardiser
+
+KNOWS_NOTHING = {"chance", "constant"}
+LEARNS = [name for name in METHODS if name not in KNOWS_NOTHING]
+FEATURES = 256  # what the small tower gives
+CONFIG = Config(
+    matcher=MatcherConfig(
+        tower="small", tower_output="pooled", hidden=32, dropout=0.2, standardise=True, embedding_dim=16
+    ),
+    training=TrainingConfig(
+        init="random",
+        iterations=160,
+        touches_per_batch=12,
+        learning_rate=3e-3,
+        schedule="cosine",
+        contrastive_weight=1.0,
+        freeze_towers=True,
+        validate_every=40,
+    ),
+)
+
+
+def planted(objects, seed, each=8, noise=0.5):
+    """Objects with three numbers of their own, seen linearly by both modalities, and noise: an easy problem."""
+    world, rng = np.random.default_rng(5), np.random.default_rng(seed)
+    latent = np.repeat(rng.standard_normal((objects, 3)), each, axis=0)
+    n = len(latent)
+    touch, photo = (
+        latent @ world.standard_normal((3, width)) + noise * rng.standard_normal((n, width))
+        for width in (2 * FEATURES, FEATURES)
+    )
+    return Features(
+        tuple(f"grasp-{seed}-{row}" for row in range(n)),
+        tuple(f"object-{seed}-{row // each:02}" for row in range(n)),
+        touch.reshape(n, 2, FEATURES).astype(np.float32),
+        photo.astype(np.float32),
+    )
+
+
+TRAIN, VALIDATION, TEST = planted(12, 0), planted(4, 1), planted(6, 2)
+
+
+@lru_cache
+def fitted(name, seed=0) -> Method:
+    method = build_method(name, Setting(CONFIG, seed=seed))
+    method.fit(TRAIN, VALIDATION)
+    return method
+
+
+def codes(method, features=TEST):
+    return method.encode_touch(features.touch), method.encode_photo(features.photo)
+
+
+every_method = pytest.mark.parametrize("name", METHODS)
+
+
+@every_method
+def test_every_touch_gets_a_finite_score_with_every_photo(name):
+    touch, photo = codes(fitted(name))
+    scores = fitted(name).score(touch, photo[:17])
+    assert scores.shape == (len(TEST), 17)
+    assert scores.dtype == np.float32
+    assert np.isfinite(scores).all()
+
+
+@every_method
+def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
+    again = build_method(name, Setting(CONFIG))
+    again.fit(TRAIN, VALIDATION)
+    np.testing.assert_array_equal(again.score(*codes(again)), fitted(name).score(*codes(fitted(name))))
+    assert again.chosen == fitted(name).chosen
+
+
+@pytest.mark.parametrize("name", LEARNS)
+def test_photos_of_the_touched_object_score_higher(name):
+    assert judge(TEST).touches(fitted(name).score(*codes(fitted(name)))) > 0.8
+
+
+def test_the_constant_is_exactly_chance_and_chance_is_about_chance():
+    assert judge(TEST).touches(fitted("constant").score(*codes(fitted("constant")))) == 0.5
+    values = [judge(TEST).touches(fitted("chance", seed).score(*codes(fitted("chance", seed)))) for seed in range(12)]
+    assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
+
+
+# Pruning looks at the whole gallery.
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "prune_rerank"])
+def test_a_score_depends_on_its_touch_and_photo_only(name):
+    touch, photo = codes(fitted(name))
+    whole = fitted(name).score(touch, photo)
+    alone = np.concatenate([fitted(name).encode_touch(TEST.touch[row : row + 1]) for row in (5, 3)])
+    part = fitted(name).score(alone, photo[10:14])
+    np.testing.assert_allclose(part, whole[[5, 3], 10:14], rtol=1e-4, atol=1e-4)  # float32 sums in other blocks
+
+
+@every_method
+def test_the_order_of_the_grasps_of_a_set_does_not_matter(name):
+    touch, photo = codes(fitted(name))
+    sets = np.array([[0, 1, 2, 3, 4], [9, 8, 15, 10, 11]])
+    turned = fitted(name).score_sets(touch, photo, sets[:, [3, 0, 4, 2, 1]])
+    np.testing.assert_allclose(turned, fitted(name).score_sets(touch, photo, sets), rtol=1e-5, atol=1e-5)
+
+
+@every_method
+def test_a_set_of_one_grasp_scores_as_the_grasp(name):
+    touch, photo = codes(fitted(name))
+    sets = np.array([[7], [0], [40]])
+    scores = fitted(name).score(touch, photo)[sets[:, 0]]
+    np.testing.assert_allclose(fitted(name).score_sets(touch, photo, sets), scores, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["late_fusion", "contrastive", "contrastive_sigmoid", "cca", "plsca", "chance"])
+def test_a_set_scores_the_sum_over_its_grasps(name):
+    touch, photo = codes(fitted(name))
+    scores = fitted(name).score(touch, photo).astype(np.float64)
+    expected = [[scores[0, n] + scores[3, n] + scores[5, n] for n in range(len(photo))]]
+    got = fitted(name).score_sets(touch, photo, np.array([[0, 3, 5]]))
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", LEARNS)
+def test_five_grasps_tell_more_than_one(name):
+    noisy = planted(6, 2, noise=6.0)
+    judged = judge(noisy)
+    touch, photo = codes(fitted(name), noisy)
+    rows = np.arange(len(TEST))
+    sets = rows[:, None] // 8 * 8 + (rows[:, None] + np.arange(5)) % 8
+    single = judged.sets(fitted(name).score(touch, photo), rows[:, None])
+    assert judged.sets(fitted(name).score_sets(touch, photo, sets), sets) > single
+
+
+@every_method
+def test_it_must_be_fitted_before_use(name):
+    method = build_method(name, Setting(CONFIG))
+    with pytest.raises(BadInput, match="fitted before"):
+        method.encode_touch(TEST.touch)
+    with pytest.raises(BadInput, match="fitted before"):
+        method.encode_photo(TEST.photo)
+    with pytest.raises(BadInput, match="fitted before"):
+        method.score(np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32))
+    with pytest.raises(BadInput, match="fitted before"):
+        method.score_sets(np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32), np.zeros((1, 1), np.int64))
+
+
+def spoiled(features, value):
+    photo = features.photo.copy()
+    photo[3, 5] = value
+    return Features(features.grasp_ids, features.object_ids, features.touch, photo)
+
+
+@every_method
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_features_that_are_not_finite_are_refused(name, value):
+    for train, validation in ((spoiled(TRAIN, value), VALIDATION), (TRAIN, spoiled(VALIDATION, value))):
+        with pytest.raises(NumericalError, match=r"photo features of .* at \(3, 5\)"):
+            build_method(name, Setting(CONFIG)).fit(train, validation)
+    with pytest.raises(NumericalError, match=r"photo features must be finite; got .* at \(3, 5\)"):
+        fitted(name).encode_photo(spoiled(TEST, value).photo)
+
+
+@every_method
+def test_features_of_another_shape_than_fitted_on_are_refused(name):
+    with pytest.raises(BadInput, match=r"touch features must be an array of shape \(B, 2, 256\)"):
+        fitted(name).encode_touch(TEST.touch[:, :1])
+    with pytest.raises(BadInput, match=r"photo features must be an array of shape \(B, 256\)"):
+        fitted(name).encode_photo(TEST.photo[:, :100])
+
+
+def test_too_few_objects_and_objects_in_both_parts_are_refused():
+    first_object = TRAIN.select(np.arange(8))
+    with pytest.raises(BadInput, match="at least 2 training objects; got 1"):
+        build_method("constant", Setting(CONFIG)).fit(first_object, VALIDATION)
+    with pytest.raises(BadInput, match="at least 2 validation objects; got 1"):
+        build_method("constant", Setting(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
+    with pytest.raises(BadInput, match="'object-0-00' is in both"):
+        build_method("constant", Setting(CONFIG)).fit(TRAIN, TRAIN)
+
+
+@pytest.mark.parametrize("sets", [np.array([0, 1]), np.zeros((2, 0), np.int64), np.array([[0.0]])])
+def test_sets_of_another_shape_are_refused(sets):
+    with pytest.raises(BadInput, match="shape"):
+        fitted("constant").score_sets(*codes(fitted("constant")), sets)
+
+
+@pytest.mark.parametrize("row", [-1, len(TEST)])
+def test_sets_that_name_no_touch_are_refused(row):
+    with pytest.raises(BadInput, match="rows of the 48 touch codes"):
+        fitted("constant").score_sets(*codes(fitted("constant")), np.array([[0, row]]))
+
+
+def test_a_method_whose_scores_are_not_finite_or_of_another_shape_is_caught():
+    class Broken(type(fitted("constant"))):
+        def _score(self, touch_codes, photo_codes):
+            return self.answer
+
+    broken = Broken(Setting(CONFIG))
+    broken.fit(TRAIN, VALIDATION)
+    broken.answer = np.full((48, 48), np.nan)
+    with pytest.raises(NumericalError, match=r"scores must be finite; got nan at \(0, 0\)"):
+        broken.score(*codes(broken))
+    broken.answer = np.zeros((48, 47))
+    with pytest.raises(BadInput, match=r"shape \(48, 48\)"):
+        broken.score(*codes(broken))
+
+
+def test_an_unknown_method_is_told_the_known_ones():
+    with pytest.raises(ConfigError, match=r"late_fusion, set_fusion, .*, constant; got 'oracle'"):
+        build_method("oracle", Setting(CONFIG))
+
+
+def test_the_worth_of_scores_is_what_loops_count():
+    rng = np.random.default_rng(3)
+    touch_owner, photo_owner = np.array([0, 0, 1, 2]), np.array([0, 0, 1, 1, 2])
+    scores = rng.integers(0, 4, (4, 5)).astype(float)
+    left_out = np.zeros((4, 5), bool)
+    left_out[[0, 1, 2, 3], [0, 1, 2, 4]] = True
+    by_object = {}
+    for i in range(4):
+        own = [j for j in range(5) if photo_owner[j] == touch_owner[i] and not left_out[i, j]]
+        own = own or [j for j in range(5) if photo_owner[j] == touch_owner[i]]  # object 2 has one photo only
+        others = [j for j in range(5) if photo_owner[j] != touch_owner[i]]
+        wins = [(scores[i, a] > scores[i, b]) + (scores[i, a] == scores[i, b]) / 2 for a in own for b in others]
+        by_object.setdefault(touch_owner[i], []).append(np.mean(wins))
+    expected = np.mean([np.mean(values) for values in by_object.values()])
+    assert ranking_auc(scores, touch_owner, photo_owner, left_out) == pytest.approx(expected, abs=1e-12)
+
+
+def test_every_object_has_its_share_of_the_grasps_to_choose_by():
+    features = planted(5, 3, each=40)
+    rows = judged_rows(features, most=50)
+    assert np.bincount(features.owner[rows]).tolist() == [10] * 5
+    assert len(np.unique(rows)) == 50
+    assert np.bincount(features.owner[judged_rows(features, most=3)]).tolist() == [2] * 5
+
+
+def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left_out():
+    x = np.array([[1.0, 5.0, 1e4], [3.0, 5.0, 1e4 + 1e-3], [5.0, 5.0, 1e4]], dtype=np.float32)
+    standardise = Standardiser.fit(x)
+    assert standardise.kept.tolist() == [0]  # the last one varies by its float32 rounding only
+    np.testing.assert_allclose(standardise(np.array([[3.0, 9.0, 0.0]])), [[0.0]])
+    np.testing.assert_allclose(standardise(x).std(0), 1.0)

@@ -1,0 +1,184 @@
+"""What methods are asked, and the file between predicting and scoring."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from retrieval.checkpoint import write_tensors
+from retrieval.dataset import Grasp, Split
+from retrieval.errors import BadInput, CheckpointError, DatasetError
+from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
+from retrieval.evaluation.queries import MOST_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
+from retrieval.features import Features
+from retrieval.methods.base import Setting
+from retrieval.methods.chance import Chance
+from tests.conftest import TINY
+
+SPLIT = Split(0, train=("a", "b"), validation=("c", "d"), test=("e", "f"))
+
+
+def recorded(counts):
+    """Grasps of objects, one object after another; every third photo is used for the next grasp too."""
+    grasps = []
+    for name, count in counts.items():
+        for number in range(count):
+            photo = Path(f"{name}-{number - number % 3 % 2}.png")
+            grasps.append(Grasp(f"{name}-{number}", name, None, photo, (Path(f"{name}-{number}-a.png"),), ()))
+    return grasps
+
+
+GRASPS = recorded({"a": 20, "b": 3, "c": 20, "d": 6, "e": 20, "f": 2, "left out": 5})
+QUERIES = draw_queries(GRASPS, SPLIT, 0)
+
+
+def test_every_grasp_of_a_test_object_is_judged_and_some_of_the_others():
+    names, counts = np.unique([GRASPS[row].object_id for row in QUERIES.touches], return_counts=True)
+    assert dict(zip(names.tolist(), counts.tolist(), strict=True)) == {
+        "a": MOST_GRASPS["train"], "b": 3, "c": MOST_GRASPS["validation"], "d": 6, "e": 20, "f": 2,
+    }  # fmt: skip
+    assert len(set(QUERIES.touches.tolist())) == len(QUERIES.touches)
+
+
+def test_touches_and_photos_know_their_objects_and_parts():
+    assert QUERIES.objects == ("a", "b", "c", "d", "e", "f")
+    for rows, owner in ((QUERIES.touches, QUERIES.touch_owner), (QUERIES.photos, QUERIES.photo_owner)):
+        assert [GRASPS[row].object_id for row in rows] == [QUERIES.objects[number] for number in owner]
+    for part in ("train", "validation", "test"):
+        places = QUERIES.of_part(QUERIES.touch_owner, part)
+        assert {GRASPS[row].object_id for row in QUERIES.touches[places]} == set(getattr(SPLIT, part))
+
+
+def test_a_photo_file_stands_once_however_many_grasps_share_it():
+    files = [GRASPS[row].photo for row in QUERIES.photos]
+    assert len(set(files)) == len(files) < len(QUERIES.touches)
+    assert [files[column] for column in QUERIES.own_photo] == [GRASPS[row].photo for row in QUERIES.touches]
+
+
+def test_sets_hold_different_grasps_of_one_object_and_leave_it_three_photos():
+    have = {"c": 12, "d": 6, "e": 20, "f": 2}
+    for size in SET_SIZES:
+        sets = QUERIES.sets[size]
+        owners = QUERIES.touch_owner[sets]
+        assert (owners == owners[:, :1]).all()
+        assert all(len(set(row)) == size for row in sets.tolist())
+        names, counts = np.unique([QUERIES.objects[number] for number in owners[:, 0]], return_counts=True)
+        assert set(names.tolist()) == {name for name, count in have.items() if count - size >= 3}
+        assert set(counts.tolist()) == {SETS_OF_AN_OBJECT}
+
+
+def test_the_same_is_asked_for_one_seed_and_something_else_for_another():
+    assert draw_queries(GRASPS, SPLIT, 0).digest == QUERIES.digest
+    assert draw_queries(GRASPS, SPLIT, 1).digest != QUERIES.digest
+    assert replace(QUERIES, sets={1: QUERIES.sets[1]}).digest != QUERIES.digest
+
+
+@pytest.mark.parametrize("part", ["train", "validation", "test"])
+def test_two_objects_of_each_part_must_be_recorded(part):
+    lacking = [grasp for grasp in GRASPS if grasp.object_id != getattr(SPLIT, part)[0]]
+    with pytest.raises(DatasetError, match=f"two {part} objects at least; the recording has 1"):
+        draw_queries(lacking, SPLIT, 0)
+
+
+@pytest.fixture(scope="module")
+def features():
+    rng = np.random.default_rng(0)
+    touch, photo = rng.standard_normal((len(GRASPS), 1, 6)), rng.standard_normal((len(GRASPS), 4))
+    ids = tuple(zip(*((grasp.grasp_id, grasp.object_id) for grasp in GRASPS), strict=True))
+    return Features(*ids, touch.astype(np.float32), photo.astype(np.float32))
+
+
+def fitted(cls, features):
+    method = cls(Setting(TINY))
+    method.fit(features.of_objects(SPLIT.train), features.of_objects(SPLIT.validation))
+    return method
+
+
+class Largest(Chance):
+    """Fuses a set by its largest score."""
+
+    def _score_sets(self, touch_codes, photo_codes, sets):
+        return self._score(touch_codes, photo_codes)[sets].max(1)
+
+
+@pytest.fixture(scope="module")
+def predictions(features):
+    return predict(fitted(Chance, features), features, QUERIES, 2.5)
+
+
+def test_predictions_are_the_scores_of_the_queries_in_their_order(features, predictions):
+    method = fitted(Chance, features)
+    assert predictions.scores.shape == (len(QUERIES.touches), len(QUERIES.photos))
+    for row, column in ((0, 0), (7, 20), (30, 5)):
+        touch = features.touch[QUERIES.touches[row]][None]
+        photo = features.photo[QUERIES.photos[column]][None]
+        alone = method.score(method.encode_touch(touch), method.encode_photo(photo))
+        assert predictions.scores[row, column] == pytest.approx(alone[0, 0], abs=1e-6)
+
+
+def test_scores_of_sets_are_those_of_the_method_whether_it_adds_or_fuses(features, predictions):
+    method = fitted(Chance, features)
+    codes = method.encode_touch(features.touch[QUERIES.touches]), method.encode_photo(features.photo[QUERIES.photos])
+    for size, sets in QUERIES.sets.items():
+        np.testing.assert_allclose(predictions.set_scores[size], method.score_sets(*codes, sets), rtol=1e-6, atol=1e-6)
+    fused = predict(fitted(Largest, features), features, QUERIES, 0.0)
+    for size, sets in QUERIES.sets.items():
+        expected = np.array([predictions.scores[list(row)].max(0) for row in sets])
+        np.testing.assert_array_equal(fused.set_scores[size], expected)
+
+
+def test_times_are_told_apart_from_scores(predictions):
+    assert predictions.seconds["fit"] == 2.5
+    assert set(predictions.seconds) == {"fit", "encode_touch", "encode_photo", "score", "query"}
+    assert all(value >= 0 for value in predictions.seconds.values())
+
+
+MADE_BY = {"method": "chance", "seed": 0, "features": "ab" * 32, "queries": QUERIES.digest}
+
+
+def test_what_was_written_is_read(predictions, tmp_path):
+    write_predictions(tmp_path / "p.safetensors", predictions, MADE_BY)
+    found = read_predictions(tmp_path / "p.safetensors", MADE_BY)
+    np.testing.assert_array_equal(found.scores, predictions.scores)
+    assert list(found.set_scores) == list(predictions.set_scores) == sorted(SET_SIZES)
+    for size, scores in predictions.set_scores.items():
+        np.testing.assert_array_equal(found.set_scores[size], scores)
+    assert (found.chosen, found.seconds) == (predictions.chosen, predictions.seconds)
+
+
+@pytest.mark.parametrize("key", list(MADE_BY))
+def test_scores_that_something_else_made_are_refused(key, predictions, tmp_path):
+    write_predictions(tmp_path / "p.safetensors", predictions, MADE_BY)
+    with pytest.raises(BadInput, match=f"of another {key} than is to be scored; delete"):
+        read_predictions(tmp_path / "p.safetensors", {**MADE_BY, key: "other"})
+    with pytest.raises(BadInput, match="of another model"):
+        read_predictions(tmp_path / "p.safetensors", {**MADE_BY, "model": "m"})
+
+
+def test_a_flipped_bit_a_missing_file_and_a_nan_are_refused(predictions, tmp_path):
+    path = tmp_path / "p.safetensors"
+    with pytest.raises(CheckpointError, match="there is no"):
+        read_predictions(path, MADE_BY)
+    write_predictions(path, predictions, MADE_BY)
+    data = bytearray(path.read_bytes())
+    data[-3] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(CheckpointError, match="damaged"):
+        read_predictions(path, MADE_BY)
+    spoilt = Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {})
+    write_predictions(path, spoilt, MADE_BY)
+    with pytest.raises(CheckpointError, match="NaN"):
+        read_predictions(path, MADE_BY)
+    write_tensors(path, {}, {})
+    with pytest.raises(BadInput, match="of another features"):
+        read_predictions(path, MADE_BY)
+
+
+def test_showing_the_true_object_by_fewer_photos_would_favour_a_method_that_knows_nothing():
+    """Why sets leave three photos: means of one score against means of three, all of them noise."""
+    noise = np.random.default_rng(0).standard_normal((20_000, 5, 3))
+    candidates = noise.mean(2)
+    assert np.mean(candidates.argmax(1) == 0) == pytest.approx(0.2, abs=0.01)
+    candidates[:, 0] = noise[:, 0, 0]  # the naive way: a set of 5 of 6 grasps leaves one photo
+    assert np.mean(candidates.argmax(1) == 0) > 0.28

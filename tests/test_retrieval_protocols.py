@@ -1,0 +1,389 @@
+"""Protocols against two plain loops, by hand, and with scorers that know nothing or everything."""
+
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+
+from retrieval.calibration import Calibration
+from retrieval.errors import BadInput
+from retrieval.evaluation.protocols import (
+    confusions,
+    full_gallery,
+    k_way,
+    objectfolder,
+    pair_accuracy,
+    pair_auc,
+    paired,
+    per_object,
+    true_ranks,
+)
+from retrieval.evaluation.table import ScoreTable, object_scores
+
+EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
+
+
+def table_of(scores, touch_owner, photo_owner=None, own=None):
+    photo_owner = touch_owner if photo_owner is None else photo_owner
+    own = np.eye(len(touch_owner), len(photo_owner)) if own is None else own
+    return ScoreTable(
+        np.asarray(scores, dtype=np.float32), np.array(touch_owner), np.array(photo_owner), np.array(own, dtype=bool)
+    )
+
+
+def uneven(seed=0, values=5):
+    """Four objects of 2, 3, 4 and 5 grasps in mixed order; few distinct scores, so that many are equal."""
+    rng = np.random.default_rng(seed)
+    owner = rng.permutation(np.repeat([3, 5, 8, 9], [2, 3, 4, 5]))
+    return table_of(rng.integers(-values, values + 1, (14, 14)), owner)
+
+
+def knowing(objects=6, grasps=4):
+    """Every photo of the object above every other."""
+    owner = np.repeat(np.arange(objects), grasps)
+    return table_of(np.where(owner[:, None] == owner, 3.0, -3.0), owner)
+
+
+def constant(objects=6, grasps=4, value=0.0):
+    owner = np.repeat(np.arange(objects), grasps)
+    return table_of(np.full((len(owner), len(owner)), value), owner)
+
+
+def others_of(table, row):
+    """{object: its columns} without the row's own object."""
+    mine = table.touch_owner[row]
+    return {name: np.flatnonzero(table.photo_owner == name) for name in np.unique(table.photo_owner) if name != mine}
+
+
+def mine_of(table, row):
+    return [
+        column
+        for column in range(len(table.photo_owner))
+        if table.photo_owner[column] == table.touch_owner[row] and not table.own[row, column]
+    ]
+
+
+def values_of(measure):
+    return measure.values[:, 0]
+
+
+# Pairs -----------------------------------------------------------------------------------------------------
+
+
+def test_pair_accuracy_is_that_of_two_loops():
+    table = uneven()
+    calibration = Calibration(2.0, -2.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)  # exactly 0 at a score of 1
+    found = values_of(pair_accuracy(table, calibration))
+    for row in range(14):
+        true = np.mean([right(2 * table.scores[row, column] - 2) for column in mine_of(table, row)])
+        false = np.mean(
+            [
+                np.mean([1 - right(2 * table.scores[row, column] - 2) for column in columns])
+                for columns in others_of(table, row).values()
+            ]
+        )
+        assert found[row] == pytest.approx((true + false) / 2, abs=1e-12)
+
+
+def right(log_odds):
+    return 0.5 if log_odds == 0 else float(log_odds > 0)
+
+
+def test_pair_accuracy_by_hand():
+    """Row 0 has photo 1 (right) and, of objects 1 and 2, photos 2 (right), 3 (a coin), 4 (wrong): (1 + 3/8) / 2."""
+    scores = np.full((5, 5), -1.0)
+    scores[0] = [-9, 2, -1, 0, 4]
+    found = pair_accuracy(table_of(scores, [0, 0, 1, 1, 2], own=np.eye(5)), EVEN)
+    assert found.values[0, 0] == (1 + (0.75 + 0) / 2) / 2
+
+
+def test_pair_auc_is_that_of_two_loops():
+    table = uneven()
+    found = values_of(pair_auc(table))
+    for row in range(14):
+        won = []
+        for columns in others_of(table, row).values():
+            pairs = [(table.scores[row, a], table.scores[row, b]) for a in mine_of(table, row) for b in columns]
+            won.append(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
+        assert found[row] == pytest.approx(np.mean(won), abs=1e-12)
+
+
+def test_an_object_with_many_photos_is_no_more_of_a_rival_than_one_with_few():
+    """Naively, over photos, the area would be 10/11: object 2 has ten photos below, object 1 has one above."""
+    owner = [0, 0, 1] + [2] * 10
+    table = table_of([[0, 5, 9, *[1] * 10]], [0], owner, own=[[1] + [0] * 12])
+    assert pair_auc(table).values[0, 0] == pytest.approx(0.5)
+    assert pair_accuracy(table, Calibration(1, -3, 0, 1, 1, 0, 0, 0, 0)).values[0, 0] == pytest.approx((1 + 0.5) / 2)
+
+
+# K-way -----------------------------------------------------------------------------------------------------
+
+
+def k_way_by_enumeration(table, row, k, photos):
+    """Every choice of photos and of rivals, equals in every order: the exact guess curve of a row."""
+    shown = [
+        [np.mean(table.scores[row, list(chosen)]) for chosen in combinations(columns, min(photos, len(columns)))]
+        for columns in [mine_of(table, row), *others_of(table, row).values()]
+    ]
+    curve, cases = np.zeros(k), 0
+    for true, *others in product(*shown):
+        for rivals in combinations(others, k - 1):
+            above, tied = sum(rival > true for rival in rivals), sum(rival == true for rival in rivals)
+            curve += [min(max((guess - above) / (tied + 1), 0), 1) for guess in range(1, k + 1)]
+            cases += 1
+    return curve / cases
+
+
+@pytest.mark.parametrize(("k", "photos"), [(3, 1), (2, 2), (4, 3)])
+def test_k_way_curves_come_to_those_of_every_draw_enumerated(k, photos):
+    table = uneven(values=2)
+    found = k_way(table, k, photos=photos, draws=1500)
+    for row in range(14):
+        exact = k_way_by_enumeration(table, row, k, photos)
+        np.testing.assert_allclose(found.values[row], exact, atol=0.065)  # five standard errors of 1,500 draws
+
+
+def test_k_way_is_exact_where_every_object_shows_all_it_has():
+    table = uneven(values=2)
+    found = k_way(table, 3, photos=5, draws=1)
+    for row in range(14):
+        np.testing.assert_allclose(found.values[row], k_way_by_enumeration(table, row, 3, 5), atol=1e-12)
+
+
+def test_a_k_way_test_by_hand():
+    """Of three rivals one scores higher: among two of them it stands two times in three."""
+    scores = [[0, 5, 9, 1, 2]]
+    table = table_of(scores, [0], [0, 0, 1, 2, 3], own=[[1, 0, 0, 0, 0]])
+    np.testing.assert_allclose(k_way(table, 3).values, [[1 / 3, 1, 1]])
+    np.testing.assert_allclose(k_way(table, 4).values, [[0, 1, 1, 1]])
+
+
+def test_more_photos_help_a_scorer_whose_photos_err_on_their_own():
+    rng = np.random.default_rng(0)
+    owner = np.repeat(np.arange(12), 8)
+    table = table_of((owner[:, None] == owner) + rng.normal(size=(96, 96)), owner)
+    first, third = (k_way(table, 5, photos=photos).values[:, 0].mean() for photos in (1, 3))
+    assert third > first + 0.1
+
+
+def test_a_test_of_more_candidates_than_objects_is_refused():
+    with pytest.raises(BadInput, match="7-way test needs k >= 1 and 6 rivals; got 5"):
+        k_way(constant(), 7)
+
+
+# Full gallery ----------------------------------------------------------------------------------------------
+
+
+def ranked_places(table, row, own_shown, order):
+    """Places of the row's object in one of the orders that its scores allow."""
+    columns = [column for column in order if own_shown or not table.own[row, column]]
+    ranked = sorted(columns, key=lambda column: -table.scores[row, column])
+    owner = table.photo_owner[ranked]
+    return [place for place, name in enumerate(owner, 1) if name == table.touch_owner[row]]
+
+
+def full_by_loops(table, row, own_shown=False):
+    """Mean over 2,000 random orders of equals."""
+    rng = np.random.default_rng(row)
+    columns = len(table.photo_owner)
+    cases = [ranked_places(table, row, own_shown, rng.permutation(columns)) for _ in range(2000)]
+    return {
+        "recall_1": np.mean([places[0] <= 1 for places in cases]),
+        "recall_5": np.mean([places[0] <= 5 for places in cases]),
+        "recall_10": np.mean([places[0] <= 10 for places in cases]),
+        "mrr": np.mean([1 / places[0] for places in cases]),
+        "map": np.mean([np.mean([seen / place for seen, place in enumerate(places, 1)]) for places in cases]),
+        "rank": np.mean([places[0] for places in cases]),
+    }
+
+
+@pytest.mark.parametrize("transposed", [False, True], ids=["touch to photo", "photo to touch"])
+def test_the_full_gallery_is_that_of_two_loops(transposed):
+    table = uneven(values=3)
+    table = table.transposed() if transposed else table
+    found = full_gallery(table)
+    ranks = true_ranks(table)
+    for row in range(14):
+        expected = full_by_loops(table, row)
+        for name in ("recall_1", "recall_5", "recall_10", "mrr", "map"):
+            assert found[name].values[row, 0] == pytest.approx(expected[name], abs=0.055), name
+        assert ranks[row] == pytest.approx(expected["rank"], abs=0.2)
+
+
+def test_without_equals_one_order_is_all_there_is():
+    rng = np.random.default_rng(3)
+    table = uneven()
+    table = table_of(rng.permutation(196).reshape(14, 14), table.touch_owner)
+    found, shown = full_gallery(table), objectfolder(table)
+    for row in range(14):
+        places = ranked_places(table, row, False, range(14))
+        assert found["mrr"].values[row, 0] == 1 / places[0]
+        assert found["recall_5"].values[row, 0] == (places[0] <= 5)
+        precisions = [seen / place for seen, place in enumerate(places, 1)]
+        assert found["map"].values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
+        places = ranked_places(table, row, True, range(14))
+        precisions = [seen / place for seen, place in enumerate(places, 1)]
+        assert shown.values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
+
+
+def test_the_own_photo_would_flatter_a_scorer_that_knows_the_lighting_of_each_grasp_and_nothing_else():
+    """Its own photo first, all else equal: chance where that is left out, more than twice chance where it is not."""
+    blind = constant(objects=10, grasps=4)
+    table = table_of(np.eye(40), blind.touch_owner)
+    left_out, included = full_gallery(table)["map"], objectfolder(table)
+    assert values_of(left_out).mean() == pytest.approx(left_out.chance[0])
+    assert values_of(included).mean() > 2 * included.chance[0]
+    assert "included" in included.gallery
+    assert "left out" in left_out.gallery
+
+
+def paired_by_loops(table, k):
+    """Expected share of rows, and of columns, that find their partner within k places."""
+    found = []
+    for scores in (table.scores, table.scores.T):
+        hits = []
+        for row in range(len(scores)):
+            above = sum(scores[row] > scores[row, row])
+            tied = sum(scores[row] == scores[row, row])
+            hits.append(min(max((k - above) / tied, 0), 1))
+        found.append(hits)
+    return np.mean(found, axis=0)
+
+
+def test_a_paired_batch_is_that_of_two_loops_both_ways():
+    table = uneven(values=4)
+    for k in (1, 5):
+        found = paired(table)[f"paired_top{k}"]
+        np.testing.assert_allclose(values_of(found), paired_by_loops(table, k), atol=1e-12)
+        assert found.chance[0] == k / 14
+
+
+def test_in_a_paired_batch_another_photo_of_the_object_is_a_wrong_answer():
+    table = knowing()
+    assert values_of(paired(table)["paired_top1"]).mean() == pytest.approx(1 / 4)
+    assert values_of(full_gallery(table)["recall_1"]).mean() == 1
+
+
+def test_photos_in_another_order_are_paired_all_the_same():
+    table = uneven()
+    order = np.random.default_rng(1).permutation(14)
+    for k in ("paired_top1", "paired_top5"):
+        np.testing.assert_allclose(paired(table)[k].values, paired(table.select(np.arange(14), order))[k].values)
+
+
+def test_a_paired_batch_needs_one_photo_for_each_touch():
+    table = uneven()
+    with pytest.raises(BadInput, match="one photo for each touch"):
+        paired(table.select(np.arange(13), np.arange(14)))
+    with pytest.raises(BadInput, match="one photo for each touch"):
+        paired(table.with_own())
+
+
+# Chance and certainty --------------------------------------------------------------------------------------
+
+
+def every_measure(table):
+    return {
+        "pair_accuracy": pair_accuracy(table, EVEN),
+        "pair_auc": pair_auc(table),
+        "k3": k_way(table, 3),
+        "k4p3": k_way(table, 4, photos=3),
+        **full_gallery(table),
+        **{f"back_{name}": measure for name, measure in full_gallery(table.transposed()).items()},
+        "objectfolder": objectfolder(table),
+        **paired(table),
+    }
+
+
+@pytest.mark.parametrize("value", [0.0, 4.0, -3e38])
+def test_a_constant_scorer_is_exactly_at_chance_in_every_protocol(value):
+    table = uneven()
+    table = table_of(np.full((14, 14), value), table.touch_owner)
+    for name, measure in every_measure(table).items():
+        _, means = measure.by_object()
+        np.testing.assert_allclose(means.mean(0), measure.chance, atol=1e-12, err_msg=name)
+
+
+def test_a_scorer_that_knows_is_right_in_every_protocol_but_the_paired_one():
+    for name, measure in every_measure(knowing()).items():
+        if not name.startswith("paired"):
+            np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
+
+
+def test_scores_of_any_size_give_what_their_order_gives():
+    table = uneven()
+    huge = table_of(table.scores.astype(np.float64) * 6e37, table.touch_owner)
+    mild = every_measure(table)
+    for name, measure in every_measure(huge).items():
+        if name != "k4p3":  # a mean of photos is no matter of order alone
+            np.testing.assert_allclose(measure.values, mild[name].values, err_msg=name)
+
+
+# Who is asked, and among what ------------------------------------------------------------------------------
+
+
+def test_rows_without_another_photo_of_their_object_are_counted_and_neither_dropped_in_silence_nor_scored_0():
+    table = table_of(np.arange(16).reshape(4, 4), [0, 0, 1, 2])
+    measures = {**every_measure_of_few(table), "auc": pair_auc(table)}
+    for name, measure in measures.items():
+        assert measure.owner.tolist() == [0, 0], name
+        assert measure.gallery.endswith("; 2 touches not asked, which have no other"), name
+    assert np.isnan(true_ranks(table)).tolist() == [False, False, True, True]
+    with pytest.raises(BadInput, match="from another grasp; none has"):
+        pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
+
+
+def every_measure_of_few(table):
+    return {"accuracy": pair_accuracy(table, EVEN), "k2": k_way(table, 2), **full_gallery(table)}
+
+
+def test_a_gallery_of_one_object_is_refused_where_rivals_are_needed():
+    table = table_of(np.zeros((3, 3)), [0, 0, 0])
+    for protocol in (pair_auc, lambda table: pair_accuracy(table, EVEN)):
+        with pytest.raises(BadInput, match="two objects at least"):
+            protocol(table)
+    with pytest.raises(BadInput, match="1 rivals; got 0"):
+        k_way(table, 2)
+
+
+def test_the_gallery_is_said_in_plain_words():
+    table = ScoreTable(
+        np.zeros((4, 4), dtype=np.float32), np.array([0, 0, 1, 1]), np.array([0, 0, 1, 1]), np.eye(4, dtype=bool),
+        object_words="unseen objects",
+    )  # fmt: skip
+    assert pair_auc(table).gallery == "2 unseen objects, 4 photos; those of the same grasp left out"
+    assert full_gallery(table.transposed())["map"].gallery.startswith("2 unseen objects, 4 touches; ")
+    assert k_way(table, 2).gallery.startswith("2 of these objects, each shown by a photo: 2 unseen objects, 4 photos")
+    assert "each shown by 3 photos" in k_way(table, 2, photos=3).gallery
+
+
+# By object -------------------------------------------------------------------------------------------------
+
+
+def test_means_by_object_are_those_of_a_loop():
+    table = uneven()
+    measure = k_way(table, 3)
+    for column in (0, 1):
+        found = per_object(measure, column)
+        assert list(found) == [3, 5, 8, 9]
+        for name, value in found.items():
+            assert value == pytest.approx(np.mean(measure.values[measure.owner == name, column]))
+
+
+def test_confusions_are_those_of_a_loop():
+    table = uneven(values=2)
+    found = {(a, b): share for a, b, share in confusions(table, photos=9, draws=1)}
+    scores = object_scores(table, 9, 1, seed=0)[0]
+    for name in table.objects:
+        rows = [row for row in range(14) if table.touch_owner[row] == name]
+        for place, other in enumerate(table.objects):
+            shares = [(scores[row, place] == max(scores[row])) / sum(scores[row] == max(scores[row])) for row in rows]
+            assert name == other or found.get((name, other), 0) == pytest.approx(np.mean(shares), abs=1e-12)
+
+
+def test_the_largest_confusion_comes_first_and_a_right_guess_is_none():
+    scores = np.array([[0, 5, 9, 0, 0], [5, 0, 9, 0, 0], [0, 0, 5, 5, 0], [0, 0, 5, 5, 5], [9, 9, 9, 9, 0]])
+    found = confusions(table_of(scores, [0, 0, 1, 1, 2], own=np.zeros((5, 5))), photos=2, draws=1)
+    # Object 0: means 2.5, 4.5, 0 twice. Object 1: a right guess; then 0, 5, 5, equals. Object 2: 9, 9, 0, equals.
+    assert found == [(0, 1, 1.0), (2, 0, 0.5), (2, 1, 0.5), (1, 2, 0.25)]
+    assert confusions(knowing()) == []

@@ -1,0 +1,187 @@
+"""Measures of a ranking: by hand, by every order of equals, against another library; chance in closed form."""
+
+from itertools import pairwise, permutations
+from math import comb
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from retrieval.errors import BadInput
+from retrieval.evaluation.ranking import (
+    FirstRelevant,
+    average_precision,
+    chance_of_average_precision,
+    chance_of_recall,
+    chance_of_reciprocal_rank,
+    first_rank,
+    first_relevant,
+    recall_at,
+    reciprocal_rank,
+)
+
+
+def measures(scores, relevant, shown=None):
+    """All measures of one row."""
+    scores, relevant = np.array([scores], dtype=float), np.array([relevant], dtype=bool)
+    shown = np.ones_like(relevant) if shown is None else np.array([shown], dtype=bool)
+    first = first_relevant(scores, relevant, shown)
+    found = {k: float(recall_at(k, first)[0]) for k in (1, 2, 3, 5)}
+    found["mrr"] = float(reciprocal_rank(first)[0])
+    found["rank"] = float(first_rank(first)[0])
+    found["map"] = float(average_precision(scores, relevant, shown)[0])
+    return found
+
+
+def measures_of_order(relevant_in_order):
+    """By two plain loops, in a ranking without equals."""
+    first = next(place for place, good in enumerate(relevant_in_order, 1) if good)
+    precisions, seen = [], 0
+    for place, good in enumerate(relevant_in_order, 1):
+        seen += good
+        if good:
+            precisions.append(seen / place)
+    found = {k: float(first <= k) for k in (1, 2, 3, 5)}
+    return found | {"mrr": 1 / first, "rank": float(first), "map": sum(precisions) / len(precisions)}
+
+
+def measures_by_enumeration(scores, relevant):
+    """Every order that the scores allow, equally likely."""
+    orders = [
+        order for order in permutations(range(len(scores))) if all(scores[a] >= scores[b] for a, b in pairwise(order))
+    ]
+    cases = [measures_of_order([relevant[item] for item in order]) for order in orders]
+    return {name: sum(case[name] for case in cases) / len(cases) for name in cases[0]}
+
+
+def test_a_ranking_counted_by_hand():
+    """Relevant at places 2, 3 and 5 of 5: average precision is (1/2 + 2/3 + 3/5) / 3."""
+    found = measures([9, 8, 7, 6, 5], [0, 1, 1, 0, 1])
+    assert [found[k] for k in (1, 2, 3, 5)] == [0, 1, 1, 1]
+    assert found["mrr"] == 0.5
+    assert found["rank"] == 2
+    assert found["map"] == pytest.approx((1 / 2 + 2 / 3 + 3 / 5) / 3, rel=1e-12)
+
+
+def test_equals_counted_by_hand():
+    """One relevant item shares places 2 and 3 with another: each is as likely."""
+    found = measures([9, 5, 5, 1], [0, 0, 1, 0])
+    assert found[1] == 0
+    assert found[2] == pytest.approx(0.5)
+    assert found[3] == pytest.approx(1)
+    assert found["mrr"] == found["map"] == pytest.approx((1 / 2 + 1 / 3) / 2)
+    assert found["rank"] == 2.5
+
+
+def test_naively_a_stable_sort_gives_a_constant_scorer_the_order_it_was_handed():
+    relevant = np.array([1, 0, 0, 0, 0], dtype=bool)
+    naive = relevant[np.argsort(-np.zeros(5), kind="stable")]
+    assert measures_of_order(naive)["mrr"] == 1
+    assert measures(np.zeros(5), relevant)["mrr"] == pytest.approx((1 + 1 / 2 + 1 / 3 + 1 / 4 + 1 / 5) / 5)
+
+
+def test_naively_an_average_precision_of_equals_from_its_first_and_last_order_is_neither_their_mean():
+    """McSherry and Najork's point: the expectation needs every order; the two ends do not give it."""
+    scores, relevant = [1, 1, 1, 1], [1, 1, 0, 0]
+    ends = [measures_of_order(order)["map"] for order in ([1, 1, 0, 0], [0, 0, 1, 1])]
+    expected = measures_by_enumeration(scores, relevant)["map"]
+    assert measures(scores, relevant)["map"] == pytest.approx(expected, rel=1e-12)
+    assert abs(sum(ends) / 2 - expected) > 0.01
+
+
+@settings(max_examples=120, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=6))
+def test_equals_count_by_the_mean_over_every_order(items):
+    scores, relevant = zip(*items, strict=True)
+    if not any(relevant):
+        relevant = (True, *relevant[1:])
+    found, expected = measures(scores, relevant), measures_by_enumeration(scores, relevant)
+    assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+def test_without_equals_an_independent_library_says_the_same():
+    from torch import from_numpy as tensor
+    from torchmetrics.functional import retrieval as library
+
+    rng = np.random.default_rng(0)
+    for size in (2, 7, 60):
+        scores = rng.permuted(np.tile(np.arange(1, size + 1) / size, (40, 1)), axis=1)
+        relevant = rng.random(scores.shape) < rng.uniform(0.05, 0.6, (40, 1))
+        relevant[np.arange(40), rng.integers(size, size=40)] = True
+        every = np.ones_like(relevant)
+        first = first_relevant(scores, relevant, every)
+        rows = [(tensor(row), tensor(good)) for row, good in zip(scores, relevant, strict=True)]
+        for k in (1, min(5, size), min(10, size)):
+            theirs = [float(library.retrieval_hit_rate(*row, top_k=k)) for row in rows]
+            np.testing.assert_allclose(recall_at(k, first), theirs)
+        theirs = [float(library.retrieval_reciprocal_rank(*row)) for row in rows]
+        np.testing.assert_allclose(reciprocal_rank(first), theirs, rtol=1e-6)  # theirs is float32
+        theirs = [float(library.retrieval_average_precision(*row)) for row in rows]
+        np.testing.assert_allclose(average_precision(scores, relevant, every), theirs, rtol=1e-5)
+
+
+def test_what_is_not_shown_takes_no_place():
+    assert measures([9, 8, 7, 6], [0, 1, 0, 1], [0, 0, 1, 1]) == measures([7, 6], [0, 1])
+    # An own photo that scores highest would otherwise count as found.
+    assert measures([9, 8, 7, 6], [1, 0, 0, 1], [0, 1, 1, 1])["mrr"] == pytest.approx(1 / 3)
+
+
+def test_a_query_with_nothing_to_find_is_refused_and_named():
+    scores, shown = np.zeros((2, 3)), np.ones((2, 3), dtype=bool)
+    relevant = np.array([[1, 0, 0], [0, 1, 0]], dtype=bool)
+    shown[1, 1] = False
+    for function in (first_relevant, average_precision):
+        with pytest.raises(BadInput, match="shown something relevant; row 1 is not"):
+            function(scores, relevant, shown)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 5), st.sampled_from([0.0, 7.5, -1e30]))
+def test_chance_is_what_a_constant_scorer_gets(count, right, hidden, value):
+    relevant = np.zeros((1, count + hidden), dtype=bool)
+    relevant[:, : min(right, count)] = True
+    shown = np.ones_like(relevant)
+    shown[:, count:] = False
+    scores = np.full(relevant.shape, value)
+    first = first_relevant(scores, relevant, shown)
+    for k in (1, 5, 10):
+        np.testing.assert_allclose(chance_of_recall(k, relevant, shown), recall_at(k, first))
+    np.testing.assert_allclose(chance_of_reciprocal_rank(relevant, shown), reciprocal_rank(first))
+    expected = average_precision(scores, relevant, shown)
+    np.testing.assert_allclose(chance_of_average_precision(relevant, shown), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("count", "right", "k"), [(792, 43, 1), (792, 43, 10), (10, 8, 5), (4, 4, 1), (9, 1, 9)])
+def test_chance_of_recall_is_hypergeometric(count, right, k):
+    relevant = np.arange(count)[None] < right
+    expected = 1 - comb(count - right, k) / comb(count, k)
+    np.testing.assert_allclose(chance_of_recall(k, relevant, np.ones_like(relevant)), expected, rtol=1e-12)
+
+
+def test_with_one_true_photo_chance_of_mean_average_precision_is_the_harmonic_mean_of_ranks():
+    """ObjectFolder's random row: 5.19 % for one positive in 100, 3.73 % in 150."""
+    for count, expected in ((100, 0.0519), (150, 0.0373)):
+        relevant = np.arange(count)[None] == 0
+        every = np.ones_like(relevant)
+        assert chance_of_average_precision(relevant, every)[0] == pytest.approx(expected, abs=5e-5)
+        assert chance_of_reciprocal_rank(relevant, every)[0] == pytest.approx(expected, abs=5e-5)
+
+
+def test_many_equals_neither_overflow_nor_lose_precision():
+    """Binomials of 4,000 items overflow a float; the products do not. By one simulated mean of 20,000 orders."""
+    with pytest.raises(OverflowError):
+        float(comb(4000, 2000))
+    first = FirstRelevant(*(np.array([value]) for value in (5, 4000, 44)))
+    rng = np.random.default_rng(0)
+    drawn = np.array([rng.choice(4000, 44, replace=False).min() for _ in range(20_000)])
+    assert reciprocal_rank(first)[0] == pytest.approx((1 / (6 + drawn)).mean(), rel=0.02)  # standard error 0.4 %
+    assert first_rank(first)[0] == pytest.approx((6 + drawn).mean(), rel=0.03)
+    assert recall_at(10, first)[0] == pytest.approx((drawn < 5).mean(), abs=0.006)
+
+
+def test_extreme_scores_rank_as_mild_ones_do():
+    relevant = [0, 1, 0, 1, 0]
+    mild = measures([3, 2, 1, 0, -1], relevant)
+    assert measures([3e38, 1e30, 1e-30, 0, -3e38], relevant) == mild
+    assert measures([1e4 + 4, 1e4 + 3, 1e4 + 2, 1e4 + 1, 1e4], relevant) == mild

@@ -1,0 +1,94 @@
+"""The learned pooling of a set of grasps: order, size and padding must not matter where they say nothing."""
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval.fusion import FusionHead
+from retrieval.methods import set_fusion
+from retrieval.methods.set_fusion import SetHead, neighbours
+
+
+def head(hidden=16, seed=0):
+    """A head whose pooling is not at its start, where it is the mean."""
+    torch.manual_seed(seed)
+    made = SetHead(10, 7, hidden, 0.5).eval()
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.normal_(0, 0.3)
+    return made.requires_grad_(False)
+
+
+def pooled(made, halves):
+    return made.pool(halves[None], torch.ones(1, len(halves), dtype=torch.bool))[0]
+
+
+def test_pooling_is_what_the_formula_says():
+    made, halves = head(), torch.randn(3, 16, generator=torch.Generator().manual_seed(1))
+    scores = [float((made.attention.weight[0] * h.relu()).sum() + made.attention.bias) for h in halves]
+    shares = [np.exp(score) / sum(np.exp(scores)) for score in scores]
+    attended = sum(share * h for share, h in zip(shares, halves, strict=True))
+    mean = (halves[0] + halves[1] + halves[2]) / 3
+    largest = torch.maximum(torch.maximum(halves[0], halves[1]), halves[2])
+    expected = mean + made.attended.weight @ (attended - mean) + made.largest.weight @ (largest - mean)
+    expected = expected + np.log(3) * made.size
+    torch.testing.assert_close(pooled(made, halves), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_order_of_grasps_does_not_matter():
+    made, halves = head(), torch.randn(6, 16, generator=torch.Generator().manual_seed(2))
+    for seed in range(5):
+        order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
+        torch.testing.assert_close(pooled(made, halves[order]), pooled(made, halves), rtol=1e-5, atol=1e-5)
+
+
+def test_a_set_of_one_is_judged_as_late_fusion_judges_a_touch():
+    made = head()
+    plain = FusionHead(10, 7, 16, 0.5).eval()
+    plain.load_state_dict(made.state_dict(), strict=False)
+    generator = torch.Generator().manual_seed(3)
+    touch, photo = made.touch_half(torch.randn(4, 10, generator=generator)), made.photo_half(torch.randn(4, 7))
+    one = made.pool(touch[:, None], torch.ones(4, 1, dtype=torch.bool))
+    torch.testing.assert_close(made(one, photo), plain(touch, photo))
+
+
+def test_an_untrained_pooling_is_the_mean():
+    made, halves = SetHead(10, 7, 16, 0.5), torch.randn(5, 16)
+    torch.testing.assert_close(pooled(made, halves), halves.mean(0))
+
+
+@pytest.mark.parametrize("padding", [0.0, 1e6, -1e6, float("nan")])
+def test_padding_changes_nothing_whatever_stands_there(padding):
+    made, generator = head(), torch.Generator().manual_seed(4)
+    sets = [torch.randn(size, 16, generator=generator) for size in (1, 8, 3)]
+    batch, held = torch.full((3, 8, 16), padding), torch.zeros(3, 8, dtype=torch.bool)
+    for place, halves in enumerate(sets):
+        batch[place, : len(halves)], held[place, : len(halves)] = halves, True
+    alone = torch.stack([pooled(made, halves) for halves in sets])
+    torch.testing.assert_close(made.pool(batch, held), alone, rtol=1e-5, atol=1e-5)
+
+
+def test_padding_has_no_part_in_the_gradient():
+    made, held = head(), torch.tensor([[True, True, False]])
+    halves = torch.randn(1, 3, 16, generator=torch.Generator().manual_seed(5), requires_grad=True)
+    (gradient,) = torch.autograd.grad(made.pool(halves, held).sum(), halves)
+    assert torch.isfinite(gradient).all()
+    assert not gradient[0, 2].any()
+    assert gradient[0, :2].abs().min() > 0
+
+
+def test_scores_in_blocks_are_the_scores_of_each_pair(monkeypatch):
+    made = head()
+    fusion = object.__new__(set_fusion.SetFusion)
+    fusion._head = made
+    touch, photo = torch.randn(5, 16), torch.randn(9, 16)
+    with torch.inference_mode():
+        expected = [[made(t[None], p[None]).item() for p in photo] for t in touch]
+    for block in (1, 4, 20, 10_000):
+        monkeypatch.setattr(set_fusion, "PAIRS_PER_BLOCK", block)
+        np.testing.assert_allclose(fusion._logits(touch, photo), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_neighbours_are_of_the_same_object_round():
+    assert neighbours(np.array([0, 1, 0, 0, 1]), 2).tolist() == [[0, 2], [1, 4], [2, 3], [3, 0], [4, 1]]
+    assert neighbours(np.array([0, 1, 1]), 3).tolist() == [[0, 0, 0], [1, 2, 1], [2, 1, 2]]
