@@ -126,32 +126,46 @@ def encode_recording(
     cache: Path | None,
     *,
     variant: str = "touch",
+    photos_of: Features | None = None,
     quiet: bool = False,
 ) -> Features:
     """Features of all grasps by the towers of `matcher`, which stand still; each photo file is encoded once.
 
     cache: folder where they are kept in parts of 512, each under a digest of tower, preprocessing, variant and image
     files: a run that was stopped goes on, a second one reads. None keeps nothing. variant: one of `VARIANTS`.
-    Raises BadInput for another one, DatasetError where a no-contact frame is needed and missing.
+    photos_of: features of these grasps and perhaps more, whose photos need no encoding again. Raises BadInput for
+    another variant, DatasetError where a no-contact frame is needed and missing.
     """
     shown = [_as_shown(grasp, variant) for grasp in grasps]
-    photos = list(dict.fromkeys(grasp.photo for grasp in grasps))
     device = default_device()
     matcher = deepcopy(matcher).to(device).eval()
     settings = _as_variant(config, variant)
     with BatchImages(settings, device, keep_bytes=0) as images:
         touch_made_by = (variant, _digest_of(matcher.touch_tower), settings.preprocessing.digest())
-        photo_made_by = ("photo", _digest_of(matcher.photo_tower), settings.preprocessing.digest())
         touches = _Parts(cache, touch_made_by, images.touch, partial(touch_features, matcher), images.files, quiet)
-        pictures = _Parts(cache, photo_made_by, images.photo, partial(photo_features, matcher), _itself, quiet)
-        touch, photo = touches.rows(shown), pictures.rows(photos)
-    row_of = {path: row for row, path in enumerate(photos)}
+        touch = touches.rows(shown)
+        if photos_of is None:
+            photo = _photos(grasps, images, matcher, cache, quiet)
+        else:
+            row_of = {grasp_id: row for row, grasp_id in enumerate(photos_of.grasp_ids)}
+            photo = photos_of.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
     return Features(
         tuple(grasp.grasp_id for grasp in grasps),
         tuple(grasp.object_id for grasp in grasps),
         touch.reshape(len(touch), config.matcher.fingers, -1),
-        photo[[row_of[grasp.photo] for grasp in grasps]],
+        photo,
     )
+
+
+def _photos(
+    grasps: Sequence[Grasp], images: BatchImages, matcher: Matcher, cache: Path | None, quiet: bool
+) -> NDArray[np.float32]:
+    """(G, F): the features of each grasp's photo."""
+    made_by = ("photo", _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
+    files = list(dict.fromkeys(grasp.photo for grasp in grasps))
+    encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), _itself, quiet).rows(files)
+    row_of = {path: row for row, path in enumerate(files)}
+    return np.asarray(encoded[[row_of[grasp.photo] for grasp in grasps]])
 
 
 def _as_variant(config: Config, variant: str) -> Config:

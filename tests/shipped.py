@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     score = jobs.add_parser("score", help="judge it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
-    score.add_argument("--grasps", type=int, default=6)
+    score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
     for job in (make, score):
         job.add_argument("--jobs", type=int, default=2)

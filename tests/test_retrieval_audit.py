@@ -164,3 +164,23 @@ def test_a_copy_far_from_the_origin_has_distance_zero():
     parts = squares[:, None] - 2 * frames @ frames.T + squares
     assert max(np.abs(naive).max(), np.abs(np.diag(parts)).max()) > 0
     assert (nearest(frames, frames)[1] == 0).all()
+
+
+def test_touches_that_hardly_differ_from_their_untouched_gel_are_faint_and_no_copies(tmp_path):
+    folder = synthetic.write_recording(tmp_path / "recording", synthetic.make_objects(10), 3, before=True)
+    for grasp in load_grasps(folder):  # pressed hard: half of the gel changes
+        for touch, untouched in zip(grasp.touches, grasp.backgrounds, strict=True):
+            gel = cv2.imread(str(touch))
+            gel[:, : gel.shape[1] // 2] = 255 - gel[:, : gel.shape[1] // 2]
+            cv2.imwrite(str(untouched), gel)
+    assert judge(folder)["frames"]["touch a"]["faint"] == 0
+    train, _, test = one_of_each(folder)
+    gel = cv2.imread(str(train.backgrounds[0]))
+    for grasp, level in ((train, 1), (test, 2)):  # the gel alone, twice: near to each other, and to their own gel
+        for finger in range(2):
+            cv2.imwrite(str(grasp.touches[finger]), brighter(gel, level))
+            cv2.imwrite(str(grasp.backgrounds[finger]), gel)
+    frames = judge(folder)["frames"]["touch a"]
+    assert frames["to_seen"][0] < CLOSE_GREY_LEVELS
+    assert (frames["faint"], frames["close"]) == (1, 0)
+    assert test.grasp_id not in {pair["test"] for pair in frames["nearest"]}

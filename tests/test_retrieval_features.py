@@ -117,6 +117,8 @@ def test_what_stands_for_a_touch_changes_the_touch_alone(grasps, matcher, tmp_pa
         for variant in ("touch", "blurred", "before")
     }
     assert counted == {"touch_features": 27, "photo_features": 9}
+    again = encode_recording(grasps[:5], matcher, TINY, None, variant="before", photos_of=made["touch"], quiet=True)
+    np.testing.assert_array_equal(again.photo, made["touch"].photo[:5])
     for variant in ("blurred", "before"):
         np.testing.assert_array_equal(made[variant].photo, made["touch"].photo)
         assert np.abs(made[variant].touch - made["touch"].touch).max() > 0.01

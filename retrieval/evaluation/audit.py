@@ -10,7 +10,9 @@ bytes, so frames are also compared as grey thumbnails of 32 x 32 pixels, in grey
 
 Measured on 598 simulated grasps of 100 objects, 256 x 256 photos and 320 x 240 gel images: a copy through JPEG of
 quality 75 and one grey level brighter lies within 0.6 of its source; frames of other objects start at 1.0 (touches)
-and 5.6 (photos). Hence the threshold of 0.75.
+and 5.6 (photos). Hence the threshold of 0.75. A touch that hardly differs from the untouched gel is near to every
+other such touch, of whatever object: where no-contact frames were recorded, one within 3 grey levels of its own is
+faint, and is not counted as close.
 """
 
 from collections import defaultdict
@@ -32,22 +34,28 @@ from retrieval.progress import Bar
 
 THUMBNAIL_PX = 32
 CLOSE_GREY_LEVELS = 0.75
+FAINT_GREY_LEVELS = 3.0
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
 _PARTS = ("train", "validation", "test")
 _SHOWN = 5
 _BLOCK = 1024
 
 Thumbnails = NDArray[np.float64]
-"""(n, 1024) grey levels less the mean of each row."""
+"""(n, 1024), or (1024,) for one: grey levels less the mean of each."""
+
+_Pair = tuple[Path, Path | None]
+"""A frame, and the no-contact frame of its finger where there is one."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """One kind of frame ("photo", "touch a", ...) of all grasps: digests of the bytes, and thumbnails (G, 1024)."""
+    """One kind of frame ("photo", "touch a", ...) of all grasps: digests of the bytes, thumbnails (G, 1024), and
+    which frames are faint (G,)."""
 
     kind: str
     digests: list[str]
     thumbnails: Thumbnails
+    faint: NDArray[np.bool_]
 
 
 def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict[str, Any]:
@@ -57,9 +65,9 @@ def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict
     objects, grasps: counts by part; shared: sentences on objects and sequences that stand in two parts;
     identical: {"count": files of equal bytes in two parts, "examples": lists of "part: grasp_id kind"};
     frames: by kind {"test", "seen": counts, "to_seen", "within_object": distances at `quantiles`, or null where
-    there is nothing to compare, "close": test frames nearer than `threshold` to a seen one, "nearest": the nearest
-    pairs, one of each test object}, where seen means of training and validation objects; quantiles, threshold, unit;
-    clean, verdict.
+    there is nothing to compare, "close": test frames nearer than `threshold` to a seen one that are not "faint",
+    "faint": how many are, "nearest": the nearest pairs of the others, one of each test object}, where seen means of
+    training and validation objects; quantiles, threshold, unit; clean, verdict.
     Raises ImageError for an image that cannot be read.
     """
     part_of = {name: part for part in _PARTS for name in getattr(split, part)}
@@ -93,29 +101,43 @@ def _counts(grasps: Sequence[Grasp], parts: NDArray[np.str_]) -> dict[str, Any]:
 
 def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
     """Photos, then the touches of each finger."""
-    files = {"photo": [grasp.photo for grasp in grasps]}
+    files: dict[str, list[_Pair]] = {"photo": [(grasp.photo, None) for grasp in grasps]}
     for finger in range(finger_count(grasps) if grasps else 0):
-        files[f"touch {ascii_lowercase[finger]}"] = [grasp.touches[finger] for grasp in grasps]
-    total = sum(len(set(paths)) for paths in files.values())
+        files[f"touch {ascii_lowercase[finger]}"] = [
+            (grasp.touches[finger], grasp.backgrounds[finger] if grasp.backgrounds else None) for grasp in grasps
+        ]
+    total = sum(len(set(pairs)) for pairs in files.values())
     with ThreadPoolExecutor(2) as pool, Bar("audit", total, "images", quiet=quiet) as bar:
-        for kind, paths in files.items():
+        for kind, pairs in files.items():
             seen = {}
-            for path, image in zip(dict.fromkeys(paths), pool.map(_look, dict.fromkeys(paths)), strict=True):
-                seen[path] = image
+            for pair, looked in zip(dict.fromkeys(pairs), pool.map(_look, dict.fromkeys(pairs)), strict=True):
+                seen[pair] = looked
                 bar.advance()
-            yield _frames(kind, [seen[path] for path in paths])
+            yield _frames(kind, [seen[pair] for pair in pairs])
 
 
-def _look(path: Path) -> tuple[str, NDArray[np.float32]]:
-    """Digest of the bytes, and the grey thumbnail in grey levels of 255, (1024,)."""
+def _frames(kind: str, looked: Sequence[tuple[str, Thumbnails, bool]]) -> _Frames:
+    thumbnails = np.array([thumbnail for _, thumbnail, _ in looked]).reshape(len(looked), THUMBNAIL_PX**2)
+    return _Frames(
+        kind, [digest for digest, _, _ in looked], thumbnails, np.array([faint for _, _, faint in looked], dtype=bool)
+    )
+
+
+def _look(pair: _Pair) -> tuple[str, Thumbnails, bool]:
+    """Digest of a frame's bytes, its thumbnail (1024,), and whether it hardly differs from its no-contact frame."""
+    path, untouched = pair
     data = read_bytes(path)
-    small = resize(decode_rgb(data, path), (THUMBNAIL_PX, THUMBNAIL_PX))
-    return sha256(data).hexdigest(), 255 * small.mean(axis=2).ravel()
+    thumbnail = _thumbnail(data, path)
+    faint = False
+    if untouched is not None:
+        difference = thumbnail - _thumbnail(read_bytes(untouched), untouched)
+        faint = bool(np.sqrt((difference**2).mean()) < FAINT_GREY_LEVELS)
+    return sha256(data).hexdigest(), thumbnail, faint
 
 
-def _frames(kind: str, seen: Sequence[tuple[str, NDArray[np.float32]]]) -> _Frames:
-    grey = np.array([thumbnail for _, thumbnail in seen], dtype=np.float64).reshape(len(seen), THUMBNAIL_PX**2)
-    return _Frames(kind, [digest for digest, _ in seen], grey - grey.mean(axis=1, keepdims=True))
+def _thumbnail(data: bytes, path: Path) -> Thumbnails:
+    grey = 255.0 * resize(decode_rgb(data, path), (THUMBNAIL_PX, THUMBNAIL_PX)).mean(axis=2, dtype=np.float64).ravel()
+    return np.asarray(grey - grey.mean())
 
 
 def _identical(grasps: Sequence[Grasp], parts: NDArray[np.str_], kinds: Iterable[_Frames]) -> dict[str, Any]:
@@ -135,25 +157,27 @@ def _nearness(frames: _Frames, grasps: Sequence[Grasp], parts: NDArray[np.str_])
     test, seen = (np.flatnonzero(side).tolist() for side in (parts == "test", parts != "test"))
     rows, distances = nearest(frames.thumbnails[test], frames.thumbnails[seen])
     owners = [grasps[row].object_id for row in test]
+    faint = frames.faint[test]
     return {
         "test": len(test),
         "seen": len(seen),
         "to_seen": _quantiles(distances),
         "within_object": _quantiles(_within_object(frames.thumbnails, grasps, test)),
-        "close": int((distances < CLOSE_GREY_LEVELS).sum()),
+        "close": int(((distances < CLOSE_GREY_LEVELS) & ~faint).sum()),
+        "faint": int(faint.sum()),
         "nearest": [
             {
                 "test": grasps[test[at]].grasp_id,
                 "seen": grasps[seen[rows[at]]].grasp_id,
                 "distance": round(float(distances[at]), 4),
             }
-            for at in _first_of_each(np.argsort(distances, kind="stable"), owners)
+            for at in _first_of_each([at for at in np.argsort(distances, kind="stable") if not faint[at]], owners)
             if len(seen)
         ],
     }
 
 
-def _first_of_each(order: NDArray[np.int64], owners: Sequence[str]) -> list[int]:
+def _first_of_each(order: Sequence[int], owners: Sequence[str]) -> list[int]:
     """The first places of an order, one of each owner: the frames of one object mostly have one neighbour."""
     first: dict[str, int] = {}
     for at in order:

@@ -35,8 +35,9 @@ def control_benches(bench: Bench, material: Material, cache: Path, seed: int) ->
     for variant in ("before", "blurred"):
         if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue
+        towers = material.matcher, material.config
         features = encode_recording(
-            grasps, material.matcher, material.config, cache, variant=variant, quiet=bench.quiet
+            grasps, *towers, cache, variant=variant, photos_of=bench.features, quiet=bench.quiet
         )
         benches[variant] = dataclasses.replace(
             bench, folder=_folder(bench, variant), features=features, queries=queries, checkpoint=None
