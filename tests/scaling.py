@@ -143,7 +143,7 @@ def plot(points: Sequence[dict[str, Any]]) -> Figure:
     _panel(right, [point for point in points if point["objects"] == objects], "grasps")
     left.set(xlabel=f"training objects, {grasps} grasps of each", ylabel="share right, unseen objects", ylim=(0, 1))
     right.set(xlabel=f"grasps of each of {objects:,} training objects")
-    right.legend(frameon=False, loc="lower right", fontsize="small")
+    right.legend(loc="lower right", fontsize="small", facecolor="white", edgecolor="none", framealpha=1)
     return figure
 
 
