@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
     make.add_argument("--objects", type=int, default=1400)
     make.add_argument("--grasps", type=int, default=4)
-    make.add_argument("--iterations", type=int, default=2000)
+    make.add_argument("--iterations", type=int, default=1500)
     score = jobs.add_parser("score", help="judge it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
