@@ -4,7 +4,6 @@ whatever was not measured, or is called strangely, leaves it whole."""
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 
 import pytest
 from PIL import Image
@@ -16,28 +15,9 @@ from retrieval.report.results import at_start, number, percent, short, with_inte
 from retrieval.report.tables import probability
 from tests import synthetic
 from tests.made_up_evaluation import write_made_up
+from tests.pages import Page
 
 FEW = ("late_fusion", "cca", "chance")
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, and the text."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.tags, self.text, self._inside = [], "", ""
-        self.feed(page)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        self._inside = tag
-
-    def handle_data(self, data):
-        if self._inside != "style":
-            self.text += data
-
-    def all(self, tag):
-        return [attributes for name, attributes in self.tags if name == tag]
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import base64
 import json
 import shutil
-from html.parser import HTMLParser
 
 import cv2
 import numpy as np
@@ -13,29 +12,10 @@ from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
 from retrieval.report import print_table, query_html
 from retrieval.search import Match, QueryResult, Searcher
+from tests.pages import Page
 
 SCRIPT = "<script>alert(1)</script>"
 ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, and the text outside `style`."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.tags, self.text, self._inside = [], "", ""
-        self.feed(page)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        self._inside = tag
-
-    def handle_data(self, data):
-        if self._inside != "style":
-            self.text += data
-
-    def all(self, tag):
-        return [attributes for name, attributes in self.tags if name == tag]
 
 
 def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match"):
