@@ -235,6 +235,9 @@ def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run,
     assert results["methods"]["late_fusion"]["chosen"] == [
         {"step": model.provenance["step"], **model.provenance["metrics"]}
     ]
+    times = json.loads((tmp_path / "out" / "timings.json").read_text())["methods"]
+    assert times["late_fusion"]["fit_s"] is None  # nobody measured it
+    assert times["cca"]["fit_s"] > 0
 
 
 def test_a_model_of_another_recording_is_judged_on_a_fresh_split(model, run, tmp_path):

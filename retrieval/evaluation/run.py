@@ -196,11 +196,11 @@ def _timings(material: Material, bench: Bench, jobs: Jobs) -> dict[str, Any]:
     }
 
 
-def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Medians over the seeds."""
+def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
+    """Medians over the seeds; no time of fitting for a method that came fitted."""
     seconds = {key: float(np.median([one[key] for one in by_seed])) for key in by_seed[0]}
     return {
-        "fit_s": seconds["fit"],
+        "fit_s": seconds["fit"] or None,
         "encode_touch_ms": 1e3 * seconds["encode_touch"],
         "encode_photo_ms": 1e3 * seconds["encode_photo"],
         "score_us_per_photo": 1e6 * seconds["score"],
