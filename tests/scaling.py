@@ -46,6 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--objects", type=int, nargs="+", default=[20, 80, 320, 1280])
     parser.add_argument("--grasps", type=int, nargs="+", default=[1, 2, 4], help="of each object, at most")
     parser.add_argument("--validation", type=int, default=100, help="objects to choose and calibrate by")
+    parser.add_argument("--fingers", type=int, default=2, help="ablation: only the first so many fingers feel")
+    parser.add_argument("--touch-px", type=int, help="ablation: side of the gel images that the towers see")
     parser.add_argument("--cache", type=Path, help="folder where features are kept (default: FOLDER/features)")
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -60,8 +62,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fit and judge every training set: each number of objects with all grasps, then all objects with fewer."""
     config = _config(arguments)
     cache = arguments.cache or arguments.out / "features"
-    seen, seen_digest = _features(arguments.recording, config, cache)
-    unseen, unseen_digest = _features(arguments.unseen, config, cache)
+    seen, seen_digest = _features(arguments.recording, config, cache, arguments.fingers)
+    unseen, unseen_digest = _features(arguments.unseen, config, cache, arguments.fingers)
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
     validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
     most = max(arguments.grasps)
@@ -80,6 +82,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "preset": arguments.preset,
         "iterations": config.training.iterations,
+        "fingers": arguments.fingers,
+        "touch_px": config.preprocessing.touch_px,
         "recording": seen_digest,
         "unseen": unseen_digest,
         "points": points,
@@ -89,12 +93,15 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 def _config(arguments: argparse.Namespace) -> Config:
     config = load_config(arguments.preset)
     training = dataclasses.replace(config.training, init=arguments.init, iterations=arguments.iterations)
-    return dataclasses.replace(config, training=training)
+    touch_px = arguments.touch_px or config.preprocessing.touch_px
+    preprocessing = dataclasses.replace(config.preprocessing, touch_px=touch_px)
+    return dataclasses.replace(config, training=training, preprocessing=preprocessing)
 
 
-def _features(recording: Path, config: Config, cache: Path) -> tuple[Features, str]:
+def _features(recording: Path, config: Config, cache: Path, fingers: int) -> tuple[Features, str]:
     grasps = load_grasps(recording)
-    return encode_recording(grasps, build_matcher(config).eval(), config, cache), data_digest(grasps)
+    features = encode_recording(grasps, build_matcher(config).eval(), config, cache)
+    return dataclasses.replace(features, touch=features.touch[:, :fingers].copy()), data_digest(grasps)
 
 
 def first_grasps(features: Features, most: int) -> Features:
