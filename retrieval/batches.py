@@ -1,8 +1,8 @@
 """From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +14,7 @@ from torch import Tensor
 from retrieval import distributed
 from retrieval.config import Config
 from retrieval.dataset import Grasp, ImageCache, PairBatch
-from retrieval.encode import Image, autocast, photo_features, to_batch, touch_batch, touch_features
+from retrieval.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
 from retrieval.errors import DatasetError
 from retrieval.fusion import Matcher
 
@@ -142,18 +142,6 @@ class FrozenFeatures(BatchImages):
         """The features of all pairs at once."""
         loaded = self.prepare(matcher, pairs).result()
         return loaded.touches, loaded.photos
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """PyTorch computes on the calling thread alone. Its workers wait for each other many times a step, and where one
-    finds its core taken by another program all the others spin: milliseconds become hundreds."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures

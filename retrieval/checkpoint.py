@@ -68,7 +68,7 @@ def save_checkpoint(
     if float16:
         state = {name: _half(path, name, tensor) for name, tensor in state.items()}
     write_tensors(path, state, header)
-    _write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
+    write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
 
 
 def _half(path: Path, name: str, tensor: Tensor) -> Tensor:
@@ -139,7 +139,7 @@ def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any
     content = {"format": FORMAT, "software": __version__, **header}
     text = json.dumps({**content, "sha256": _checksum(state, content)}, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    _write_atomically(path, save(state, {_HEADER: text}))
+    write_atomically(path, save(state, {_HEADER: text}))
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -169,9 +169,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def _checksum(state: Mapping[str, Tensor], header: Mapping[str, Any]) -> str:
     """SHA-256 of header and tensors: the format itself takes a flipped bit in a weight or a setting for what it is."""
-    digest = hashlib.sha256(json.dumps(header).encode())
+    return tensors_digest(state, json.dumps(header))
+
+
+def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
+    """SHA-256 (hex) of `about` and of tensors, whose names, types and shapes count."""
+    digest = hashlib.sha256(about.encode())
     for name in sorted(state):
-        tensor = state[name].contiguous()
+        tensor = state[name].cpu().contiguous()
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
@@ -201,7 +206,8 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
 
-def _write_atomically(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before."""
     temporary = _temporary(path)
     try:
         with temporary.open("wb") as file:

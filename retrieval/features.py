@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retrieval.batches import BatchImages
-from retrieval.checkpoint import file_digest, read_tensors, write_tensors
+from retrieval.checkpoint import file_digest, read_tensors, tensors_digest, write_tensors
 from retrieval.config import Config
 from retrieval.dataset import Grasp
 from retrieval.encode import batches, default_device, photo_features, touch_features
@@ -193,11 +193,7 @@ def _itself(path: Path) -> tuple[Path, ...]:
 
 
 def _digest_of(tower: nn.Module) -> str:
-    digest = hashlib.sha256(type(tower).__name__.encode())
-    for name, tensor in tower.state_dict().items():
-        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()
+    return tensors_digest(tower.state_dict(), type(tower).__name__)
 
 
 @dataclass(frozen=True)

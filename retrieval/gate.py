@@ -4,8 +4,7 @@ As in the authors' collection code, one network serves every finger and sees the
 a grasp succeeded when ANY finger says so with probability 1/2 or more. The network is smaller.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retrieval.checkpoint import load_weights, read_tensors
-from retrieval.encode import touch_batch
+from retrieval.encode import one_thread, touch_batch
 from retrieval.errors import BadInput, CheckpointError, ConfigError
 from retrieval.images import Preprocessing, to_float
 
@@ -68,18 +67,6 @@ def _convolution(inputs: int, outputs: int, kernel: int) -> list[nn.Module]:
     layer = nn.Conv2d(inputs, outputs, kernel, stride=2, padding=kernel // 2, padding_mode="replicate")
     nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
     return [layer, nn.ReLU()]
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let PyTorch use one thread: so small a network gains nothing from more, results do not depend on their number,
-    and where other work runs, threads that wait for each other took ten times as long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class FingerFrames(Protocol):

@@ -40,10 +40,10 @@ from retrieval.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.encode import batches, touch_batch
+from retrieval.encode import batches, one_thread, touch_batch
 from retrieval.errors import ConfigError, DatasetError, NumericalError
 from retrieval.evaluation.metrics import grouped_interval
-from retrieval.gate import TASK, Gate, GateSettings, GraspNet, one_thread
+from retrieval.gate import TASK, Gate, GateSettings, GraspNet
 from retrieval.gate import load_gate as load_gate
 from retrieval.progress import Bar
 

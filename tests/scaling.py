@@ -20,10 +20,10 @@ from matplotlib.figure import Figure
 
 from retrieval.config import Config, load_config
 from retrieval.dataset import data_digest, load_grasps
-from retrieval.evaluation import protocols
 from retrieval.evaluation.calibrate import calibrate
-from retrieval.evaluation.intervals import summarise
-from retrieval.evaluation.table import Measure, ScoreTable
+from retrieval.evaluation.run import DRAWS
+from retrieval.evaluation.scoring import main_measures, summaries
+from retrieval.evaluation.table import ScoreTable
 from retrieval.features import Features, encode_recording
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
@@ -113,10 +113,7 @@ def first_grasps(features: Features, most: int) -> Features:
 def judge(method: Method, validation: Features, unseen: Features) -> dict[str, Any]:
     """Summaries of the measures on unseen objects, by name."""
     fitted = calibrate({1: scored(method, validation)}, [], seed=0)
-    test = scored(method, unseen)
-    measures: dict[str, Measure] = {"pair_accuracy": protocols.pair_accuracy(test, fitted.pairs[1])}
-    measures |= {f"guesses_k{k}": protocols.k_way(test, k) for k in (5, 10)}
-    return {name: summarise([measure]) for name, measure in measures.items()}
+    return summaries([main_measures(scored(method, unseen), fitted, seed=0)], DRAWS, seed=0)
 
 
 def scored(method: Method, features: Features) -> ScoreTable:

@@ -19,7 +19,7 @@ import numpy as np
 from retrieval import cli, defaults
 from retrieval.checkpoint import Checkpoint, save_checkpoint
 from retrieval.config import load_config
-from retrieval.dataset import Split, data_digest, load_grasps, recording_source
+from retrieval.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.features import encode_recording
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
@@ -65,7 +65,7 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     training = dataclasses.replace(config.training, init=str(arguments.init), iterations=arguments.iterations)
     config = dataclasses.replace(config, training=training)
     features = encode_recording(grasps, build_matcher(config).eval(), config, arguments.folder / "features")
-    split = draw_split(recording, train=None, validation=VALIDATION)
+    split = draw_split(grasps, train=None, validation=VALIDATION)
     parts = (features.of_objects(split.train), features.of_objects(split.validation))
     made = trained_checkpoint(Setting(config, folder=arguments.folder, quiet=False), *parts)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
@@ -93,16 +93,16 @@ def score_shipped(arguments: argparse.Namespace) -> int:
     if code := collect(recording, arguments, SEED_SCORED):
         return code
     split = recording.with_name("split.json")
-    split.write_text(json.dumps(draw_split(recording, FITTED, FITTED).to_dict(), indent=1) + "\n")
+    split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
     model = arguments.model or defaults.shipped_model()
     methods = "late_fusion,prune_rerank,chance"
     out = arguments.folder / "report"
     return retrieve("evaluate", recording, "--model", model, "--methods", methods, "--split", split, "--out", out)
 
 
-def draw_split(recording: Path, train: int | None, validation: int) -> Split:
+def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:
     """So many objects to train and to validate on, the others to test; train None: all others train."""
-    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    names = sorted({grasp.object_id for grasp in grasps})
     names = [str(name) for name in np.random.default_rng(0).permutation(names)]
     held, others = names[:validation], names[validation:]
     seen = others if train is None else others[:train]

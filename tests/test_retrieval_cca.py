@@ -12,7 +12,8 @@ from retrieval.errors import BadInput, NumericalError
 from retrieval.features import Features
 from retrieval.methods.base import Setting
 from retrieval.methods.cca import Canonical, Cca, canonical, cosine, decompose, unit_rows
-from retrieval.methods.plsca import Plsca, next_of_object
+from retrieval.methods.plsca import Plsca
+from retrieval.methods.selection import neighbours
 from retrieval.methods.standardise import Standardiser
 
 
@@ -295,4 +296,4 @@ def test_one_grasp_for_each_object_is_plain_canonical_correlation_and_can_be_fit
 
 def test_a_touch_is_paired_with_the_photo_of_the_next_grasp():
     owner = np.array([0, 1, 0, 0, 2, 1])
-    assert next_of_object(owner).tolist() == [2, 5, 3, 0, 4, 1]
+    assert neighbours(owner, 2)[:, 1].tolist() == [2, 5, 3, 0, 4, 1]

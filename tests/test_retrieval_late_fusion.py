@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.batches import one_thread
 from retrieval.checkpoint import load_checkpoint
 from retrieval.dataset import load_grasps, make_split
+from retrieval.encode import one_thread
 from retrieval.errors import BadInput, Interrupted
 from retrieval.features import Features, encode_recording
 from retrieval.finish import unfinished

@@ -1,1 +1,4 @@
 """How good a ranking is, with intervals and the level of chance."""
+
+SCHEMA_VERSION = 1
+"""Of results.json."""

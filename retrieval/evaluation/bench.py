@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.batches import one_thread
 from retrieval.checkpoint import Checkpoint
 from retrieval.config import Config
 from retrieval.dataset import Split
+from retrieval.encode import one_thread
 from retrieval.errors import BadInput
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries

@@ -63,5 +63,5 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
 def score_control(name: str, bench: Bench, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
     """A control's entry of results.json."""
     judged = Judged(bench.queries, bench.predictions(METHOD, training_seed), seed)
-    measures = main_measures(judged, judged.calibrations())
+    measures = main_measures(judged.touches("test", "test"), judged.calibrations(), seed)
     return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}

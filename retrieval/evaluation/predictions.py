@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.batches import one_thread
 from retrieval.checkpoint import read_tensors, write_tensors
+from retrieval.encode import one_thread
 from retrieval.errors import BadInput
 from retrieval.evaluation.queries import Queries
 from retrieval.features import Features

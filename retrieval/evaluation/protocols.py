@@ -5,6 +5,8 @@ The gallery of a row never holds photos of its own grasps, except in the two pro
 not asked, and the gallery's words count such rows. Objects count alike: each is a rival as often as any other.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,16 +57,18 @@ def pair_auc(table: ScoreTable) -> Measure:
     kept = asked(table)
     weights = _rival_weights(kept)
     rows = zip(kept.scores, kept.relevant, kept.relevant & ~kept.own, weights, strict=True)
-    values = [_area(row[mine], row[~same], weight[~same]) for row, same, mine, weight in rows]
+    values = [share_below(row[mine], row[~same], weight[~same]).mean() for row, same, mine, weight in rows]
     return _measure(table, kept, np.array(values), 0.5)
 
 
-def _area(mine: NDArray[np.float32], others: NDArray[np.float32], weights: NDArray[np.float64]) -> float:
-    """Weighted share of `others` below `mine`, equals half, averaged over `mine`."""
+def share_below(
+    values: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Weighted share of `others` (their weights sum to 1) that each of `values` is above; equals half."""
     order = np.argsort(others)
     below = np.append(0.0, np.cumsum(weights[order]))
-    ranks = [np.searchsorted(others[order], mine, side) for side in ("left", "right")]
-    return float((below[ranks[0]] + below[ranks[1]]).mean() / 2)
+    ranks = [np.searchsorted(others[order], values, side) for side in ("left", "right")]
+    return np.asarray((below[ranks[0]] + below[ranks[1]]) / 2)
 
 
 def _halves(table: ScoreTable, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

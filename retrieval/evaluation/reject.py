@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from retrieval.calibration import Calibration, fit_calibration
 from retrieval.errors import BadInput
-from retrieval.evaluation.protocols import asked, gallery_words
+from retrieval.evaluation.protocols import asked, gallery_words, share_below
 from retrieval.evaluation.table import Measure, ScoreTable, object_scores, object_weights
 
 _ROC_POINTS = 200
@@ -92,23 +92,13 @@ def reject(gate: Gate, table: ScoreTable, *, seed: int = 0) -> Rejection:
     scores, true = _gallery(kept, seed)
     present, absent = statistics(gate.objects.log_odds(scores), true, seed)
     weights = object_weights(kept.touch_owner)
-    hits, alarms = _above(present, absent, weights), 1 - _above(absent, present, weights)
+    hits, alarms = share_below(present, absent, weights), 1 - share_below(absent, present, weights)
     areas = hits + alarms - np.sum(weights * hits)
     accepted = [gate.decision.log_odds(part) >= gate.decision.reject_log_odds for part in (present, absent)]
     right = (accepted[0] + 1.0 - accepted[1]) / 2
     words = f"{gallery_words(table, kept)}; each asked with its object and without, a rival dropped in its stead"
     auroc, balanced = (Measure(values[:, None], kept.touch_owner, np.array([0.5]), words) for values in (areas, right))
     return Rejection(auroc, balanced, gate.threshold, _roc(present, absent, weights))
-
-
-def _above(
-    values: NDArray[np.float64], others: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(T,) weighted share of `others` that each value is above; equals half."""
-    order = np.argsort(others)
-    below = np.append(0.0, np.cumsum(weights[order]))
-    ranks = [np.searchsorted(others[order], values, side) for side in ("left", "right")]
-    return np.asarray((below[ranks[0]] + below[ranks[1]]) / 2)
 
 
 def _roc(present: NDArray[np.float64], absent: NDArray[np.float64], weights: NDArray[np.float64]) -> list[list[float]]:

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from retrieval.batches import BatchImages, one_thread
+from retrieval.batches import BatchImages
+from retrieval.checkpoint import write_atomically
 from retrieval.config import Config
 from retrieval.dataset import Split
-from retrieval.encode import photo_features, touch_features
-from retrieval.errors import BadInput, ConfigError, Interrupted
+from retrieval.encode import one_thread, photo_features, touch_features
+from retrieval.errors import BadInput, Interrupted
+from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import audit
 from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.controls import METHOD, control_benches, score_control
@@ -23,13 +25,12 @@ from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.features import encode_recording
-from retrieval.methods import METHODS
+from retrieval.methods import METHODS, require_known
 from retrieval.progress import Bar
 from retrieval.version import __version__
 
 Jobs = Mapping[str, Sequence[int]]
 """Training seeds by method."""
-SCHEMA_VERSION = 1
 DRAWS = 10_000
 COMPARED = ("pair_accuracy", "guesses_k5")
 """Measures by which the first method is compared with each of the others."""
@@ -56,7 +57,9 @@ def evaluate(
     so that a run which was stopped goes on; equal settings give equal results to the byte. Raises ConfigError for an
     unknown method, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
     """
-    _require_known(methods, seeds)
+    require_known(*methods)
+    if not methods or seeds < 1:
+        raise BadInput(f"give one method and one seed at least; got {len(methods)} and {seeds}")
     out.mkdir(parents=True, exist_ok=True)
     seed = config.training.seed
     try:
@@ -77,13 +80,6 @@ def evaluate(
     _write(out / "results.json", results)
     _write(out / "timings.json", _timings(material, bench, jobs))
     return results
-
-
-def _require_known(methods: Sequence[str], seeds: int) -> None:
-    if unknown := [name for name in methods if name not in METHODS]:
-        raise ConfigError(f"method must be one of {', '.join(METHODS)}; got {unknown[0]!r}")
-    if not methods or seeds < 1:
-        raise BadInput(f"give one method and one seed at least; got {len(methods)} and {seeds}")
 
 
 def _benches(material: Material, out: Path, cache: Path, seed: int, quiet: bool) -> tuple[Bench, dict[str, Bench]]:
@@ -227,7 +223,4 @@ def _tower_times(material: Material, count: int = 4, repeats: int = 3) -> dict[s
 
 def _write(path: Path, document: Mapping[str, Any]) -> None:
     """Whole or not at all, and equal documents to the byte."""
-    text = json.dumps(document, sort_keys=True, indent=1, allow_nan=False)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text + "\n", "utf-8")
-    temporary.replace(path)
+    write_atomically(path, f"{json.dumps(document, sort_keys=True, indent=1, allow_nan=False)}\n".encode())

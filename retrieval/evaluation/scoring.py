@@ -74,19 +74,18 @@ def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray
     return np.arange(len(owner)) if part is None else queries.of_part(owner, part)
 
 
-def main_measures(judged: Judged, calibrations: Calibrations) -> Measures:
-    """Pair accuracy and guess curves on test objects; a curve needs as many objects as candidates."""
-    test = judged.touches("test", "test")
+def main_measures(test: ScoreTable, calibrations: Calibrations, seed: int) -> Measures:
+    """Pair accuracy and guess curves of single touches; a curve needs as many objects as candidates."""
     found = {"pair_accuracy": protocols.pair_accuracy(test, calibrations.pairs[1])}
     for k in (5, 10):
-        found |= _guesses(f"guesses_k{k}", test, k, judged.seed)
+        found |= _guesses(f"guesses_k{k}", test, k, seed)
     return found
 
 
 def all_measures(judged: Judged, calibrations: Calibrations) -> Measures:
     """Every measure of results.json."""
     test = judged.touches("test", "test")
-    found = main_measures(judged, calibrations) | {"pair_auc": protocols.pair_auc(test)}
+    found = main_measures(test, calibrations, judged.seed) | {"pair_auc": protocols.pair_auc(test)}
     for size, table in judged.sets("test").items():
         found |= _guesses(f"guesses_k5_g{size}_p{SHOWN_PHOTOS}", table, 5, judged.seed, SHOWN_PHOTOS)
     found |= _guesses("all_objects_k5", judged.touches("test", None), 5, judged.seed)

@@ -26,8 +26,14 @@ METHODS = {
 
 def build_method(name: str, setting: "Setting") -> "Method":
     """Make the method `name`, not fitted yet. Raises ConfigError for an unknown name."""
-    if name not in METHODS:
-        raise ConfigError(f"method must be one of {', '.join(METHODS)}; got {name!r}")
+    require_known(name)
     module, cls = METHODS[name].split(":")
     method: Method = getattr(import_module(module), cls)(setting)
     return method
+
+
+def require_known(*names: str) -> None:
+    """Raise ConfigError for a name that no method has."""
+    for name in names:
+        if name not in METHODS:
+            raise ConfigError(f"method must be one of {', '.join(METHODS)}; got {name!r}")

@@ -4,11 +4,10 @@ import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import Matrix, admissible, cosine, decompose, unit_rows
-from retrieval.methods.selection import judge
+from retrieval.methods.selection import judge, neighbours
 
 if TYPE_CHECKING:
     from retrieval.features import Features
@@ -30,7 +29,7 @@ class Plsca(Method):
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch = _Reduced(train.touch)
         self._photo = _Reduced(train.photo)
-        maps = _rotations(self._touch(train.touch), self._photo(train.photo)[next_of_object(train.owner)])
+        maps = _rotations(self._touch(train.touch), self._photo(train.photo)[neighbours(train.owner, 2)[:, 1]])
         judged = judge(validation)
         touch, photo = self._touch(judged.features.touch) @ maps[0], self._photo(judged.features.photo) @ maps[1]
         # Components are found one after another, so those of a smaller number are the first of a larger one.
@@ -67,15 +66,6 @@ class _Reduced:
 
     def __call__(self, x: Array) -> Matrix:
         return np.asarray(self._standardise(x) @ self._directions)
-
-
-def next_of_object(owner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) for each row the next row of its object, round; itself where it is the only one."""
-    following = np.empty_like(owner)
-    for name in np.unique(owner):
-        rows = np.flatnonzero(owner == name)
-        following[rows] = np.roll(rows, -1)
-    return following
 
 
 def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:

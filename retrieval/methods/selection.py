@@ -62,3 +62,12 @@ class Judge:
 def judge(validation: Features) -> Judge:
     """A judge by enough of the validation grasps."""
     return Judge(validation.select(judged_rows(validation)))
+
+
+def neighbours(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """(n, most) for each row itself and the next rows of its object, round."""
+    groups = np.empty((len(owner), most), dtype=np.int64)
+    for name in np.unique(owner):
+        rows = np.flatnonzero(owner == name)
+        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(most)) % len(rows)]
+    return groups

@@ -15,7 +15,7 @@ from retrieval.fusion import FusionHead
 from retrieval.losses import match_loss
 from retrieval.methods.base import Array, Method
 from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded, standardised
-from retrieval.methods.selection import judge
+from retrieval.methods.selection import judge, neighbours
 from retrieval.methods.standardise import Standardiser
 from retrieval.progress import Bar
 
@@ -129,12 +129,3 @@ class SetFusion(Method):
                 block = self._head(touch[start : start + rows, None], photo[None, first : first + PAIRS_PER_BLOCK])
                 logits[start : start + rows, first : first + PAIRS_PER_BLOCK] = block.numpy()
         return logits
-
-
-def neighbours(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """(n, most) for each row itself and the next rows of its object, round."""
-    groups = np.empty((len(owner), most), dtype=np.int64)
-    for name in np.unique(owner):
-        rows = np.flatnonzero(owner == name)
-        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(most)) % len(rows)]
-    return groups

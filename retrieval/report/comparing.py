@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
-from retrieval.report.results import GRASPS
+from retrieval.report.results import GRASPS, of_grasps
 
 INTERVALS = (
     "Brackets hold 95 % intervals: a bootstrap that resamples objects, since queries of one object are alike. Every "
@@ -49,7 +49,7 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
 
 def grasps(builder: Builder) -> Iterator[Block | None]:
     """What several grasps of one object add."""
-    keys = [f"guesses_k5_g{count}_p3" for count in GRASPS]
+    keys = [of_grasps(count) for count in GRASPS]
     if builder.any(*keys):
         yield builder.picture(
             "grasps.png",

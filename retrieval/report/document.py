@@ -7,15 +7,14 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
 
-import jinja2
 from PIL import Image
 
 from retrieval.report.canvas import FIGURE_DPI
 from retrieval.report.pictures import data_uri
+from retrieval.report.templates import render
 
 _PAGE_DPI = 96
 
@@ -108,9 +107,7 @@ def to_html(document: Document, folder: Path) -> str:
         with Image.open(folder / file) as image:
             return round(image.width * _PAGE_DPI / FIGURE_DPI)
 
-    source = (resources.files("retrieval") / "templates" / "evaluation.html").read_text("utf-8")
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(source).render(document=document, uri=uri, width=width, anchor=_anchor)
+    return render("evaluation.html", document=document, uri=uri, width=width, anchor=_anchor)
 
 
 def _anchor(title: str) -> str:

@@ -1,13 +1,11 @@
 """Results of a query for people: the table on a terminal and the self-contained HTML page."""
 
-from importlib import resources
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
-import jinja2
-
 from retrieval.report.pictures import data_uri, jpeg, thumbnail
+from retrieval.report.templates import render
 from retrieval.search import QueryResult
 
 _THUMBNAIL_PX = 320
@@ -52,9 +50,7 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
     matches: list[dict[str, Any]] = [
         {**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results
     ]
-    source = (resources.files("retrieval") / "templates" / "query.html").read_text("utf-8")
-    page = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
-    return page.render(result=result, touches=touches, matches=matches)
+    return render("query.html", result=result, touches=touches, matches=matches)
 
 
 def _data_uri(path: Path) -> str:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from retrieval.errors import BadInput
+from retrieval.evaluation import SCHEMA_VERSION
 
-SCHEMA_VERSION = 1
 NOTHING = "–"
 
 # Order of every table and figure. A method or measure that is not here comes last, under its own name.
@@ -26,12 +26,19 @@ METHODS = {
 }
 KNOW_NOTHING = frozenset({"chance", "constant"})
 GRASPS = (1, 2, 3, 5, 8)
+
+
+def of_grasps(count: int) -> str:
+    """The measure of a query of so many grasps, three photos of each candidate."""
+    return f"guesses_k5_g{count}_p3"
+
+
 MEASURES = {
     "pair_accuracy": "pair accuracy",
     "pair_auc": "pair AUC",
     "guesses_k5": "first guess of 5",
     "guesses_k10": "first guess of 10",
-    **{f"guesses_k5_g{count}_p3": f"first guess of 5, {count} grasp{'s' * (count > 1)}, 3 photos" for count in GRASPS},
+    **{of_grasps(count): f"first guess of 5, {count} grasp{'s' * (count > 1)}, 3 photos" for count in GRASPS},
     "all_objects_k5": "first guess of 5, all objects",
     **{
         f"{prefix}{key}": f"{label}{way}"
