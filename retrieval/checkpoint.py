@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -25,6 +27,7 @@ from retrieval.version import __version__
 
 FORMAT = 1
 _HEADER = "touch_retrieval"
+_QUERIES = "queries.touch_halves"
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Checkpoint:
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
     digest: SHA-256 of the file. provenance: step, seed, data digest, metrics and so on, as written by training.
+    queries: (Q, hidden) halves of touches of validation objects, by which an index can measure its own search.
     """
 
     path: Path
@@ -41,6 +45,7 @@ class Checkpoint:
     split: Split | None
     calibration: Calibration | None
     provenance: dict[str, Any]
+    queries: NDArray[np.float16] | None = None
 
 
 def save_checkpoint(
@@ -51,6 +56,7 @@ def save_checkpoint(
     split: Split | None,
     calibration: Calibration | None,
     provenance: Mapping[str, Any],
+    queries: NDArray[np.float16] | None = None,
     float16: bool = False,
 ) -> None:
     """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
@@ -67,6 +73,8 @@ def save_checkpoint(
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
     if float16:
         state = {name: _half(path, name, tensor) for name, tensor in state.items()}
+    if queries is not None:
+        state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
     write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
 
@@ -116,10 +124,20 @@ def load_checkpoint(path: Path) -> Checkpoint:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
         matcher = Matcher(config.matcher)
+        queries = state.pop(_QUERIES, None)
         load_weights(matcher, state)
     except BadInput as error:
         raise CheckpointError(f"{path} is not a checkpoint that this version can use: {error}") from error
-    return Checkpoint(path, file_digest(path), matcher.eval(), config, split, calibration, header["provenance"])
+    return Checkpoint(
+        path,
+        file_digest(path),
+        matcher.eval(),
+        config,
+        split,
+        calibration,
+        header["provenance"],
+        None if queries is None else queries.numpy(),
+    )
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:

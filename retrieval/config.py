@@ -23,7 +23,8 @@ class MatcherConfig:
     outputs are fused) or "pooled". fingers: gel images in one touch (training takes it from the recording).
     hidden: width of the fusion head. standardise: centre and scale the features by their statistics over the
     training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
-    embedding_dim: length of the unit embeddings for candidate search.
+    embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the networks that
+    make these embeddings from halves after training (`retrieval.pruner`); 0: they are the contrastive ones.
     """
 
     tower: str = "resnet50"
@@ -33,8 +34,10 @@ class MatcherConfig:
     dropout: float = 0.5
     standardise: bool = False
     embedding_dim: int = 128
+    pruner_width: int = 0
 
     def __post_init__(self) -> None:
+        _require(self.pruner_width >= 0, f"pruner_width must be at least 0; got {self.pruner_width}")
         for name in ("fingers", "hidden", "embedding_dim"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
         _require(0 <= self.dropout < 1, f"dropout must be in [0, 1); got {self.dropout}")
@@ -107,6 +110,11 @@ class Config:
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     preprocessing: Preprocessing = field(default_factory=Preprocessing)
+
+    @property
+    def has_embeddings(self) -> bool:
+        """Whether embeddings are trained, so that candidates can be searched by them."""
+        return self.matcher.pruner_width > 0 or self.training.contrastive_weight > 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, as in a TOML file."""

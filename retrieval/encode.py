@@ -43,14 +43,14 @@ def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -
 @torch.inference_mode()
 def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Code:
     """Halves and embeddings of touches, on the CPU."""
-    code = matcher.touch_code(touch_features(matcher, touches, batch))
+    code = matcher.touch_entry(touch_features(matcher, touches, batch))
     return Code(code.half.cpu(), code.embedding.cpu())
 
 
 @torch.inference_mode()
 def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Code:
     """Halves and embeddings of photos, on the CPU."""
-    code = matcher.photo_code(photo_features(matcher, photos, batch))
+    code = matcher.photo_entry(photo_features(matcher, photos, batch))
     return Code(code.half.cpu(), code.embedding.cpu())
 
 

@@ -17,6 +17,7 @@ from torch.nn import functional
 from retrieval.config import MatcherConfig
 from retrieval.errors import BadInput, NumericalError
 from retrieval.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
+from retrieval.pruner import Pruner
 from retrieval.towers import build_tower
 
 
@@ -74,6 +75,7 @@ class Matcher(nn.Module):
         norm = partial(nn.BatchNorm1d, affine=False) if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
+        self.pruner = Pruner(config.hidden, config.pruner_width, config.embedding_dim) if config.pruner_width else None
 
     def touch_features(self, touches: Tensor) -> Tensor:
         """Features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
@@ -93,14 +95,24 @@ class Matcher(nn.Module):
         return features.float()
 
     def touch_code(self, features: Tensor) -> Code:
-        """Half and embedding of touch features."""
+        """Half of touch features, and their embedding by the contrastive projection."""
         features = self.touch_norm(features)
         return Code(self.head.touch_half(features), _unit(self.touch_projection(features)))
 
     def photo_code(self, features: Tensor) -> Code:
-        """Half and embedding of photo features."""
+        """Half of photo features, and their embedding by the contrastive projection."""
         features = self.photo_norm(features)
         return Code(self.head.photo_half(features), _unit(self.photo_projection(features)))
+
+    def touch_entry(self, features: Tensor) -> Code:
+        """Half and embedding for candidate search of touch features."""
+        code = self.touch_code(features)
+        return code if self.pruner is None else Code(code.half, self.pruner.touch(code.half))
+
+    def photo_entry(self, features: Tensor) -> Code:
+        """Half and embedding for candidate search of photo features: what an index keeps."""
+        code = self.photo_code(features)
+        return code if self.pruner is None else Code(code.half, self.pruner.photo(code.half))
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
         """Match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""

@@ -161,8 +161,7 @@ class Searcher:
 
     def _candidates(self, embeddings: NDArray[np.float32], k: int) -> NDArray[np.int64] | None:
         """Rows to judge, the union over grasps; None for all, where the stage would leave nothing out."""
-        trained = self.checkpoint.config.training.contrastive_weight > 0
-        if not trained or k >= self.generation.count:
+        if not self.checkpoint.config.has_embeddings or k >= self.generation.count:
             return None
         found = [rows for rows, _ in self.generation.search(embeddings, k)]
         return np.unique(np.concatenate(found))

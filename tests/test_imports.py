@@ -17,6 +17,7 @@ STAGES = (
     ("images",),
     ("catalogue", "config", "dataset", "losses"),
     ("check", "towers"),
+    ("pruner",),
     ("fusion",),
     ("encode", "distributed", "calibration"),
     ("checkpoint", "batches", "gate"),

@@ -17,7 +17,7 @@ class PruneRerank(LateFusion):
 
     share: of the gallery that is judged. The others stand behind these, in the order of their embeddings. Photos are
     taken for each grasp of a set and put together, as search does. A model without trained embeddings
-    (contrastive_weight = 0) judges every photo. A code is the half and, behind it, the embedding.
+    judges every photo. A code is the half and, behind it, the embedding.
     """
 
     def __init__(self, setting: Setting, share: float = SHARE) -> None:
@@ -26,17 +26,17 @@ class PruneRerank(LateFusion):
 
     def _take(self, checkpoint: Checkpoint) -> None:
         super()._take(checkpoint)
-        if checkpoint.config.training.contrastive_weight == 0:
+        if not checkpoint.config.has_embeddings:
             self.share = 1.0
         self.chosen["judged_share"] = self.share
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        return np.concatenate(self._matcher.touch_code(torch.from_numpy(touch).flatten(1)), axis=1)
+        return np.concatenate(self._matcher.touch_entry(torch.from_numpy(touch).flatten(1)), axis=1)
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        return np.concatenate(self._matcher.photo_code(torch.from_numpy(photo)), axis=1)
+        return np.concatenate(self._matcher.photo_entry(torch.from_numpy(photo)), axis=1)
 
     def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
         touch_halves, halves, nearness = self._parts(touch_codes, photo_codes)
