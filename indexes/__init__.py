@@ -24,6 +24,7 @@ KINDS = {
     "flat": "indexes.flat:FlatIndex",
     "hnsw": "indexes.hnsw:HNSWIndex",
     "ivf_flat": "indexes.ivf:IVFFlatIndex",
+    "ivf_sq8": "indexes.ivf:IVFSQ8Index",
     "ivf_pq": "indexes.ivf:IVFPQIndex",
 }
 """Name of a kind -> where its class stands. A new kind is one file and one line here."""

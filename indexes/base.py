@@ -12,6 +12,7 @@ import numpy as np
 from indexes.checks import check_k, check_unit
 from indexes.errors import ParameterError, VectorError
 from indexes.scores import Floats, Mask, Slots
+from indexes.stack import Stack, Vectors, parts_of
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,12 @@ class VectorIndex(ABC):
       fewer, it looks further and in the end scans. There is no padding.
     * Vectors are checked when added and when searched for: finite, of unit norm within 1e-3, of d components.
 
-    A subclass writes `_search`, and the structure's `_build`, `_append`, `_read`, `_write` where it has one.
+    A subclass writes `_search`, and the structure's `_build`, `_grown`, `_read`, `_write` where it has one.
     """
 
     kind: ClassVar[str]
     exact: ClassVar[bool] = False
     """Whether a search always finds the true best k."""
-    rebuild_is_cheap: ClassVar[bool] = False
-    """Whether building costs no more than copying."""
     retrain_growth: ClassVar[float | None] = None
     """Growth by `add`, as a multiple of the trained size, beyond which to build anew; None: any."""
     structure_file: ClassVar[bool] = True
@@ -55,9 +54,11 @@ class VectorIndex(ABC):
     search_settings: ClassVar[frozenset[str]] = frozenset()
     """Parameters that a search reads and the structure does not depend on."""
     parameters_type: ClassVar[type[Parameters]] = Parameters
+    fewest: ClassVar[int] = 1
+    """Vectors that a build needs."""
     parameters: Parameters
 
-    def __init__(self, vectors: Floats, parameters: Any, seed: int, threads: int | None) -> None:
+    def __init__(self, vectors: Vectors, parameters: Any, seed: int, threads: int | None) -> None:
         """Used by `build` and `load`, which check what comes here."""
         self._vectors = vectors
         self.parameters = parameters
@@ -82,10 +83,20 @@ class VectorIndex(ABC):
         table = check_unit(vectors, names=names)
         if not len(table):
             raise VectorError("an index needs at least one vector; got none")
+        return cls.over(table, cls.asked(parameters), seed=seed, threads=threads)
+
+    @classmethod
+    def asked(cls, parameters: Parameters | None) -> Parameters:
+        """The parameters, or the defaults for None; of another kind they raise `ParameterError`."""
         asked = cls.parameters_type() if parameters is None else parameters
         if not isinstance(asked, cls.parameters_type):
             raise ParameterError(f"{cls.kind} takes {cls.parameters_type.__name__}; got {type(asked).__name__}")
-        index = cls(table, cls._resolve(asked, *table.shape), seed, check_threads(threads))
+        return asked
+
+    @classmethod
+    def over(cls, vectors: Vectors, parameters: Parameters, *, seed: int = 0, threads: int | None = None) -> Self:
+        """`build` over vectors (M, d), M >= 1, that were checked before, in one array or in several."""
+        index = cls(vectors, cls._resolve(parameters, *vectors.shape), seed, check_threads(threads))
         index._build()
         return index
 
@@ -93,21 +104,25 @@ class VectorIndex(ABC):
     def load(
         cls,
         path: str | Path | None,
-        vectors: Floats,
+        vectors: Vectors,
         parameters: Parameters,
         *,
+        covered: int | None = None,
         seed: int = 0,
         threads: int | None = None,
     ) -> Self:
         """The index that `save` wrote to `path`, over the same `vectors` (M, d), which may be memory-mapped.
 
-        A file that is unreadable or does not fit the vectors raises `CorruptIndex`. The vectors are trusted.
+        `covered` says how many leading vectors the structure holds (None: all). A file that is unreadable or does
+        not fit raises `CorruptIndex`. The vectors are trusted.
         """
         index = cls(vectors, parameters, seed, check_threads(threads))
         if cls.structure_file:
             if path is None:
                 raise ParameterError(f"{cls.kind} is loaded from a file; got no path")
-            index._read(Path(path))
+            index._read(Path(path), len(vectors) if covered is None else covered)
+        else:
+            index._build()
         return index
 
     @classmethod
@@ -132,9 +147,18 @@ class VectorIndex(ABC):
         return int(self._vectors.shape[1])
 
     @property
-    def vectors(self) -> Floats:
+    def vectors(self) -> Vectors:
         """The vectors (M, d); not to be written to."""
         return self._vectors
+
+    @property
+    def covered(self) -> int:
+        """How many leading vectors the structure holds; those after them are scanned."""
+        return 0
+
+    def shares_structure(self, other: "VectorIndex") -> bool:
+        """Whether both search one structure; False for a kind that has none."""
+        return False
 
     def settings(self) -> dict[str, Any]:
         """The parameters as a JSON object."""
@@ -159,8 +183,12 @@ class VectorIndex(ABC):
         """Append `vectors` (F, d) as slots M..M+F-1; F = 0 changes nothing."""
         fresh = check_unit(vectors, dim=self.dim, names=names)
         if len(fresh):
-            self._append(fresh)
-            self._vectors = np.concatenate([self._vectors, fresh])
+            self.grow(Stack([*parts_of(self._vectors), fresh]))
+
+    def grow(self, vectors: Vectors) -> None:
+        """Search `vectors` (M', d), M' >= M, of which the first M are those of this index and all were checked."""
+        self._vectors = vectors
+        self._grown()
 
     def save(self, path: str | Path) -> bool:
         """Write the structure to `path`; False, and nothing written, for a kind that has none."""
@@ -184,7 +212,9 @@ class VectorIndex(ABC):
 
     @classmethod
     def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
-        """The parameters with every None filled in for `count` vectors of `dim` components."""
+        """The parameters with every None filled in for `count` vectors of `dim` components; refuses too few."""
+        if count < cls.fewest:
+            raise ParameterError(f"{cls.kind} needs {cls.fewest} or more vectors to train its codes; got {count}")
         return asked
 
     @abstractmethod
@@ -194,11 +224,11 @@ class VectorIndex(ABC):
     def _build(self) -> None:  # noqa: B027 - nothing to do without a structure
         """Make the structure over `self._vectors`."""
 
-    def _append(self, fresh: Floats) -> None:  # noqa: B027 - nothing to do without a structure
-        """Add `fresh` (F, d) to the structure; `self._vectors` follows."""
+    def _grown(self) -> None:  # noqa: B027 - nothing to do without a structure
+        """Take in that `self._vectors` has more vectors than before."""
 
-    def _read(self, path: Path) -> None:
-        """Read the structure and check that it fits `self._vectors`."""
+    def _read(self, path: Path, covered: int) -> None:
+        """Read the structure and check that it holds the first `covered` of `self._vectors`."""
         raise NotImplementedError
 
     def _write(self, path: Path) -> None:

@@ -14,6 +14,7 @@ from indexes.scores import Floats
 LADDERS: dict[str, tuple[str, tuple[int, ...]]] = {
     "hnsw": ("ef_search", (16, 32, 64, 128, 256, 512)),
     "ivf_flat": ("probes", (1, 4, 16, 64, 256)),
+    "ivf_sq8": ("probes", (1, 4, 16, 64, 256)),
     "ivf_pq": ("probes", (1, 4, 16, 64, 256)),
 }
 """Approximate kind -> the setting that trades time for recall, and the values to try, fastest first."""
@@ -43,6 +44,12 @@ class Choice:
     reason: str
 
 
+def require_buildable(kind: str, count: int, dim: int) -> None:
+    """Refuse, with `ParameterError`, a kind that is unknown or cannot be built over so many vectors of that size."""
+    chosen = load_kind(kind)
+    chosen._resolve(chosen.parameters_type(), count, dim)
+
+
 def operating_points(
     vectors: Floats,
     kinds: Sequence[str] = ("flat", "hnsw", "ivf_flat"),
@@ -61,7 +68,7 @@ def operating_points(
     asked = sample_queries(vectors, MEASURED_QUERIES, seed=seed) if queries is None else queries
     for kind in kinds:
         built = load_kind(kind).build(vectors, seed=seed, threads=threads)
-        for index in _ladder(built):
+        for index in ladder(built):
             recall = 1.0 if index.exact else recall_against_exact(index, asked, k)
             yield OperatingPoint(kind, index.parameters, query_ms(index, asked, k, clock=clock), recall)
 
@@ -118,7 +125,8 @@ def _said(taken: OperatingPoint, exact: OperatingPoint, budget_ms: float, min_re
     return Choice(taken.kind, taken.parameters, taken.ms, exact.ms, taken.recall, reason)
 
 
-def _ladder(built: VectorIndex) -> Iterator[VectorIndex]:
+def ladder(built: VectorIndex) -> Iterator[VectorIndex]:
+    """The same structure with each value of its kind's ladder, fastest first; one without a ladder as it is."""
     if built.kind not in LADDERS:
         yield built
         return

@@ -14,7 +14,6 @@ class ExactIndex(VectorIndex):
 
     kind: ClassVar[str] = "exact"
     exact: ClassVar[bool] = True
-    rebuild_is_cheap: ClassVar[bool] = True
     structure_file: ClassVar[bool] = False
 
     def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:

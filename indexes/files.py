@@ -20,8 +20,14 @@ def durable(path: Path) -> Iterator[BinaryIO]:
     """A new file to write; flushed to the disk when the block ends."""
     with path.open("wb") as handle:
         yield handle
-        handle.flush()
-        os.fsync(handle.fileno())
+        finish(handle)
+
+
+def finish(handle: BinaryIO) -> None:
+    """Flush what was written to the disk, and close the file."""
+    handle.flush()
+    os.fsync(handle.fileno())
+    handle.close()
 
 
 def sync(path: Path) -> None:
@@ -57,20 +63,45 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def write_array(path: Path, dtype: Any, shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]) -> None:
-    """A `.npy` file of `shape` from blocks of rows, without holding more than one of them."""
-    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": shape}
-    with durable(path) as handle:
-        np.lib.format.write_array_header_1_0(handle, header)
+class ArrayFile:
+    """A `.npy` file that grows row by row; its header, written last, says how many rows there are."""
+
+    HEADER_BYTES = 256
+
+    def __init__(self, path: Path, dtype: Any, row_shape: tuple[int, ...]) -> None:
+        self.path, self.dtype, self.row_shape, self.rows = path, np.dtype(dtype), row_shape, 0
+        self._handle = path.open("wb")
+        self._handle.write(bytes(self.HEADER_BYTES))
+
+    def append(self, block: NDArray[Any]) -> None:
+        """Add rows (n, *row_shape)."""
+        self._handle.write(np.ascontiguousarray(block, dtype=self.dtype).data.cast("B") if len(block) else b"")
+        self.rows += len(block)
+
+    def close(self) -> None:
+        """Write the header and flush the file to the disk."""
+        descr = np.lib.format.dtype_to_descr(self.dtype)
+        header = {"descr": descr, "fortran_order": False, "shape": (self.rows, *self.row_shape)}
+        prefix, text = np.lib.format.magic(1, 0), repr(header).encode()
+        room = self.HEADER_BYTES - len(prefix) - 2
+        self._handle.seek(0)
+        self._handle.write(prefix + room.to_bytes(2, "little") + text.ljust(room - 1) + b"\n")
+        finish(self._handle)
+
+    def abandon(self) -> None:
+        """Close without finishing."""
+        self._handle.close()
+
+
+def write_array(path: Path, dtype: Any, row_shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]) -> None:
+    """A `.npy` file (n, *row_shape) from blocks of rows, without holding more than one of them."""
+    file = ArrayFile(path, dtype, row_shape)
+    try:
         for block in blocks:
-            handle.write(np.ascontiguousarray(block, dtype=dtype).tobytes())
-
-
-def write_lines(path: Path, documents: Iterable[Any]) -> None:
-    """One JSON document a line."""
-    with durable(path) as handle:
-        for document in documents:
-            handle.write(encoded(document) + b"\n")
+            file.append(block)
+        file.close()
+    finally:
+        file.abandon()
 
 
 def encoded(document: Any, *, indent: int | None = None) -> bytes:

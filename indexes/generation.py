@@ -1,7 +1,8 @@
 """One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,43 +20,46 @@ from indexes.errors import (
     UnsupportedFormat,
 )
 from indexes.manifest import AGAIN, Manifest, check_files, read_manifest
+from indexes.rows import RECORD, Records, Rows, Segment, keys_of
 from indexes.scores import Floats, Mask, Slots, grid_scores, on_grid
+from indexes.stack import Vectors, parts_of, stacked
 
-ROWS, EMBEDDINGS, STRUCTURE = "rows.jsonl", "embeddings.npy", "vectors.faiss"
+STRUCTURE, ORDER = "vectors.faiss", "order.npy"
 SHOWN_IDS = 5
+CHECKED = 1000
 
 
 class Generation:
     """What a reader holds. It stays usable, arrays and all, when writers replace and delete it on the disk.
 
-    rows        the N rows as they were written, in their order
+    rows        the N rows as they were written, in their order, each parsed when it is asked for
     slots       (N,) int64, the slot of each row; rows with equal vectors share one
     embeddings  (S, d) float32 unit vectors, one for each slot, memory-mapped
-    arrays      name -> (N, ...) per-row array, memory-mapped
+    arrays      name -> (N, ...) per-row array, memory-mapped; an array, or a `Stack` of several
     documents   name -> JSON document
     manifest    what `manifest.json` says
     index       the vector index over the slots
+    identities  file name -> the file that was opened, as `file_identity` says
     """
 
     def __init__(
         self,
         folder: Path,
         manifest: Manifest,
-        rows: list[dict[str, Any]],
-        slots: Slots,
-        embeddings: Floats,
-        arrays: Mapping[str, NDArray[Any]],
+        records: Records,
+        order: Slots | None,
+        embeddings: Vectors,
         documents: Mapping[str, Any],
         index: VectorIndex,
+        identities: Mapping[str, tuple[int, int]],
     ) -> None:
-        self.folder, self.manifest = folder, manifest
-        self.rows, self.slots, self.embeddings = rows, slots, embeddings
-        self.arrays, self.documents, self.index = arrays, documents, index
-        self._number = {row["id"]: number for number, row in enumerate(rows)}
-        self._id_rank = np.empty(len(rows), dtype=np.int64)
-        self._id_rank[sorted(range(len(rows)), key=lambda number: str(rows[number]["id"]))] = np.arange(len(rows))
-        self._by_slot = np.argsort(slots, kind="stable")
-        self._per_slot = np.bincount(slots, minlength=len(embeddings))
+        self.folder, self.manifest, self.records = folder, manifest, records
+        self.rows = Rows(records, np.arange(len(records)) if order is None else order)
+        self.embeddings, self.documents, self.index, self.identities = embeddings, documents, index, identities
+        self.arrays: dict[str, Any] = {name: records.array(name, order) for name in manifest.arrays}
+        self.slots: Slots = records.column("slot", order)
+        self._by_slot = np.argsort(self.slots, kind="stable")
+        self._per_slot = np.bincount(self.slots, minlength=len(embeddings))
         self._starts = np.cumsum(self._per_slot) - self._per_slot
         self._live: Mask | None = None if self._per_slot.all() else self._per_slot > 0
 
@@ -92,52 +96,127 @@ class Generation:
 
     def row_number(self, row_id: str) -> int:
         """The number of the row with that id; KeyError where there is none."""
-        return self._number[row_id]
+        number = int(self.rows.find([row_id])[0])
+        if number < 0:
+            raise KeyError(row_id)
+        return number
+
+    def codes(self, field: str) -> Slots:
+        """For each row (N,) a number that rows share when their `field` is the same text; no row is parsed.
+
+        field is one of `indexes.rows.KEYS`; numbers count up from 0 in the order of the rows that have them first.
+        """
+        _, first, code = np.unique(self.rows.keys(field), return_index=True, return_inverse=True)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(first)] = np.arange(len(first))
+        return rank[code]
 
     def search(self, queries: Floats, k: int) -> list[tuple[Slots, Floats]]:
         """For each unit query (Q, d) the rows of the best k slots: row numbers (n,) and scores (n,) float32.
 
         A slot stands for all its rows, so n may exceed k. Order: (-score, id).
         """
-        scores, slots = self.index.search(queries, k, self._live)
-        return [self._expanded(*pair) for pair in zip(scores, slots, strict=True)]
+        scores, slots = self.index.search(queries, k + 1, self._live)
+        return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
+
+    def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
+        """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
+        numbers, keys = self.rows.find(ids), keys_of(digests)
+        same = (keys != b"") & (keys == self._digests[numbers])
+        return np.where((numbers >= 0) & same, numbers, -1)
 
     def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
         """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
-        return {
-            row_id: self._number[row_id]
-            for row_id, digest in wanted.items()
-            if digest is not None and row_id in self._number and self.rows[self._number[row_id]].get("digest") == digest
-        }
+        numbers = self.matching(list(wanted), wanted.values()).tolist()
+        return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
 
     def self_check(self, sample: int = 256, seed: int = 0) -> None:
         """Search for the vectors of `sample` rows; `SelfRetrievalFailed` names those that do not come first.
 
-        A row passes when its slot, or one that scores as high (a near-copy), is at rank 1.
+        A row passes when its slot, or one that scores as high (a near-copy), is at rank 1. Where a search for one
+        misses it, one for a hundredth of all rows may find it: candidates are asked for by the hundred, and codes
+        cannot tell near-copies apart.
         """
         drawn = np.random.default_rng(seed).permutation(self.count)[:sample]
-        if not len(drawn):
-            return
-        own = np.ascontiguousarray(self.embeddings[self.slots[drawn]])
-        top = self.index.search(own, 1, self._live)[0][:, 0]
-        gridded = on_grid(own)
-        must = np.array([grid_scores(vector, vector[None])[0] for vector in gridded])
-        lost = sorted(self.rows[number]["id"] for number in drawn[top < must])
+        for k in sorted({1, max(1, min(CHECKED, self.count // 100))}):
+            drawn = self._lost(drawn, k)
+        lost = sorted(self.rows.ids(drawn))
         if lost:
             shown = ", ".join(lost[:SHOWN_IDS]) + (", ..." if len(lost) > SHOWN_IDS else "")
             raise SelfRetrievalFailed(
-                f"{len(lost)} of {len(drawn)} rows do not find themselves in the {self.manifest.kind} index "
-                f"({shown}); choose the kind flat, or a broader search",
+                f"{len(lost)} of {min(sample, self.count)} rows do not find themselves in the {self.manifest.kind} "
+                f"index ({shown}); choose the kind flat, or a broader search",
                 lost,
             )
 
+    def _lost(self, numbers: Slots, k: int) -> Slots:
+        """Those of the rows for whose vectors a search for k slots puts a worse one first."""
+        if not len(numbers):
+            return numbers
+        own = np.ascontiguousarray(self.embeddings[self.slots[numbers]])
+        top = self.index.search(own, k, self._live)[0][:, 0]
+        must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
+        return numbers[top < must]
+
+    def file_bytes(self, name: str) -> memoryview:
+        """The bytes of a file of a segment, whether it is still on the disk or not."""
+        numbers = self.manifest.segments
+        held: dict[str, NDArray[Any]] = {}
+        for number, segment in zip(numbers["records"], self.records.segments, strict=True):
+            columns = {"rows": segment.text, "table": segment.table} | dict(segment.arrays)
+            held |= {segment_name(column, number): array for column, array in columns.items()}
+        for number, part in zip(numbers["vectors"], parts_of(self.embeddings), strict=True):
+            held[segment_name("embeddings", number)] = part
+        return memoryview(held[name].base)  # type: ignore[arg-type]  # the mapping of the whole file
+
+    @cached_property
+    def _digests(self) -> NDArray[np.bytes_]:
+        return self.rows.keys("digest")
+
+    def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
+        """The rows of the best k of k + 1 slots; where slots tie for the last place, their ids say which stays."""
+        wanted = k
+        while len(scores) > wanted and scores[wanted] == scores[k - 1]:
+            wanted *= 2
+            found_scores, found = self.index.search(query[None], wanted + 1, self._live)
+            scores, slots = found_scores[0], found[0]
+        if wanted == k:
+            return self._expanded(scores[:k], slots[:k])
+        rows, spread = self._expanded(scores, slots)
+        _, first = np.unique(self.slots[rows], return_index=True)
+        stay = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
+        return rows[stay], spread[stay]
+
     def _expanded(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
+        """All rows of slots in the order of their scores, and their scores; equal scores in the order of ids."""
         counts = self._per_slot[slots]
         spread = np.repeat(scores, counts)
         inside = np.arange(len(spread)) - np.repeat(np.cumsum(counts) - counts, counts)
         rows = self._by_slot[np.repeat(self._starts[slots], counts) + inside]
-        order = np.lexsort((self._id_rank[rows], -spread))
-        return rows[order], spread[order]
+        edges = np.flatnonzero(np.diff(spread)) + 1
+        starts, ends = np.concatenate([[0], edges]), np.append(edges, len(spread))
+        tied = ends - starts > 1
+        for start, end in zip(starts[tied], ends[tied], strict=True):
+            ids = self.rows.ids(rows[start:end])
+            rows[start:end] = rows[start:end][sorted(range(len(ids)), key=ids.__getitem__)]
+        return rows, spread
+
+
+def segment_name(what: str, number: int) -> str:
+    """The file of a segment: of "rows", "table", "embeddings" or an array, written by generation `number`."""
+    return f"{what}-{number:06d}.{'jsonl' if what == 'rows' else 'npy'}"
+
+
+def file_identity(path: Path) -> tuple[int, int]:
+    """What tells one file from another under the same name."""
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def mapped(path: Path) -> NDArray[Any]:
+    """The array in a file, memory-mapped."""
+    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    return array
 
 
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:
@@ -145,13 +224,15 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     manifest = read_manifest(folder)
     check_files(folder, manifest, verify=verify)
     try:
-        rows, slots = _read_rows(folder / ROWS)
-        embeddings = _mapped(folder / EMBEDDINGS)
-        arrays = {name: _mapped(folder / f"{name}.npy") for name in manifest.arrays}
+        identities = {name: file_identity(folder / name) for name in manifest.files}
+        records = Records([_segment(folder, manifest, number) for number in manifest.segments["records"]])
+        order = mapped(folder / ORDER) if ORDER in manifest.files else None
+        names = [segment_name("embeddings", number) for number in manifest.segments["vectors"]]
+        embeddings = stacked([mapped(folder / name) for name in names])
         documents = {name: json.loads((folder / f"{name}.json").read_bytes()) for name in manifest.documents}
-        _check_counts(manifest, slots, embeddings, arrays)
+        _check_counts(manifest, records, order, embeddings)
         index = _read_index(folder, manifest, embeddings, threads)
-        return Generation(folder, manifest, rows, slots, embeddings, arrays, documents, index)
+        return Generation(folder, manifest, records, order, embeddings, documents, index, identities)
     except ParameterError as error:
         raise UnsupportedFormat(f"{folder}: {error}. Update the software, or {AGAIN}") from error
     except IndexesError:
@@ -160,39 +241,43 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
-def _read_rows(path: Path) -> tuple[list[dict[str, Any]], Slots]:
-    rows = [json.loads(line) for line in path.read_bytes().split(b"\n")[:-1]]
-    return rows, np.array([row.pop("slot") for row in rows], dtype=np.int64)
+def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
+    text = np.memmap(folder / segment_name("rows", number), np.uint8, "r")
+    table = mapped(folder / segment_name("table", number))
+    arrays = {name: mapped(folder / segment_name(name, number)) for name in manifest.arrays}
+    must = {"fields": RECORD, "bytes of text": len(text)} | dict.fromkeys(arrays, len(table))
+    got = {"fields": table.dtype, "bytes of text": int(table["stop"][-1])}
+    got |= {name: len(array) for name, array in arrays.items()}
+    if got != must:
+        raise CorruptIndex(f"{folder}: segment {number} must hold {must}, holds {got}; {AGAIN}")
+    return Segment(text, table, arrays)
 
 
-def _mapped(path: Path) -> NDArray[Any]:
-    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    return array
-
-
-def _check_counts(manifest: Manifest, slots: Slots, embeddings: Floats, arrays: Mapping[str, NDArray[Any]]) -> None:
+def _check_counts(manifest: Manifest, records: Records, order: Slots | None, embeddings: Vectors) -> None:
     counts = manifest.counts
-    empty = counts.slots - len(np.unique(slots))
+    slots = records.column("slot", order)
+    if slots.min() < 0 or slots.max() >= counts.slots:
+        raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")
     got = {
         "rows": len(slots),
+        "records": len(records),
         "slots": len(embeddings),
-        "tombstones": empty,
+        "tombstones": counts.slots - int(np.count_nonzero(np.bincount(slots))),
         "components": embeddings.shape[1],
     }
     must = {
         "rows": counts.rows,
+        "records": counts.records,
         "slots": counts.slots,
         "tombstones": counts.tombstones,
         "components": manifest.dim,
     }
-    for name, array in arrays.items():
-        got[name], must[name] = len(array), counts.rows
-    if got != must or slots.min() < 0 or slots.max() >= counts.slots:
+    if got != must:
         raise CorruptIndex(f"{manifest.generation}: the manifest says {must}, the files hold {got}; {AGAIN}")
 
 
-def _read_index(folder: Path, manifest: Manifest, embeddings: Floats, threads: int | None) -> VectorIndex:
+def _read_index(folder: Path, manifest: Manifest, embeddings: Vectors, threads: int | None) -> VectorIndex:
     kind = load_kind(manifest.kind)
     parameters = kind.parameters_from(manifest.parameters)
-    path = folder / STRUCTURE if kind.structure_file else None
-    return kind.load(path, embeddings, parameters, seed=manifest.seed, threads=threads)
+    path, covered = folder / STRUCTURE if kind.structure_file else None, manifest.counts.structure_slots
+    return kind.load(path, embeddings, parameters, covered=covered, seed=manifest.seed, threads=threads)

@@ -36,13 +36,12 @@ class HNSWIndex(FaissIndex):
     def _make(self) -> Any:
         structure = faiss.IndexHNSWFlat(self.dim, self.parameters.neighbours, faiss.METRIC_INNER_PRODUCT)
         structure.hnsw.efConstruction = self.parameters.ef_construction
-        structure.hnsw.rng = faiss.RandomGenerator(self.seed)
         return structure
 
-    def _append(self, fresh: Floats) -> None:
+    def _take_in(self) -> None:
         # A graph read from disk has lost its generator: seed it by what is there, read or not.
-        self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self.count)
-        super()._append(fresh)
+        self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self.covered)
+        super()._take_in()
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         breadth = max(fetch, self.parameters.ef_search * effort)

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import numpy as np
+
 from indexes import base
 from indexes.errors import ParameterError
 from indexes.faiss_index import FaissIndex, faiss
@@ -12,7 +14,16 @@ from indexes.scores import Floats, Slots
 POINTS_PER_CENTRE = 39
 """Fewest training points for each centre that FAISS accepts without a warning."""
 
-FEWEST_REFINED = 8
+MOST_POINTS_PER_CENTRE = 64
+"""Training points for each centre beyond which the centres gain nothing worth the time."""
+
+FEWEST_CODED = 16 * POINTS_PER_CENTRE
+"""Vectors that codes need for their training: enough for the smallest codebook, and for the range of each component."""
+
+SPARE_CODES = 64
+"""Candidates beyond k that are scored exactly: with a byte for each component, near-copies change places."""
+
+FEWEST_REFINED = 64
 """Compressed scores are too coarse to trust their very first: a smaller k refines as many as this one."""
 
 
@@ -57,6 +68,7 @@ class IVFFlatIndex(FaissIndex):
 
     @classmethod
     def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
+        asked = super()._resolve(asked, count, dim)
         most = max(1, count // POINTS_PER_CENTRE)
         lists = min(most, asked.lists or round(4 * math.sqrt(count)))
         probes = min(lists, asked.probes or max(8, math.ceil(lists / 16)))
@@ -65,6 +77,13 @@ class IVFFlatIndex(FaissIndex):
     def _make(self) -> Any:
         structure = faiss.IndexIVFFlat(self._centres(), self.dim, self._lists, faiss.METRIC_INNER_PRODUCT)
         return self._prepared(structure)
+
+    def _training(self) -> Floats:
+        most = MOST_POINTS_PER_CENTRE * self._lists
+        if self.count <= most:
+            return super()._training()
+        drawn = np.random.default_rng(self.seed).choice(self.count, most, replace=False)
+        return np.ascontiguousarray(self._vectors[np.sort(drawn)])
 
     def _centres(self) -> Any:
         return faiss.IndexFlatIP(self.dim)
@@ -85,6 +104,22 @@ class IVFFlatIndex(FaissIndex):
         return rough, found
 
 
+class IVFSQ8Index(IVFFlatIndex):
+    """Inverted lists of vectors with a byte for each component: a quarter of the memory, and scores within 1 %."""
+
+    kind: ClassVar[str] = "ivf_sq8"
+    structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"
+    fewest: ClassVar[int] = FEWEST_CODED
+
+    def _make(self) -> Any:
+        quantizer, metric = faiss.ScalarQuantizer.QT_8bit, faiss.METRIC_INNER_PRODUCT
+        centres = self._centres()
+        return self._prepared(faiss.IndexIVFScalarQuantizer(centres, self.dim, self._lists, quantizer, metric))
+
+    def _first_fetch(self, k: int) -> int:
+        return k + SPARE_CODES
+
+
 class IVFPQIndex(IVFFlatIndex):
     """Inverted lists of compressed vectors; the uncompressed ones on disk give the final scores.
 
@@ -93,16 +128,13 @@ class IVFPQIndex(IVFFlatIndex):
 
     kind: ClassVar[str] = "ivf_pq"
     structure_type: ClassVar[str] = "IndexIVFPQ"
+    fewest: ClassVar[int] = FEWEST_CODED
     search_settings: ClassVar[frozenset[str]] = frozenset({"probes", "refine"})
     parameters_type: ClassVar[type[base.Parameters]] = IVFPQParameters
     parameters: IVFPQParameters
 
     @classmethod
     def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
-        if count < POINTS_PER_CENTRE * 16:
-            raise ParameterError(
-                f"ivf_pq needs {POINTS_PER_CENTRE * 16} or more vectors to train its codes; got {count}"
-            )
         if asked.code_bytes is not None and dim % asked.code_bytes:
             raise ParameterError(f"code_bytes must divide the vector size {dim}; got {asked.code_bytes}")
         return replace(super()._resolve(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim))

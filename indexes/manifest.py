@@ -10,24 +10,32 @@ from typing import Any
 from indexes.errors import CorruptIndex, UnsupportedFormat
 from indexes.files import digest, durable, encoded
 
-FORMAT = 1
+FORMAT = 2
 NAME = "manifest.json"
 AGAIN = "run `retrieve build-index` again"
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Rows; slots (distinct vectors); tombstones (slots without a row); slots of the last full build."""
+    """Rows; records (those that no row shows any more too); slots (distinct vectors); tombstones (slots without a row).
+
+    built_slots were there when the structure was trained, structure_slots are in it; those after them are scanned.
+    """
 
     rows: int
+    records: int
     slots: int
     tombstones: int
     built_slots: int
+    structure_slots: int
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The fields of the file, in its order. `asked` are the parameters before None was filled in."""
+    """The fields of the file, in its order. `asked` are the parameters before None was filled in.
+
+    segments: "records" and "vectors" -> the numbers of the generations that wrote their segments, in order.
+    """
 
     generation: str
     parent: str | None
@@ -43,6 +51,7 @@ class Manifest:
     seed: int
     recall: dict[str, Any]
     counts: Counts
+    segments: dict[str, list[int]]
     arrays: list[str]
     documents: list[str]
     files: dict[str, dict[str, Any]]
@@ -78,9 +87,12 @@ def read_manifest(folder: Path) -> Manifest:
     return _parsed(path, content)
 
 
-def sealed(folder: Path) -> dict[str, dict[str, Any]]:
-    """Size and SHA-256 of every file in the folder."""
-    return {path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())}
+def sealed(folder: Path, known: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file in the folder; those of the names in `known` are taken from there."""
+    return {
+        path.name: known.get(path.name) or {"bytes": path.stat().st_size, "sha256": digest(path)}
+        for path in sorted(folder.iterdir())
+    }
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:

@@ -12,7 +12,7 @@ The price is the rounding of the components, at most 2^-27 each: the score moves
 """
 
 import math
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,34 +50,36 @@ def slack(dim: int) -> float:
 
 def best(scores: Floats, slots: Slots, k: int) -> tuple[Floats, Slots]:
     """The k best of (n,) scores and their slots, ordered by (-score, slot)."""
+    if len(scores) > k:
+        reach = scores >= np.partition(scores, len(scores) - k)[len(scores) - k]  # the last place's ties too
+        scores, slots = scores[reach], slots[reach]
     order = np.lexsort((slots, -scores))[:k]
     return scores[order], slots[order]
 
 
-def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
+def scan(vectors: Any, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
     """Score every slot: (Q, k) scores and slots ordered by (-score, slot), where `live` (M,) is true.
 
-    k must not exceed the number of live slots. This is the reference that every kind is measured against.
+    vectors (M, d) are an array or an `indexes.stack.Stack`, read block by block. k must not exceed the number of live
+    slots. This is the reference that every kind is measured against.
     """
-    scores = np.empty((len(queries), k), dtype=np.float32)
-    slots = np.empty((len(queries), k), dtype=np.int64)
-    step = max(1, BLOCK_NUMBERS // max(1, len(vectors)))
-    for start in range(0, len(queries), step):
-        block = slice(start, start + step)
-        table = score_table(queries[block], vectors)
+    gridded = on_grid(queries)
+    found = [(np.empty(0, np.float32), np.empty(0, np.int64))] * len(queries)
+    step = max(1, BLOCK_NUMBERS // max(1, len(queries), vectors.shape[1]))
+    for start in range(0, len(vectors), step):
+        table = grid_scores(gridded, on_grid(vectors[start : start + step]))
+        slots = np.arange(start, start + table.shape[1])
         if live is not None:
-            table[:, ~live] = -np.inf
-        order = np.argsort(-table, axis=1, kind="stable")[:, :k]
-        scores[block], slots[block] = np.take_along_axis(table, order, axis=1), order
-    return scores, slots
+            slots = slots[live[slots]]
+        for query, (scores, before) in enumerate(found):
+            row = table[query, slots - start]
+            found[query] = best(np.concatenate([scores, row]), np.concatenate([before, slots]), k)
+    return np.stack([scores for scores, _ in found]), np.stack([slots for _, slots in found])
 
 
-def score_table(queries: Floats, vectors: Floats) -> Floats:
+def score_table(queries: Floats, vectors: Any) -> Floats:
     """Every inner product (Q, M) of queries (Q, d) and vectors (M, d), the vectors read block by block."""
     gridded = on_grid(queries)
-    table = np.empty((len(queries), len(vectors)), dtype=np.float32)
     step = max(1, BLOCK_NUMBERS // max(1, vectors.shape[1]))
-    for start in range(0, len(vectors), step):
-        block = slice(start, start + step)
-        table[:, block] = grid_scores(gridded, on_grid(vectors[block]))
-    return table
+    blocks = [grid_scores(gridded, on_grid(vectors[start : start + step])) for start in range(0, len(vectors), step)]
+    return np.concatenate(blocks, axis=1)

@@ -1,24 +1,28 @@
 """The index on disk: a folder of generations, of which one is current.
 
-    CURRENT             the name of the current generation; the only file ever replaced
-    gen-000007/         a generation: written beside, checked, renamed into place, never changed afterwards
-      manifest.json     what it is, and size and SHA-256 of every other file; written last
-      rows.jsonl        a row's own data and its slot
-      embeddings.npy    (slots, d) float32, from which any kind of index is built
-      vectors.faiss     the structure of the index, for kinds that have one
-      NAME.npy          per-row arrays
-      NAME.json         documents
-    LOCK                held by the writer
+    CURRENT               the name of the current generation; the only file ever replaced
+    gen-000007/           a generation: written beside, checked, renamed into place, never changed afterwards
+      manifest.json       what it is, and size and SHA-256 of every other file; written last
+      rows-000005.jsonl   rows as lines of JSON: one file for each segment, named by the generation that wrote it
+      table-000005.npy    slot, bytes and keys of each of those lines (see `indexes.rows`)
+      NAME-000005.npy     per-row arrays
+      embeddings-000005.npy   (slots, d) float32, from which any kind of index is built
+      order.npy           which rows are shown and in which order, where that is not all of them as they lie
+      vectors.faiss       the structure of the index, for kinds that have one
+      NAME.json           documents
+    LOCK                  held by the writer
+
+A file of a segment never changes. A generation made from a parent gives the parent's files a second name (a hard link)
+and writes what is new; rows that are gone stay in their segments until they are a tenth of all. Small segments are
+joined as they come (see `indexes.stack.segments_kept`).
 
 One writer, many readers. A writer killed at any moment leaves the old or the new generation current, whole;
 the next writer sweeps up what the killed one left.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
-from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
 from typing import Any
@@ -26,18 +30,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from indexes import files, load_kind
-from indexes.base import Parameters, VectorIndex
+from indexes.base import Parameters
 from indexes.errors import CorruptIndex, NoIndex, RowError, WriteFailed
-from indexes.generation import EMBEDDINGS, ROWS, STRUCTURE, Generation, read_generation
+from indexes.generation import Generation, read_generation
 from indexes.locking import WriterLock
-from indexes.manifest import AGAIN, Counts, Manifest, sealed, write_manifest
-from indexes.measure import recall_against_exact, sample_queries
-from indexes.plan import Content, Plan, check_documents, gather, lay_out
+from indexes.manifest import AGAIN
 from indexes.scores import Floats
+from indexes.spool import Block, Kept, check_documents
+from indexes.writing import Job, Settle, write_generation
 
 GENERATION = re.compile(r"gen-(\d{6,})")
-RECALL_AT = 10
-RECALL_QUERIES = 100
 
 
 class IndexStore:
@@ -91,6 +93,23 @@ class IndexStore:
         embeddings: Floats | None,
         arrays: Mapping[str, NDArray[Any]] | None = None,
         documents: Mapping[str, Any] | None = None,
+        **settings: Any,
+    ) -> Generation:
+        """Write a new generation holding exactly `rows`, make it current, and return it opened.
+
+        rows         JSON objects with a distinct text "id", and a "digest" of the content for later reuse
+        embeddings   (F, d) float32 unit vectors; arrays: name -> (F, ...) finite numbers
+        documents    name -> JSON; never taken over from the parent
+        settings     those of `write_blocks`. Rows that `parent.reusable` gives for their ids and digests keep its
+                     vectors and arrays, and F counts only the other rows, in their order (embeddings may be None
+                     when F = 0). Without a parent, F is the number of rows.
+        """
+        return self.write_blocks([Block(rows, embeddings, arrays or {})], documents, **settings)
+
+    def write_blocks(
+        self,
+        blocks: Iterable[Block | Kept],
+        documents: Mapping[str, Any] | None = None,
         *,
         fingerprint: Mapping[str, str],
         about: Mapping[str, Any] | None = None,
@@ -100,20 +119,19 @@ class IndexStore:
         software: str = "",
         seed: int = 0,
         threads: int | None = None,
+        settle: Settle | None = None,
+        queries: Floats | None = None,
         self_check: int = 256,
         keep: int = 2,
     ) -> Generation:
-        """Write a new generation holding exactly `rows`, make it current, and return it opened.
+        """As `write`, from blocks of rows that are put on the disk as they come: memory holds one of them.
 
-        rows         JSON objects with a distinct text "id", and a "digest" of the content for later reuse
-        embeddings   (F, d) float32 unit vectors; arrays: name -> (F, ...) finite numbers
-        documents    name -> JSON; never taken over from the parent
         fingerprint  what made the vectors; `open(expect=...)` compares it
         about        anything else for the manifest
-        parent       a generation to take rows over from: those that `parent.reusable` gives for the ids and
-                     digests of `rows` keep its vectors and arrays, and F counts only the other rows, in their
-                     order (embeddings may be None when F = 0). Without a parent, F is the number of rows.
+        parent       a generation to take rows over from, as `Block` and `Kept` say
         software     version that writes
+        settle       chooses kind, parameters and more of `about` instead, once all rows are on the disk
+        queries      (Q, d) unit vectors to measure recall with; None draws them near the index's own
         self_check   rows that must find themselves before the switch (see `Generation.self_check`)
         keep         generations before the new one that stay on disk for readers that are just opening them
 
@@ -121,56 +139,31 @@ class IndexStore:
         while another writer works, `SelfRetrievalFailed`, and then the index is as it was; `WriteFailed` when
         the disk refuses, and then it is the old one or the new one, whole.
         """
+        job = Job(
+            documents=check_documents(documents or {}),
+            fingerprint=dict(fingerprint),
+            about=dict(about or {}),
+            kind=load_kind(kind),
+            asked=load_kind(kind).asked(parameters),
+            parent=parent,
+            software=software,
+            seed=seed,
+            threads=threads,
+            settle=settle,
+            queries=queries,
+        )
+        check_about(fingerprint, about or {})
         with self._lock, self._writing():
-            content = gather(rows, embeddings, arrays, parent, fingerprint)
-            texts = check_documents(documents or {})
-            clash = sorted(set(texts) & set(content.arrays))
-            if clash:
-                raise RowError(f"an array and a document cannot share a name; got {', '.join(clash)}")
-            check_about(fingerprint, about or {})
-            chosen = load_kind(kind)
-            asked = chosen.parameters_type() if parameters is None else parameters
-            plan = lay_out(content, chosen, asked, seed)
-            index = _index(chosen, asked, plan, content, seed, threads)
             self._sweep()
-            name = self._next_name()
-            manifest = Manifest(
-                generation=name,
-                parent=None if content.parent is None else content.parent.name,
-                created=datetime.now(UTC).isoformat(timespec="seconds"),
-                software=software,
-                fingerprint=dict(fingerprint),
-                about=dict(about or {}),
-                dim=index.dim,
-                metric="inner_product",
-                kind=kind,
-                parameters=index.settings(),
-                asked=asdict(asked),
-                seed=seed,
-                recall=_recall(index, plan, seed),
-                counts=_counts(plan, content),
-                arrays=sorted(content.arrays),
-                documents=sorted(texts),
-                files={},
-            )
-            return self._publish(manifest, content, plan, index, texts, threads, self_check, keep)
+            return self._publish(self._next_number(), blocks, job, self_check, keep)
 
-    def _publish(
-        self,
-        manifest: Manifest,
-        content: Content,
-        plan: Plan,
-        index: VectorIndex,
-        documents: Mapping[str, Any],
-        threads: int | None,
-        self_check: int,
-        keep: int,
-    ) -> Generation:
-        name = manifest.generation
+    def _publish(self, number: int, blocks: Iterable[Block | Kept], job: Job, self_check: int, keep: int) -> Generation:
+        name = generation_name(number)
         folder = self.path / f"{name}.tmp-{getpid()}"
         try:
-            _write_files(folder, manifest, content, plan, index, documents)
-            generation = read_generation(folder, verify=True, threads=threads)
+            folder.mkdir()
+            write_generation(folder, name, number, blocks, job)
+            generation = read_generation(folder, verify=False, threads=job.threads)  # the digests were just taken
             generation.self_check(self_check)
             folder.rename(self.path / name)
         except BaseException:
@@ -203,8 +196,8 @@ class IndexStore:
         found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
         return sorted(int(match[1]) for match in found if match)
 
-    def _next_name(self) -> str:
-        return f"gen-{max(self._numbers(), default=0) + 1:06d}"
+    def _next_number(self) -> int:
+        return max(self._numbers(), default=0) + 1
 
     def _sweep(self) -> None:
         """Delete what killed writers left: unfinished folders and files beside CURRENT."""
@@ -218,7 +211,12 @@ class IndexStore:
         """Delete all generations but the newest and `keep` before it."""
         numbers = self._numbers()
         for number in numbers[: max(0, len(numbers) - 1 - keep)]:
-            _discard(self.path / f"gen-{number:06d}")
+            _discard(self.path / generation_name(number))
+
+
+def generation_name(number: int) -> str:
+    """The name of a generation, such as gen-000007."""
+    return f"gen-{number:06d}"
 
 
 def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> None:
@@ -227,68 +225,6 @@ def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> Non
     if odd:
         raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
     files.check_json(dict(about), "about")
-
-
-def _index(
-    kind: type[VectorIndex],
-    asked: Parameters,
-    plan: Plan,
-    content: Content,
-    seed: int,
-    threads: int | None,
-) -> VectorIndex:
-    if plan.inherited and content.parent is not None:
-        index = content.parent.index.copy()
-        index.threads = threads
-        index.add(plan.vectors[plan.inherited :])
-        return index
-    return kind.build(plan.vectors, asked, seed=seed, threads=threads)
-
-
-def _counts(plan: Plan, content: Content) -> Counts:
-    slots = len(plan.vectors)
-    built = slots
-    if plan.inherited and content.parent is not None:
-        built = content.parent.manifest.counts.built_slots
-    return Counts(len(content.rows), slots, slots - len(set(plan.slots.tolist())), built)
-
-
-def _recall(index: VectorIndex, plan: Plan, seed: int) -> dict[str, Any]:
-    if index.exact:
-        return {"value": 1.0, "at": RECALL_AT, "queries": 0, "how": "exact by construction"}
-    queries = sample_queries(plan.vectors, RECALL_QUERIES, seed=seed)
-    value = recall_against_exact(index, queries, RECALL_AT)
-    return {
-        "value": value,
-        "at": RECALL_AT,
-        "queries": RECALL_QUERIES,
-        "how": "measured on moved own vectors",
-    }
-
-
-def _write_files(
-    folder: Path,
-    manifest: Manifest,
-    content: Content,
-    plan: Plan,
-    index: VectorIndex,
-    documents: Mapping[str, Any],
-) -> None:
-    folder.mkdir()
-    pairs = zip(content.rows, plan.slots.tolist(), strict=True)
-    files.write_lines(folder / ROWS, ({"slot": slot} | row for row, slot in pairs))
-    files.write_array(folder / EMBEDDINGS, plan.vectors.dtype, plan.vectors.shape, [plan.vectors])
-    for name, array in content.arrays.items():
-        shape = (len(content.rows), *array.shape[1:])
-        files.write_array(folder / f"{name}.npy", array.dtype, shape, content.array_blocks(name))
-    for name, document in documents.items():
-        with files.durable(folder / f"{name}.json") as handle:
-            handle.write(files.encoded(document, indent=2) + b"\n")
-    if index.save(folder / STRUCTURE):
-        files.sync(folder / STRUCTURE)
-    manifest.files.update(sealed(folder))
-    write_manifest(folder, manifest)
-    files.sync(folder)
 
 
 def _discard(folder: Path) -> None:

@@ -23,7 +23,9 @@ def build_parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_build_index(commands)
     _add_query(commands)
+    _add_export(commands)
     _add_evaluate(commands)
+    _add_frontier(commands)
     return parser
 
 
@@ -91,8 +93,11 @@ def _add_build_index(commands: Any) -> None:
     parser.add_argument("catalogue", type=Path, help="folder: <object>/<photo> or <object>.<ext>")
     parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
     parser.add_argument("--out", type=Path, default=Path("index"), help="index folder (default: index)")
-    parser.add_argument("--kind", help="candidate index (default: exact, unless it breaks --max-ms); see the README")
-    parser.add_argument("--max-ms", type=float, help="longest candidate search in milliseconds")
+    parser.add_argument("--kind", help="candidate index (default: exact, unless a bound asks for more); see the README")
+    parser.add_argument(
+        "--min-recall", type=float, help="least share of touches whose best photo must be found (default: 0.99)"
+    )
+    parser.add_argument("--max-ms", type=float, help="longest search in milliseconds: candidates and judging them")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
 
 
@@ -117,10 +122,25 @@ def _add_query(commands: Any) -> None:
     parser.add_argument("--index", help="index folder (default: ./index, else the last one built)")
     parser.add_argument("--model", help="checkpoint (default: the one the index was built with)")
     parser.add_argument("--top", type=int, default=10, help="objects to return (default: 10)")
-    parser.add_argument("--candidates", type=int, help="photos that the full classifier judges (default: 1000)")
+    parser.add_argument(
+        "--candidates", type=int, help="photos that the full classifier judges (default: what the index needs)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--html", type=Path, help="write a page with photos and gel images")
     parser.add_argument("--no-verify", action="store_true", help="skip the checksums of a huge index")
+
+
+def _add_export(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "export",
+        "Write a checkpoint's touch encoder as ONNX; `query` finds it beside the checkpoint and does without PyTorch.",
+    )
+    parser.add_argument(
+        "model", nargs="?", help="checkpoint (default: the last one trained, else the shipped one)", metavar="MODEL"
+    )
+    parser.add_argument("--out", type=Path, help="file to write (default: beside the checkpoint, ending in .onnx)")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -145,4 +165,21 @@ def _add_evaluate(commands: Any) -> None:
     parser.add_argument("--seed", type=int, help="seed of split, queries and first training, instead of the preset's")
     parser.add_argument("--split", type=Path, help="JSON file with train, validation and test objects")
     parser.add_argument("--cache", type=Path, help="folder where features of images are kept (default: OUT/features)")
+    parser.add_argument("--json", action="store_true", help="print the results as one JSON document")
+
+
+def _add_frontier(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "frontier",
+        "Error against run time of every approximation; goes on where it was stopped. Writes plots and a page.",
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for frontier.json, frontier.html and plots")
+    parser.add_argument("--recording", type=Path, help="grasps of unseen objects (default: a small one is collected)")
+    parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these approximations only")
+    parser.add_argument("--quick", action="store_true", help="smallest sizes, to see that it runs; concludes nothing")
+    parser.add_argument(
+        "--stability", action="store_true", help="instead: run the hard cases of every numerical kernel"
+    )
     parser.add_argument("--json", action="store_true", help="print the results as one JSON document")

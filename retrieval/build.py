@@ -1,32 +1,41 @@
 """From a folder of photos to a searchable index; only photos whose content changed are embedded again."""
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch  # before faiss, which the index imports: both bring OpenMP
-from numpy.typing import NDArray
 
 from indexes import load_kind
-from indexes.choice import Choice, choose_kind
+from indexes.choice import choose_kind, require_buildable
 from indexes.errors import CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
 from indexes.generation import Generation
+from indexes.spool import Block
 from indexes.store import IndexStore
-from retrieval.catalogue import Catalogue, PhotoBytes, SkippedPhoto, decode_photo, list_catalogue, read_photos
+from indexes.writing import RECALL_QUERIES, Chosen, Laid
+from retrieval.catalogue import SkippedPhoto, list_catalogue
 from retrieval.checkpoint import Checkpoint
-from retrieval.encode import Image, batches, encode_photos
-from retrieval.errors import BadInput, DatasetError, NumericalError
-from retrieval.progress import Bar
+from retrieval.embed import Embedder, Part
+from retrieval.operating import (
+    Asked,
+    Bench,
+    Settled,
+    all_judged,
+    can_measure,
+    kept,
+    needs_measuring,
+    query_codes,
+    sentence,
+    settle,
+)
+from retrieval.stored import fingerprint
 from retrieval.version import __version__
 
-T = TypeVar("T")
-R = TypeVar("R")
-BATCH = 16
 SHOWN = 20
 
 
@@ -34,12 +43,15 @@ SHOWN = 20
 class BuildReport:
     """What a build did.
 
-    skipped: photos that could not be read; ignored: files that are no photos by name; notes: remarks on metadata.
+    written: False where nothing had changed, so that the generation stayed as it was. skipped: photos that could not
+    be read; ignored: files that are no photos by name; notes: remarks on metadata. candidates: the operating point as
+    the manifest has it (`retrieval.operating`), None where the checkpoint has nothing to measure one with.
     half_error: largest rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
     """
 
     index: str
     generation: str
+    written: bool
     model: str
     photos: int
     objects: int
@@ -52,6 +64,7 @@ class BuildReport:
     kind: str
     reason: str
     recall: Any
+    candidates: dict[str, Any] | None
     half_error: float
     seconds: float
 
@@ -71,6 +84,8 @@ class BuildReport:
             f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
             f"{self.embedded} embedded, {self.reused} unchanged, {self.removed} removed{rate}"
         )
+        if not self.written:
+            yield "nothing changed, by the content of every file: the index stays as it is"
         yield f"candidate search: {self.kind}. {self.reason}{self._measured()}"
         yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
         if self.ignored:
@@ -87,70 +102,115 @@ def _some(what: str, items: Sequence[str]) -> Iterator[str]:
         yield f"  and {len(items) - SHOWN} more (--json lists them all)"
 
 
-def fingerprint(checkpoint: Checkpoint) -> dict[str, str]:
-    """What must be the same for an index to be searched with a checkpoint."""
-    return {"checkpoint": checkpoint.digest, "preprocessing": checkpoint.config.preprocessing.digest()}
-
-
 def build_index(
     folder: Path,
     checkpoint: Checkpoint,
     out: Path,
     *,
     kind: str | None = None,
+    min_recall: float | None = None,
     max_ms: float | None = None,
     quiet: bool = False,
 ) -> BuildReport:
     """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
 
-    kind: of the candidate index; where None, exact search unless its measured time exceeds `max_ms`. Photos that
-    cannot be read are skipped and reported. Raises DatasetError where none can be, and the errors of
-    `indexes.store.IndexStore.write`, which leave the index as it was.
+    kind, min_recall, max_ms: what is asked of the search (`retrieval.operating`); where all are None, exact search.
+    Where neither the photos' content nor what is asked for changed, nothing is written. Photos that cannot be read are
+    skipped and reported. Raises DatasetError where none can be, and the errors of `indexes.store.IndexStore.write`,
+    which leave the index as it was.
     """
-    _check_kind(kind, max_ms)
+    asked = Asked(kind, min_recall, max_ms)
     catalogue = list_catalogue(folder)
+    if kind is not None:
+        require_buildable(kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     store = IndexStore(out)
     with store.lock():
         parent, why = _parent(store, checkpoint)
+        about = {
+            "checkpoint": str(checkpoint.path.resolve()),
+            "catalogue": str(folder.resolve()),
+            "asked": asdict(asked),
+        }
+        made = Embedder(checkpoint, parent)
         start = time.perf_counter()
-        made = _embed(catalogue, checkpoint, parent, quiet)
-        seconds = time.perf_counter() - start
-        choice = _choice(made, kind, max_ms)
-        generation = store.write(
-            made.rows,
-            made.embeddings,
-            {"halves": made.halves},
-            {"calibration": checkpoint.calibration.to_dict()} if checkpoint.calibration else {},
-            fingerprint=fingerprint(checkpoint),
-            about={
-                "checkpoint": str(checkpoint.path.resolve()),
-                "catalogue": str(folder.resolve()),
-                "half_error": made.half_error,
-            },
-            kind=choice.kind,
-            parameters=choice.parameters,
-            parent=parent,
-            software=__version__,
-        )
-    kept, inside = {row["id"] for row in made.rows}, out.resolve()
+        with closing(made.parts(catalogue, quiet)) as parts:
+            changed = _unless_same(parent, parts, about)
+            job = _Job(store, made, about, asked, quiet)
+            generation = parent if parent is not None and changed is None else job.write(changed or ())
+        seconds = time.perf_counter() - start - job.settling_s
+    inside = out.resolve()
     return BuildReport(
         index=str(out),
         generation=generation.name,
+        written=changed is not None,
         model=str(checkpoint.path),
         photos=generation.count,
-        objects=len({row["object_id"] for row in made.rows}),
-        embedded=made.count,
-        reused=len(made.rows) - made.count,
-        removed=sum(row["id"] not in kept for row in parent.rows) if parent else 0,
+        objects=len(made.object_ids),
+        embedded=made.embedded,
+        reused=made.photos - made.embedded,
+        removed=made.removed,
         skipped=made.skipped,
         ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(inside)],
         notes=list(catalogue.notes),
-        kind=choice.kind,
-        reason=" ".join(filter(None, (why, choice.reason))),
+        kind=generation.manifest.kind,
+        reason=" ".join(filter(None, (why, generation.manifest.about["reason"]))),
         recall=generation.manifest.recall,
+        candidates=generation.manifest.about["candidates"],
         half_error=made.half_error,
         seconds=seconds,
     )
+
+
+def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:
+    """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest say the
+    same. Parts are held back until one differs; these have rows alone."""
+    if parent is None or any(parent.manifest.about.get(key) != value for key, value in about.items()):
+        return parts
+    same: list[Part] = []
+    place = 0
+    for part in parts:
+        same.append(part)
+        if part.halves is not None or parent.rows[place : place + len(part.rows)] != part.rows:
+            return chain(same, parts)
+        place += len(part.rows)
+    return None if place == parent.count else iter(same)
+
+
+@dataclass
+class _Job:
+    """Writes a generation from parts, and settles how it is to be searched when all of them are on the disk."""
+
+    store: IndexStore
+    made: Embedder
+    about: Mapping[str, Any]
+    asked: Asked
+    quiet: bool
+    settling_s: float = 0.0
+
+    def write(self, parts: Iterable[Part]) -> Generation:
+        """Write the parts as they come."""
+        checkpoint = self.made.checkpoint
+        return self.store.write_blocks(
+            (_block(part) for part in parts),
+            {"calibration": checkpoint.calibration.to_dict()} if checkpoint.calibration else {},
+            fingerprint=fingerprint(checkpoint),
+            about=self.about,
+            parent=self.made.parent,
+            software=__version__,
+            settle=self._settle,
+            queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
+        )
+
+    def _settle(self, laid: Laid) -> Chosen:
+        start = time.perf_counter()
+        settled = _settled(self.made, laid, self.asked, self.quiet)
+        self.settling_s = time.perf_counter() - start
+        about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
+        return Chosen(settled.kind, settled.parameters, about)
+
+
+def _block(part: Part) -> Block:
+    return Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
 
 
 def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, str]:
@@ -165,129 +225,29 @@ def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | Non
         return None, f"The index there was not usable, so every photo was embedded again ({error})."
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """A row of the new generation, and its preprocessed image where the parent does not have the photo."""
-
-    row: dict[str, Any]
-    image: Image | None
-
-
-class _Embedded:
-    """Rows in catalogue order, and embeddings and halves (float16) of those that the parent does not have."""
-
-    def __init__(self, checkpoint: Checkpoint, parent: Generation | None) -> None:
-        self.checkpoint, self.parent = checkpoint, parent
-        self.rows: list[dict[str, Any]] = []
-        self.skipped: list[SkippedPhoto] = []
-        self.half_error = 0.0
-        self._embeddings = [np.empty((0, checkpoint.config.matcher.embedding_dim), np.float32)]
-        self._halves = [np.empty((0, checkpoint.config.matcher.hidden), np.float16)]
-
-    @property
-    def embeddings(self) -> NDArray[np.float32]:
-        """(embedded photos, embedding_dim)."""
-        return np.concatenate(self._embeddings)
-
-    @property
-    def halves(self) -> NDArray[np.float16]:
-        """(embedded photos, hidden)."""
-        return np.concatenate(self._halves)
-
-    @property
-    def count(self) -> int:
-        """How many photos were embedded."""
-        return sum(map(len, self._halves))
-
-    def prepare(self, item: PhotoBytes | SkippedPhoto) -> _Prepared | SkippedPhoto:
-        """What is to be done with a photo. Called on threads, ahead of `add`; keeps none of the file's bytes."""
-        if isinstance(item, SkippedPhoto):
-            return item
-        row = _row(item)
-        if self.parent is not None and self.parent.reusable({row["id"]: item.digest}):
-            return _Prepared(row, None)
-        image = decode_photo(item)
-        if isinstance(image, SkippedPhoto):
-            return image
-        return _Prepared(row, self.checkpoint.config.preprocessing.photo(image))
-
-    def add(self, part: Sequence[_Prepared | SkippedPhoto]) -> None:
-        """Take the next photos, one batch for the tower."""
-        usable = [item for item in part if isinstance(item, _Prepared)]
-        self.rows += [item.row for item in usable]
-        self.skipped += [item for item in part if isinstance(item, SkippedPhoto)]
-        fresh = {item.row["id"]: item.image for item in usable if item.image is not None}
-        if fresh:
-            code = encode_photos(self.checkpoint.matcher, fresh.values(), BATCH)
-            halves = code.half.numpy()
-            stored = _as_float16(halves, list(fresh))
-            self.half_error = max(self.half_error, float(np.abs(stored - halves).max()))
-            self._halves.append(stored)
-            self._embeddings.append(code.embedding.numpy())
+def _settled(made: Embedder, laid: Laid, asked: Asked, quiet: bool) -> Settled:
+    """The kind to build and the candidates to judge, measured where there is something to measure with."""
+    photos, checkpoint = len(laid.slots), made.checkpoint
+    previous = None if made.parent is None else made.parent.manifest
+    before = None if previous is None else previous.about.get("candidates")
+    again = kept(before, asked, photos, made.embedded + made.removed)
+    if previous is not None and again is not None:
+        parameters = load_kind(previous.kind).parameters_from(previous.asked)
+        return Settled(previous.kind, parameters, sentence(again), again)
+    if not checkpoint.config.has_embeddings or not needs_measuring(photos, asked):
+        chosen, judged = asked.kind or "flat", all_judged(photos, asked)
+        return Settled(chosen, load_kind(chosen).parameters_type(), sentence(judged), judged)
+    if not can_measure(checkpoint):
+        return _by_neighbours(laid, asked)
+    return settle(Bench(checkpoint, laid.vectors, laid.slots, laid.arrays["halves"], quiet=quiet), asked)
 
 
-def _embed(catalogue: Catalogue, checkpoint: Checkpoint, parent: Generation | None, quiet: bool) -> _Embedded:
-    made = _Embedded(checkpoint, parent)
-    made.skipped += catalogue.skipped
-    with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar:
-        for part in batches(ahead(made.prepare, read_photos(catalogue)), BATCH):
-            made.add(part)
-            bar.advance(len(part))
-    if not made.rows:
-        first = made.skipped[0]
-        raise DatasetError(f"no photo in {catalogue.folder} can be read; the first: {first.path}: {first.reason}")
-    if parent is not None and made.count < len(made.rows):  # what was taken over was rounded when it was made
-        made.half_error = max(made.half_error, parent.manifest.about.get("half_error", 0.0))
-    return made
-
-
-def _row(item: PhotoBytes) -> dict[str, Any]:
-    photo = item.photo
-    return {
-        "id": photo.photo_id,
-        "object_id": photo.object_id,
-        "path": photo.path,
-        "digest": item.digest,
-        "metadata": photo.metadata,
-    }
-
-
-def _as_float16(halves: NDArray[np.float32], names: list[str]) -> NDArray[np.float16]:
-    largest = np.abs(halves).max(axis=1)
-    bad = np.flatnonzero(~(largest <= np.finfo(np.float16).max))
-    if len(bad):
-        raise NumericalError(
-            f"halves are stored as float16 and must stay within 65504; {names[bad[0]]} gives {largest[bad[0]]}; "
-            "the model has diverged, train again with a lower learning rate"
-        )
-    return halves.astype(np.float16)
-
-
-def _check_kind(kind: str | None, max_ms: float | None) -> None:
-    """Refuse what could not be built, before the photos are embedded."""
-    if kind is not None:
-        load_kind(kind)
-    if max_ms is not None and not max_ms > 0:
-        raise BadInput(f"the longest candidate search must be above 0 ms; got {max_ms}")
-
-
-def _choice(made: _Embedded, kind: str | None, max_ms: float | None) -> Choice:
-    if kind is not None:
-        return Choice(kind, load_kind(kind).parameters_type(), None, None, 1.0, "It was asked for.")
-    vectors = made.embeddings  # without a budget nothing is measured, on these or others
-    if max_ms is not None and made.parent is not None:
-        reused = made.parent.reusable({row["id"]: row["digest"] for row in made.rows})
-        vectors = np.concatenate([vectors, made.parent.embeddings[made.parent.slots[list(reused.values())]]])
-    return choose_kind(vectors, max_ms, threads=torch.get_num_threads())
-
-
-def ahead(function: Callable[[T], R], items: Iterable[T], threads: int = 2, window: int = 4 * BATCH) -> Iterator[R]:
-    """`map(function, items)` on threads, in order, never more than `window` items ahead of the reader."""
-    waiting: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= window:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+def _by_neighbours(laid: Laid, asked: Asked) -> Settled:
+    """The kind by its recall of nearest neighbours, where the checkpoint keeps no touches to find winners of."""
+    why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
+    if asked.kind is not None:
+        return Settled(asked.kind, load_kind(asked.kind).parameters_type(), f"It was asked for. {why}", None)
+    # Without a budget nothing is measured, so no vector need be read.
+    vectors = laid.vectors[:0] if asked.max_ms is None else laid.vectors[np.unique(laid.slots)]
+    choice = choose_kind(vectors, asked.max_ms, min_recall=asked.target, threads=torch.get_num_threads())
+    return Settled(choice.kind, choice.parameters, f"{choice.reason} {why}", None)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import expit, log_expit
 
 from retrieval.errors import BadInput, NumericalError
 
@@ -38,12 +37,19 @@ class Calibration:
     ece_after: float
 
     def log_odds(self, logit: ArrayLike, grasps: int = 1) -> NDArray[np.float64]:
-        """Calibrated log-odds of a sum of `grasps` match logits (the grasps taken as independent)."""
-        return self.slope * np.asarray(logit, dtype=np.float64) + grasps * self.intercept
+        """Calibrated log-odds of a sum of `grasps` match logits (the grasps taken as independent).
+
+        Raises NumericalError for a logit that is not finite: it is not above any threshold, and would count as "no
+        match".
+        """
+        z = np.asarray(logit, dtype=np.float64)
+        if not np.isfinite(z).all():
+            raise NumericalError(f"every logit must be finite to be calibrated; got {z[~np.isfinite(z)][0]}")
+        return self.slope * z + grasps * self.intercept
 
     def probability(self, logit: ArrayLike, grasps: int = 1) -> NDArray[np.float64]:
         """Probability of a match at even odds, for people; never rank by it."""
-        return np.asarray(expit(self.log_odds(logit, grasps)))
+        return _expit(self.log_odds(logit, grasps))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
@@ -103,7 +109,7 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
     z = z - centre
 
     def slack(slope: float, intercept: float) -> NDArray[np.float64]:
-        return np.asarray(weights * (expit(slope * z + intercept) - targets))
+        return np.asarray(weights * (_expit(slope * z + intercept) - targets))
 
     def best_intercept(slope: float) -> float:
         reach = slope * float(np.abs(z).max()) + 50  # there every probability is 0 (or 1) and the targets are not
@@ -166,11 +172,17 @@ def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 
 
 def _nll(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    return float(-np.mean(np.where(y == 1, log_expit(x), log_expit(-x))))
+    return float(-np.mean(-np.logaddexp(0, np.where(y == 1, -x, x))))
 
 
 def _ece(x: NDArray[np.float64], y: NDArray[np.float64], bins: int = 15) -> float:
-    p = expit(x)
+    p = _expit(x)
     which = np.minimum((p * bins).astype(int), bins - 1)
     gaps = np.bincount(which, weights=p - y, minlength=bins)
     return float(np.abs(gaps).sum() / len(y))
+
+
+def _expit(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1 / (1 + exp(-x)) without overflow; scipy.special has it too, at a fifth of a second a query for its import."""
+    small = np.exp(-np.abs(x))
+    return np.asarray(np.where(x >= 0, 1, small) / (1 + small))

@@ -7,20 +7,20 @@
                                     give a key, the photo's own wins
 
 Names that start with a dot are ignored. A photo's stable id is its path in the catalogue, forward slashes.
-Listing opens no photo; `read_photos` reads them one at a time, and one broken file never stops the rest.
+Listing opens no photo; `read_photo` reads one, and one broken file never stops the rest.
 """
 
 import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
 
 from retrieval.errors import DatasetError, ImageError
-from retrieval.images import EXTENSIONS, RgbImage, decode_rgb, read_bytes
+from retrieval.images import EXTENSIONS, decode_rgb, read_bytes
+from retrieval.resize import RgbImage
 
 METADATA_FILE = "metadata.jsonl"
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
@@ -89,19 +89,17 @@ def list_catalogue(folder: str | Path) -> Catalogue:
     return Catalogue(root, tuple(listed), tuple(ignored), tuple(walk.skipped), tuple(notes))
 
 
-def read_photos(catalogue: Catalogue) -> Iterator[PhotoBytes | SkippedPhoto]:
-    """Read each photo's bytes once, in order, only when asked for; an unreadable one is a SkippedPhoto."""
-    for photo in catalogue.photos:
-        try:
-            data = read_bytes(catalogue.folder / photo.path)
-        except ImageError as error:
-            yield SkippedPhoto(photo.path, error.reason)
-        else:
-            yield PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())
+def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
+    """Read a photo's bytes, once; an unreadable one is a SkippedPhoto."""
+    try:
+        data = read_bytes(catalogue.folder / photo.path)
+    except ImageError as error:
+        return SkippedPhoto(photo.path, error.reason)
+    return PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())
 
 
 def decode_photo(item: PhotoBytes | SkippedPhoto) -> RgbImage | SkippedPhoto:
-    """Decode what `read_photos` gave to (H, W, 3) float32, or say why it is left out."""
+    """Decode what `read_photo` gave to (H, W, 3) float32, or say why it is left out."""
     if isinstance(item, SkippedPhoto):
         return item
     try:
@@ -111,7 +109,7 @@ def decode_photo(item: PhotoBytes | SkippedPhoto) -> RgbImage | SkippedPhoto:
 
 
 def _is_photo(path: str) -> bool:
-    return PurePosixPath(path).suffix.lower() in EXTENSIONS
+    return os.path.splitext(path)[1].lower() in EXTENSIONS
 
 
 def _object_id(path: str) -> str:

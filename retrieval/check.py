@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from retrieval.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError, ImageError
-from retrieval.images import decode_rgb, read_bytes, resize
+from retrieval.images import decode_rgb, read_bytes
 from retrieval.progress import Bar
+from retrieval.resize import resize
 
 _THUMBNAIL = (6, 8)
 _SHOWN = 5

@@ -23,28 +23,32 @@ from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.fusion import Matcher
+from retrieval.stored import (
+    FORMAT,
+    HEADER,
+    Stored,
+    config_of,
+    file_digest,
+    matcher_header,
+    read_header,
+    unreadable,
+    unusable,
+)
 from retrieval.version import __version__
 
-FORMAT = 1
-_HEADER = "touch_retrieval"
 _QUERIES = "queries.touch_halves"
 
 
 @dataclass(frozen=True)
-class Checkpoint:
+class Checkpoint(Stored):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
-    digest: SHA-256 of the file. provenance: step, seed, data digest, metrics and so on, as written by training.
     queries: (Q, hidden) halves of touches of validation objects, by which an index can measure its own search.
     """
 
-    path: Path
-    digest: str
     matcher: Matcher
-    config: Config
     split: Split | None
     calibration: Calibration | None
-    provenance: dict[str, Any]
     queries: NDArray[np.float16] | None = None
 
 
@@ -105,39 +109,30 @@ def beside(path: Path, ending: str) -> Path:
     return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint. Raises CheckpointError with what is wrong and what to do."""
-    state, header = read_tensors(path)
-    if "task" in header:
-        raise CheckpointError(
-            f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
-            "`retrieve train` makes matchers"
-        )
-    lacking = [name for name in ("config", "split", "calibration", "provenance") if name not in header]
-    if lacking:
-        raise CheckpointError(
-            f"{path} is not a checkpoint: its header has no {lacking[0]}; a file in .state.safetensors is the state of "
-            "an unfinished training, the checkpoint lies beside it"
-        )
+def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
+    """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
+
+    known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
+    digest nor checksum is reckoned again.
+    """
+    state, header = read_tensors(path, check=known is None)
+    header = matcher_header(path, header)
+    about = known or Stored(path, file_digest(path), config_of(path, header), header["provenance"])
     try:
-        config = Config.from_dict(header["config"])
         split = None if header["split"] is None else Split.from_dict(header["split"])
         calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
-        matcher = Matcher(config.matcher)
         queries = state.pop(_QUERIES, None)
-        load_weights(matcher, state)
+        matcher = _matcher(about.config, state)
     except BadInput as error:
-        raise CheckpointError(f"{path} is not a checkpoint that this version can use: {error}") from error
-    return Checkpoint(
-        path,
-        file_digest(path),
-        matcher.eval(),
-        config,
-        split,
-        calibration,
-        header["provenance"],
-        None if queries is None else queries.numpy(),
-    )
+        raise unusable(path, error) from error
+    kept = None if queries is None else queries.numpy()
+    return Checkpoint(path, about.digest, about.config, about.provenance, matcher, split, calibration, kept)
+
+
+def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    matcher = Matcher(config.matcher)
+    load_weights(matcher, state)
+    return matcher.eval()
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
@@ -157,30 +152,21 @@ def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any
     content = {"format": FORMAT, "software": __version__, **header}
     text = json.dumps({**content, "sha256": _checksum(state, content)}, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, save(state, {_HEADER: text}))
+    write_atomically(path, save(state, {HEADER: text}))
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `write_tensors` wrote. Raises CheckpointError."""
-    if path.is_dir():
-        raise CheckpointError(f"{path} is a folder; give the .safetensors file of a checkpoint")
-    if not path.is_file():
-        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one")
+def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `write_tensors` wrote; check: that it is what was written. Raises CheckpointError."""
+    header = read_header(path)
     try:
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(_HEADER)
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is not a readable .safetensors file ({error}); it may be truncated") from error
-    if text is None:
-        raise CheckpointError(
-            f"{path} holds weights but not our header; only checkpoints of `retrieve train` work here "
-            "(give other weights to `retrieve train --init`)"
-        )
-    header = _parsed(path, text)
-    if header.pop("sha256", None) != _checksum(state, header):
+        raise unreadable(path, error) from error
+    checksum = header.pop("sha256", None)
+    if check and checksum != _checksum(state, header):
         raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
-    if any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
+    if check and any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
         raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
     return state, header
 
@@ -198,26 +184,6 @@ def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _parsed(path: Path, text: str) -> dict[str, Any]:
-    try:
-        header = json.loads(text)
-        version = header["format"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(f"the header of {path} is damaged ({error}); train again or restore the file") from error
-    if version != FORMAT:
-        raise CheckpointError(
-            f"{path} has checkpoint format {version}, this version reads {FORMAT}; install the touch-retrieval "
-            f"that wrote it ({header.get('software')}) or train again"
-        )
-    return dict(header)
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _temporary(path: Path) -> Path:

@@ -8,16 +8,14 @@ import dataclasses
 import json
 import logging
 import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from retrieval.arguments import build_parser
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.interruption import noticed_interrupts
 from retrieval.progress import Bar
 
 if TYPE_CHECKING:
@@ -33,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _replace_closed_streams()
     arguments = build_parser().parse_args(argv)
     logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING)
-    with _noticed_interrupts() as interrupts:
+    with noticed_interrupts() as interrupts:
         try:
             COMMANDS[arguments.command](arguments)
             sys.stdout.flush()
@@ -66,26 +64,6 @@ def _replace_closed_streams() -> None:
     """A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout."""
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-
-
-@contextmanager
-def _noticed_interrupts() -> Iterator[list[int]]:
-    """The Ctrl-C signals so far; each raises KeyboardInterrupt as usual. One that breaks off an import may come out as
-    another error: numpy.linalg half loaded raises RecursionError."""
-    seen: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield seen
-        return
-
-    def on_interrupt(number: int, frame: object) -> None:
-        seen.append(number)
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield seen
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _fail(arguments: argparse.Namespace, message: str, code: int) -> int:
@@ -143,8 +121,8 @@ def _load_gate(path: Path | None) -> tuple[Any, str | None]:
     """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
     if path is None:
         return None, None
-    from retrieval.checkpoint import file_digest
     from retrieval.grasp_success import load_gate
+    from retrieval.stored import file_digest
 
     gate = load_gate(path)
     return gate, f"learned, sha256 {file_digest(path)}"
@@ -282,6 +260,7 @@ def run_build_index(arguments: argparse.Namespace) -> None:
         load_checkpoint(path),
         arguments.out,
         kind=arguments.kind,
+        min_recall=arguments.min_recall,
         max_ms=arguments.max_ms,
     )
     defaults.remember("index", arguments.out)
@@ -308,7 +287,7 @@ def run_query(arguments: argparse.Namespace) -> None:
         candidates=arguments.candidates,
     )
     if arguments.html:
-        from retrieval.report import query_html
+        from retrieval.report.query import query_html
 
         arguments.html.parent.mkdir(parents=True, exist_ok=True)
         arguments.html.write_text(query_html(result, searcher.catalogue), "utf-8")
@@ -317,18 +296,32 @@ def run_query(arguments: argparse.Namespace) -> None:
     if arguments.json:
         _print_json(result.to_dict())
         return
-    from retrieval.report import print_table
+    from retrieval.report.terminal import print_table
 
     print_table(result)
     if result.verdict == "no match":
         _say("no photo is above the reject threshold: the object may not be in the catalogue")
 
 
+def run_export(arguments: argparse.Namespace) -> None:
+    """`retrieve export`."""
+    from retrieval import defaults
+    from retrieval.checkpoint import load_checkpoint
+    from retrieval.export import export
+
+    path, why = defaults.find_model(arguments.model)
+    _say(f"model: {path} ({why})")
+    result = export(load_checkpoint(path), arguments.out)
+    _say(str(result))
+    if arguments.json:
+        _print_json(dataclasses.asdict(result))
+
+
 def run_evaluate(arguments: argparse.Namespace) -> None:
     """`retrieve evaluate`."""
     from retrieval.evaluation.run import evaluate
     from retrieval.methods import METHODS
-    from retrieval.report import write_report
+    from retrieval.report.evaluation import write_report
 
     if arguments.model and (arguments.config or arguments.init):
         raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
@@ -353,6 +346,32 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
         _print_json(results)
 
 
+def run_frontier(arguments: argparse.Namespace) -> None:
+    """`retrieve frontier`."""
+    from retrieval import frontier_report
+
+    if arguments.stability:
+        from robot import hard_cases
+
+        document = frontier_report.report_stability(arguments.out, robot=hard_cases.hard_cases)
+    else:
+        from robot.sim.frontier import closing_points, contact_points
+        from robot.sim.photometric import optics_points
+
+        document = frontier_report.report_frontier(
+            arguments.out,
+            model=arguments.model,
+            recording=arguments.recording,
+            simulation={"contact": contact_points, "closing": closing_points, "gel_optics": optics_points},
+            only=arguments.only,
+            quick=arguments.quick,
+        )
+    if arguments.json:
+        _print_json(document)
+    if document.get("failed"):
+        raise RetrievalError(f"{document['failed']} of {len(document['cases'])} hard cases do not hold; see the page")
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "demo": run_demo,
     "collect": run_collect,
@@ -361,7 +380,9 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "train": run_train,
     "build-index": run_build_index,
     "query": run_query,
+    "export": run_export,
     "evaluate": run_evaluate,
+    "frontier": run_frontier,
 }
 
 

@@ -54,7 +54,8 @@ class TrainingConfig:
     paper. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way round would; not in
     the paper. freeze_batch_norm: keep the batch
     statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
-    encoded once for the whole training. validation_fraction, test_fraction: shares of the objects.
+    encoded once for the whole training. distil_steps: steps of teaching the pruner after training, where the matcher
+    has one (`retrieval.distil`). validation_fraction, test_fraction: shares of the objects.
     """
 
     init: str = "imagenet"
@@ -69,6 +70,7 @@ class TrainingConfig:
     shuffle_fingers: bool = False
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
+    distil_steps: int = 600
     validation_fraction: float = 0.1
     test_fraction: float = 0.184
     validate_every: int = 500
@@ -81,6 +83,7 @@ class TrainingConfig:
             "touches_per_batch",
             "positives_per_touch",
             "negatives_per_touch",
+            "distil_steps",
             "validate_every",
         ):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")

@@ -1,14 +1,24 @@
-"""Images in, halves and embeddings out: the forward pass of the towers, in batches."""
+"""Images in, halves and embeddings out: the forward pass of the towers, in batches.
 
+Nothing is learned here, so the towers run in another form than in training: batch normalisation folded into the
+convolution before it, weights laid out with channels last. The arithmetic stays float32 on every machine: bfloat16,
+where hardware multiplies it, moves the shipped checkpoint's halves by up to an eighth of the largest, and a query
+there would not meet an index made elsewhere.
+"""
+
+import copy
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from itertools import islice
+from dataclasses import dataclass
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from retrieval.errors import ConfigError
 from retrieval.fusion import Code, Matcher
@@ -28,16 +38,104 @@ def touch_batch(touches: Sequence[Sequence[Image]], device: torch.device | str =
     return stacked.permute(0, 1, 4, 2, 3).to(device)
 
 
+TOWERS = ("touch_tower", "photo_tower")
+
+
+def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
+    """A matcher that gives the same halves and embeddings faster; for forward passes without gradients.
+
+    Its towers are copies, made again only after a weight of theirs changed; the rest is shared. Their features are as
+    near to the exact ones as the plain towers' are: on the shipped checkpoint the two differ by 1e-5 of the largest
+    at most. A tower in training mode, whose batch normalisation looks at the batch, stays as it is.
+    """
+    fast = copy.copy(matcher)
+    fast._modules = dict(matcher._modules)
+    for name in towers:
+        fast.add_module(name, _prepared(matcher.get_submodule(name)))
+    return fast
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A tower as it runs fastest; made from `tensors`, kept so that no other takes their identity, at `versions`."""
+
+    tensors: list[Tensor]
+    versions: list[tuple[int, int]]
+    tower: nn.Module
+
+
+_cache: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
+
+
+def _prepared(tower: nn.Module) -> nn.Module:
+    if tower.training:
+        return tower
+    tensors = _tensors(tower)
+    versions = [(tensor.data_ptr(), 0 if tensor.is_inference() else tensor._version) for tensor in tensors]
+    kept = _cache.get(tower)
+    if kept is None or kept.versions != versions or list(map(id, kept.tensors)) != list(map(id, tensors)):
+        kept = _cache[tower] = _Prepared(tensors, versions, _folded(tower))
+    return kept.tower
+
+
+def _tensors(tower: nn.Module) -> list[Tensor]:
+    """Weights and buffers; `parameters()` and `buffers()` take three times as long, a twentieth of a forward pass."""
+    both = ((module._parameters, module._buffers) for module in tower.modules())
+    return [tensor for pair in both for group in pair for tensor in group.values() if tensor is not None]
+
+
+def _folded(module: nn.Module) -> nn.Module:
+    """A twin that shares all tensors but those of convolutions, which have channels last and have taken in the batch
+    normalisation that is registered right after them. Copying everything takes ten times as long."""
+    twin = _twin(module)
+    children = list(module.named_children())
+    for name, child in children:
+        twin._modules[name] = _folded(child)
+    for (name, child), (after, normalisation) in itertools.pairwise(children):
+        if isinstance(child, nn.Conv2d) and isinstance(normalisation, nn.BatchNorm2d):
+            twin._modules[name], twin._modules[after] = _fused(child, normalisation), nn.Identity()
+    return twin
+
+
+def _twin(module: nn.Module) -> nn.Module:
+    twin = copy.copy(module)
+    twin._modules, twin._parameters = dict(module._modules), dict(module._parameters)
+    if isinstance(twin, nn.Conv2d):
+        twin.weight = _channels_last(twin.weight)
+    return twin
+
+
+def _fused(convolution: nn.Conv2d, norm: nn.BatchNorm2d) -> nn.Module:
+    twin = _twin(convolution)
+    weight, twin.bias = fuse_conv_bn_weights(
+        convolution.weight,
+        convolution.bias,
+        norm.get_buffer("running_mean"),
+        norm.get_buffer("running_var"),
+        norm.eps,
+        norm.weight,
+        norm.bias,
+    )
+    twin.weight = _channels_last(weight)
+    return twin
+
+
+def _channels_last(weight: Tensor) -> nn.Parameter:
+    return nn.Parameter(weight.detach().contiguous(memory_format=torch.channels_last), requires_grad=False)
+
+
 def touch_features(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Tensor:
     """Features (B, fingers * features) of touches, each a sequence of finger images (H, W, 3) in 0..1."""
-    device = next(matcher.parameters()).device
-    return _in_batches(touches, batch, lambda part: matcher.touch_features(touch_batch(part, device)))
+    fast = for_inference(matcher, ["touch_tower"])
+    device = next(fast.parameters()).device
+    return _in_batches(touches, batch, lambda part: fast.touch_features(touch_batch(part, device)))
 
 
 def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Tensor:
     """Features (B, features) of photos (H, W, 3) in 0..1."""
-    device = next(matcher.parameters()).device
-    return _in_batches(photos, batch, lambda part: matcher.photo_features(to_batch(part, device)))
+    fast = for_inference(matcher, ["photo_tower"])
+    device = next(fast.parameters()).device
+    return _in_batches(photos, batch, lambda part: fast.photo_features(to_batch(part, device)))
 
 
 @torch.inference_mode()
@@ -54,6 +152,21 @@ def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) ->
     return Code(code.half.cpu(), code.embedding.cpu())
 
 
+class TorchEncoder:
+    """The touch encoder of one query after another: `encode_touches` of a model that does not change."""
+
+    name = "torch"
+
+    def __init__(self, matcher: Matcher) -> None:
+        self._fast = for_inference(matcher, ["touch_tower"])
+
+    @torch.inference_mode()
+    def encode(self, touches: Sequence[Sequence[Image]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Halves (B, hidden) and embeddings (B, embedding_dim) of touches."""
+        code = self._fast.touch_entry(self._fast.touch_features(touch_batch(touches)))
+        return code.half.numpy(), code.embedding.numpy()
+
+
 @torch.inference_mode()
 def _in_batches(items: Iterable[T], batch: int, encode: Callable[[list[T]], Tensor]) -> Tensor:
     return torch.cat([encode(part) for part in batches(items, batch)])
@@ -62,7 +175,7 @@ def _in_batches(items: Iterable[T], batch: int, encode: Callable[[list[T]], Tens
 def batches(items: Iterable[T], size: int) -> Iterator[list[T]]:
     """Lists of `size` items, the last one shorter."""
     iterator = iter(items)
-    while part := list(islice(iterator, size)):
+    while part := list(itertools.islice(iterator, size)):
         yield part
 
 

@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retrieval.batches import BatchImages
-from retrieval.checkpoint import file_digest, read_tensors, tensors_digest, write_tensors
+from retrieval.checkpoint import read_tensors, tensors_digest, write_tensors
 from retrieval.config import Config
 from retrieval.dataset import Grasp
 from retrieval.encode import batches, default_device, photo_features, touch_features
-from retrieval.errors import BadInput, CheckpointError, DatasetError
+from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
 from retrieval.fusion import Matcher
-from retrieval.images import Preprocessing, RgbImage, read_rgb, resize
+from retrieval.images import Preprocessing, read_rgb
 from retrieval.progress import Bar
+from retrieval.resize import RgbImage, resize
+from retrieval.stored import file_digest
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -41,7 +43,8 @@ class Features:
     """Tower features of grasps: what every method is fitted on and judged by. One row per grasp.
 
     grasp_ids, object_ids: of each row. touch (G, fingers, F_touch) and photo (G, F_photo), float32; the photo is the
-    one taken before that grasp. Raises BadInput for arrays of other shapes or types.
+    one taken before that grasp. Raises BadInput for arrays of other shapes or types, NumericalError for a feature that
+    is not finite, its grasp named.
     """
 
     grasp_ids: tuple[str, ...]
@@ -58,6 +61,13 @@ class Features:
             )
         if self.touch.dtype != np.float32 or self.photo.dtype != np.float32:
             raise BadInput(f"features must be float32; got touch {self.touch.dtype}, photo {self.photo.dtype}")
+        for what, part in (("touch", self.touch), ("photo", self.photo)):
+            bad = np.flatnonzero(~np.isfinite(part).reshape(len(part), -1).all(axis=1))
+            if len(bad):
+                raise NumericalError(
+                    f"{what} features must be finite; grasp {self.grasp_ids[bad[0]]} has a NaN or infinite one: the "
+                    "tower has diverged, or its weights are damaged"
+                )
 
     def __len__(self) -> int:
         return len(self.grasp_ids)

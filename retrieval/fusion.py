@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.config import MatcherConfig
-from retrieval.errors import BadInput, NumericalError
+from retrieval.errors import BadInput
+from retrieval.judge import Judge
 from retrieval.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.pruner import Pruner
 from retrieval.towers import build_tower
@@ -130,38 +131,18 @@ def _unit(x: Tensor) -> Tensor:
     return functional.normalize(x.float(), dim=-1, eps=1e-6)
 
 
-@torch.inference_mode()
+def judge_of(head: FusionHead) -> Judge:
+    """What follows the halves of a head, dropout off whatever its mode; a view of its weights where they lie on the
+    CPU."""
+    parts = (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
+    return Judge(*(part.detach().cpu().numpy() for part in parts))
+
+
 def score_halves(
     head: FusionHead,
     touch_halves: Tensor,
     photo_halves: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
-    block: int = 4096,
 ) -> NDArray[np.float32]:
-    """Sum over grasps of the match logits of the photos at `rows` (all where None): (len(rows),), higher is better.
-
-    touch_halves (G, hidden) of G grasps of ONE object; photo_halves (N, hidden) in any float type, memory-mapped or
-    not, read in blocks and reckoned with in float32. Adding logits takes the grasps as independent given the object,
-    and a flat prior. Dropout is off whatever the mode of `head`. Raises NumericalError for a NaN or infinite logit:
-    sorting would rank it first.
-    """
-    count = len(photo_halves) if rows is None else len(rows)
-    scores = np.empty(count, dtype=np.float32)
-    for start in range(0, count, block):
-        stop = min(start + block, count)
-        part = photo_halves[start:stop] if rows is None else photo_halves[rows[start:stop]]
-        photos = torch.from_numpy(np.array(part, dtype=np.float32))
-        scores[start:stop] = _sum_of_logits(head, touch_halves, photos).numpy()
-    if not np.isfinite(scores).all():
-        bad = int(np.flatnonzero(~np.isfinite(scores))[0])
-        name = bad if rows is None else int(rows[bad])
-        raise NumericalError(f"every match logit must be finite; photo row {name} has {scores[bad]}")
-    return scores
-
-
-def _sum_of_logits(head: FusionHead, touch_halves: Tensor, photos: Tensor) -> Tensor:
-    total = torch.zeros(len(photos))
-    for touch_half in touch_halves:
-        hidden = functional.relu(touch_half + photos)
-        total += head.out(functional.relu(head.second(hidden))).squeeze(-1)
-    return total
+    """`Judge.logits` of a head in PyTorch and touch halves (G, hidden)."""
+    return judge_of(head).logits(touch_halves.detach().cpu().numpy(), photo_halves, rows)

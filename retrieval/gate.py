@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from retrieval.checkpoint import load_weights, read_tensors
 from retrieval.encode import one_thread, touch_batch
-from retrieval.errors import BadInput, CheckpointError, ConfigError
+from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.images import Preprocessing, to_float
 
 TASK = "grasp-success"
@@ -104,10 +104,19 @@ class Gate:
 
     @torch.inference_mode()
     def judge(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
-        """Logits of grasps, each a sequence of its fingers' differences."""
+        """Logits of grasps, each a sequence of its fingers' differences. Raises NumericalError for a NaN or infinite
+        one: it is not above 0, and the grasp would count as failed."""
         with one_thread():
-            logits: list[list[float]] = self.net(touch_batch(differences)).tolist()
-        return logits
+            logits = self.net(touch_batch(differences))
+        bad = torch.nonzero(~torch.isfinite(logits))
+        if len(bad):
+            grasp, finger = bad[0].tolist()
+            raise NumericalError(
+                f"every logit of a gate must be finite; finger {finger} of grasp {grasp} has "
+                f"{logits[grasp, finger].item()}; train the gate again"
+            )
+        found: list[list[float]] = logits.tolist()
+        return found
 
     def _difference(self, finger: str, frames: FingerFrames) -> NDArray[np.float32]:
         judged, before = getattr(frames, self.settings.frame), frames.before

@@ -16,7 +16,6 @@ import threading
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,9 +24,7 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
-
-RgbImage = npt.NDArray[np.float32]
-"""(H, W, 3) float32, red first, 0..1 (-1..1 after a background was subtracted)."""
+from retrieval.resize import RgbImage, check_rgb, resize
 
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 MAX_PIXELS = 50_000_000
@@ -40,7 +37,32 @@ _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF or WebP picture, or its header is damage
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"})
 _ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
-_warnings_lock = threading.Lock()  # warnings.catch_warnings changes the state of the whole process
+
+
+class _Quiet:
+    """No warnings while any thread is inside. The filters belong to the whole process: `warnings.catch_warnings` in
+    each thread would let them be put back in the wrong order, and a lock around it would decode one picture at a
+    time."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._filters = threading.Lock(), 0, warnings.catch_warnings()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._filters = warnings.catch_warnings()
+                self._filters.__enter__()
+                warnings.simplefilter("ignore")
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._filters.__exit__(None, None, None)
+
+
+_quiet = _Quiet()
 
 
 # Reading ---------------------------------------------------------------------------------------------
@@ -101,8 +123,7 @@ def _reason(error: BaseException) -> str:
 
 def _decode(data: bytes, name: str | Path) -> RgbImage:
     _check_pixels(_webp_size(data), name)
-    with _warnings_lock, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with _quiet:
         try:
             image = Image.open(io.BytesIO(data), formats=_FORMATS)
         except Image.DecompressionBombError:
@@ -222,67 +243,6 @@ def _upright(image: RgbImage, orientation: int) -> RgbImage:
     return image[::rows, ::columns]
 
 
-# Resizing --------------------------------------------------------------------------------------------
-
-
-def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
-    """Resize `image` (H, W, 3) float32 to `size` = (height, width) pixels.
-
-    Aspect is not kept and nothing is cropped: the paper tried cropping and found it worse.
-    An axis that shrinks is averaged over the exact area of each new pixel, an axis that grows is interpolated
-    linearly between pixel centres (the edge repeats), an equal axis is left as it is. Each axis is one sparse
-    matrix whose rows sum to 1, so a constant stays constant (cv2.INTER_AREA drops overlaps below 0.001 pixel:
-    5000 to 4999 turns 1.0 into 0.9992). float32 sums of n samples: error below n * 6e-8. Raises BadInput.
-    """
-    _check_rgb(image, "image")
-    if min(size) < 1:
-        raise BadInput(f"the new size must be at least 1 x 1 pixel, got {size[0]} x {size[1]}")
-    for axis in sorted((0, 1), key=lambda axis: size[axis] / image.shape[axis]):  # shrink before growing
-        if image.shape[axis] != size[axis]:
-            image = _resize_axis(image, axis, size[axis])
-    return image
-
-
-def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
-    image = np.ascontiguousarray(image.swapaxes(0, axis))
-    mixed = _axis_weights(image.shape[0], length) @ image.reshape(image.shape[0], -1)
-    out: RgbImage = mixed.reshape(length, *image.shape[1:]).swapaxes(0, axis)
-    return np.ascontiguousarray(out)
-
-
-@lru_cache(maxsize=16)
-def _axis_weights(old: int, new: int) -> Any:
-    """(new, old) sparse float32 matrix that resizes one axis of `old` samples to `new`; its rows sum to 1."""
-    from scipy.sparse import csr_array
-
-    rows, columns, weights = (_area_weights if new < old else _linear_weights)(old, new)
-    return csr_array((weights.astype(np.float32), (rows, columns)), shape=(new, old))
-
-
-_Triplets = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]
-
-
-def _area_weights(old: int, new: int) -> _Triplets:
-    """Cut the axis, old * new units long, at all edges of old and new pixels: a piece lies in one of each."""
-    cuts = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)
-    return cuts[:-1] // old, cuts[:-1] // new, np.diff(cuts) / old
-
-
-def _linear_weights(old: int, new: int) -> _Triplets:
-    position = np.clip((np.arange(new) + 0.5) * (old / new) - 0.5, 0, old - 1)
-    left = np.minimum(position.astype(np.int64), max(old - 2, 0))
-    right = np.minimum(left + 1, old - 1)
-    share = position - left
-    rows = np.tile(np.arange(new), 2)
-    return rows, np.concatenate([left, right]), np.concatenate([1 - share, share])
-
-
-def _check_rgb(image: RgbImage, what: str) -> None:
-    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0 or image.dtype != np.float32:
-        shape = " x ".join(map(str, image.shape))
-        raise BadInput(f"{what} must be H x W x 3 float32 in 0..1, got {shape} {image.dtype}; see to_float")
-
-
 # The gel's background --------------------------------------------------------------------------------
 
 _SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
@@ -301,12 +261,12 @@ def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str
     brighter. Raises ConfigError for an unknown policy or a missing reference, BadInput for other shapes.
     """
     _check_policy(policy)
-    _check_rgb(touch, "touch")
+    check_rgb(touch, "touch")
     if policy == "none":
         return touch
     if reference is None:
         raise _missing_reference(policy)
-    _check_rgb(reference, "reference")
+    check_rgb(reference, "reference")
     if touch.shape != reference.shape:
         raise BadInput(f"touch and reference must have one shape, got {touch.shape} and {reference.shape}")
     return _SUBTRACT[policy](touch, reference)

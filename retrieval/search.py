@@ -2,10 +2,11 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,27 @@ from numpy.typing import NDArray
 from indexes.generation import Generation
 from indexes.store import IndexStore
 from retrieval import defaults
-from retrieval.build import fingerprint
 from retrieval.calibration import Calibration
-from retrieval.checkpoint import Checkpoint, file_digest, load_checkpoint
-from retrieval.encode import Image, encode_touches
-from retrieval.errors import BadInput, CheckpointError
-from retrieval.fusion import score_halves
+from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.judge import Judge
+from retrieval.onnx_encoder import exported_beside
+from retrieval.resize import RgbImage
+from retrieval.stored import Stored, file_digest, fingerprint, read_judge, read_stored
 
 DEFAULT_CANDIDATES = 1000
+DECODERS = 2  # a touch has as many images
+Floats = NDArray[np.float32]
+
+
+class Encoder(Protocol):
+    """What makes halves (G, hidden) and embeddings (G, embedding_dim) of touches: PyTorch or ONNX Runtime."""
+
+    @property
+    def name(self) -> str:
+        """How it is called in the answer."""
+
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
+        """Encode grasps, each its fingers' images."""
 
 
 @dataclass(frozen=True)
@@ -63,27 +77,31 @@ class QueryResult:
 class Searcher:
     """An opened index with its model, for any number of queries."""
 
-    def __init__(self, index: Path, generation: Generation, checkpoint: Checkpoint) -> None:
+    def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
         self.index, self.generation, self.checkpoint = index, generation, checkpoint
+        self.encoder, self.judge = encoder, judge
         self.calibration: Calibration | None = None
         if "calibration" in generation.documents:
             self.calibration = Calibration.from_dict(generation.documents["calibration"])
-        objects = [row["object_id"] for row in generation.rows]
-        self._object_names, self._object_of_row = np.unique(np.array(objects, dtype=str), return_inverse=True)
-        digests = [row["digest"] for row in generation.rows]
-        self._content = np.unique(digests, return_inverse=True)[1] if len(set(digests)) < len(digests) else None
+        self._object_of_row = generation.codes("object_id")
+        self._original = _originals(generation.codes("digest"))
+        self._threads = ThreadPoolExecutor(DECODERS, "decode")
 
     @classmethod
-    def open(cls, index: Path, *, model: str | Path | None = None, verify: bool = True) -> "Searcher":
+    def open(cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True) -> "Searcher":
         """Open the current generation of an index with the checkpoint that built it.
 
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
-        Raises the errors of `indexes.store.IndexStore.open`, CheckpointError, and MismatchedIndex for another model.
+        Touches are encoded by the export beside the checkpoint (`retrieval.export`) where there is one, and PyTorch is
+        not imported then. Raises the errors of `indexes.store.IndexStore.open`, CheckpointError, and MismatchedIndex
+        for another model.
         """
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
-        checkpoint = load_checkpoint(Path(model) if model else _model_of(generation))
-        generation.require(fingerprint(checkpoint))
-        return cls(index, generation, checkpoint)
+        stored = read_stored(Path(model) if model else _model_of(generation))
+        _require(generation, stored)
+        return cls(
+            Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
+        )
 
     @property
     def catalogue(self) -> Path:
@@ -102,24 +120,22 @@ class Searcher:
 
         touches: for each grasp its gel images, in finger order. background: the fingers' no-contact frames, for a
         model that subtracts them and for no other. top: objects to return. candidates: photos per grasp that the full
-        classifier judges, `top` at least; with no fewer than there are photos, or a model without trained embeddings,
-        it judges all of them and no candidate stage runs. Several grasps count as independent given the object: their
-        logits add. Raises BadInput, ImageError or NumericalError.
+        classifier judges, `top` at least, by default as many as the index was found to need; with no fewer than there
+        are photos, or a model without trained embeddings, it judges all of them and no candidate stage runs. Several
+        grasps count as independent given the object: their logits add. Raises BadInput, ImageError or NumericalError.
         """
-        limit = DEFAULT_CANDIDATES if candidates is None else candidates
+        limit = self.default_candidates if candidates is None else candidates
         if top < 1 or limit < 1 or not touches:
             raise BadInput(f"give at least one touch, top >= 1 and candidates >= 1; got {len(touches)}, {top}, {limit}")
         clock = _Clock()
         with clock("decode"):
-            references = self._references(background)
-            images = [self._load(touch, references) for touch in touches]
+            images = self._load(touches, self._references(background))
         with clock("encode"):
-            code = encode_touches(self.checkpoint.matcher, images)
+            touch_halves, embeddings = _finite(self.encoder.encode(images))
         with clock("candidates"):
-            rows = self._candidates(code.embedding.numpy(), max(limit, top))
+            rows = self._candidates(embeddings, max(limit, top))
         with clock("rerank"):
-            halves = self.generation.arrays["halves"]
-            logits = score_halves(self.checkpoint.matcher.head, code.half, halves, rows)
+            logits = self.judge.logits(touch_halves, self.generation.arrays["halves"], rows)
             judged = np.arange(self.generation.count) if rows is None else rows
             best = self._best_of_objects(judged, self._equal_for_equals(judged, logits), top)
         results = [self._match(rank, row, logit, len(touches)) for rank, (row, logit) in enumerate(best, start=1)]
@@ -130,6 +146,12 @@ class Searcher:
             verdict=self._verdict(results[0], len(touches)),
             results=results,
         )
+
+    @property
+    def default_candidates(self) -> int:
+        """Photos that the classifier judges where a query says no number: as measured on the index, else 1000."""
+        measured = self.generation.manifest.about.get("candidates")
+        return int(measured["k"]) if measured else DEFAULT_CANDIDATES
 
     def _references(self, background: Sequence[str | Path] | None) -> Sequence[str | Path | None]:
         """The no-contact frame of each finger, None for a model that looks at no such frame."""
@@ -143,9 +165,14 @@ class Searcher:
             raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
         return [None] * self._fingers if background is None else self._one_per_finger("background", background)
 
-    def _load(self, touch: Sequence[str | Path], references: Sequence[str | Path | None]) -> list[Image]:
+    def _load(
+        self, touches: Sequence[Sequence[str | Path]], references: Sequence[str | Path | None]
+    ) -> list[list[RgbImage]]:
+        """The images of all grasps, decoded side by side; of several bad files the first is told."""
         load = self.checkpoint.config.preprocessing.load_touch
-        return [load(*pair) for pair in zip(self._one_per_finger("touch", touch), references, strict=True)]
+        pairs = [list(zip(self._one_per_finger("touch", touch), references, strict=True)) for touch in touches]
+        jobs = [[self._threads.submit(load, *pair) for pair in touch] for touch in pairs]
+        return [[job.result() for job in touch] for touch in jobs]
 
     def _one_per_finger(self, what: str, files: Sequence[str | Path]) -> Sequence[str | Path]:
         if len(files) != self._fingers:
@@ -166,22 +193,34 @@ class Searcher:
         found = [rows for rows, _ in self.generation.search(embeddings, k)]
         return np.unique(np.concatenate(found))
 
-    def _equal_for_equals(self, rows: NDArray[np.int64], logits: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _equal_for_equals(self, rows: NDArray[np.int64], logits: Floats) -> Floats:
         """Photos of equal bytes have equal logits; a matrix product may round its last rows in another way."""
-        if self._content is None:
+        if self._original is None:
             return logits
-        _, first, group = np.unique(self._content[rows], return_index=True, return_inverse=True)
-        return logits[first][group]
+        original, of_original = self._original[rows], np.empty(self.generation.count, dtype=np.float32)
+        of_original[original[::-1]] = logits[::-1]  # the last assignment counts: that of the first equal photo
+        equal: Floats = of_original[original]
+        return equal
 
-    def _best_of_objects(
-        self, rows: NDArray[np.int64], logits: NDArray[np.float32], top: int
-    ) -> list[tuple[int, float]]:
+    def _best_of_objects(self, rows: NDArray[np.int64], logits: Floats, top: int) -> list[tuple[int, float]]:
         """(row, logit) of the best photo of each of the `top` best objects; ties by object, then by row."""
-        objects = self._object_of_row[rows]
-        order = np.lexsort((rows, objects, -logits))
-        _, first = np.unique(objects[order], return_index=True)
-        best = order[np.sort(first)[:top]]
-        return [(int(rows[place]), float(logits[place])) for place in best]
+        looked_at = 8 * top
+        while True:
+            near = _largest(logits, looked_at)
+            objects = self._object_of_row[rows[near]]
+            order = np.lexsort((rows[near], self._object_ranks(rows[near], logits[near]), -logits[near]))
+            _, first = np.unique(objects[order], return_index=True)
+            if len(first) >= top or len(near) == len(rows):
+                best = near[order[np.sort(first)[:top]]]
+                return [(int(rows[place]), float(logits[place])) for place in best]
+            looked_at *= 8
+
+    def _object_ranks(self, rows: NDArray[np.int64], logits: Floats) -> NDArray[np.int64]:
+        """Of each row, its object's place in the order of names; all 0 where no tie asks for it, as it parses rows."""
+        if len(np.unique(logits)) == len(logits):
+            return np.zeros(len(rows), dtype=np.int64)
+        names = np.array([self.generation.rows[row]["object_id"] for row in rows])
+        return np.unique(names, return_inverse=True)[1]
 
     def _match(self, rank: int, row_number: int, logit: float, grasps: int) -> Match:
         row = self.generation.rows[row_number]
@@ -200,12 +239,51 @@ class Searcher:
             "generation": self.generation.name,
             "kind": self.generation.manifest.kind,
             "photos": self.generation.count,
-            "objects": len(self._object_names),
+            "objects": int(self._object_of_row.max()) + 1,
             "scored": scored,
+            "encoder": self.encoder.name,
             "catalogue": str(self.catalogue),
             "model": str(self.checkpoint.path),
             "trained_on": self.checkpoint.provenance.get("source", "unknown"),
         }
+
+
+def _finite(code: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    for name, values in zip(("half", "embedding"), code, strict=True):
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(bad):
+            raise NumericalError(f"the {name} of touch {bad[0] + 1} holds a NaN or infinite number; the model is unfit")
+    return code
+
+
+def _originals(contents: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """For each photo the first one of equal bytes, which `contents` numbers; None where no two are equal."""
+    _, first = np.unique(contents, return_index=True)
+    return first[contents] if len(first) < len(contents) else None
+
+
+def _largest(values: Floats, count: int) -> NDArray[np.int64]:
+    """Places of the `count` largest values, and of all that equal the least of them."""
+    if count >= len(values):
+        return np.arange(len(values))
+    return np.flatnonzero(values >= np.partition(values, len(values) - count)[len(values) - count])
+
+
+def _require(generation: Generation, stored: Stored) -> None:
+    wanted = fingerprint(stored)
+    if wanted["checkpoint"] != generation.fingerprint.get("checkpoint"):
+        from retrieval.checkpoint import load_checkpoint
+
+        load_checkpoint(stored.path)  # a damaged one says so
+    generation.require(wanted)
+
+
+def _torch_encoder(stored: Stored) -> Encoder:
+    """The towers in PyTorch, whose import takes longer than all the rest."""
+    from retrieval.checkpoint import load_checkpoint
+    from retrieval.encode import TorchEncoder
+
+    return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher)
 
 
 def _model_of(generation: Generation) -> Path:

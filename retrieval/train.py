@@ -6,11 +6,8 @@ machine ends bit for bit where an unbroken run ends.
 
 import dataclasses
 import math
-import signal
 import threading
-from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 
 from retrieval import distributed
 from retrieval.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
@@ -45,10 +43,12 @@ from retrieval.dataset import (
     make_split,
     recording_source,
 )
+from retrieval.distil import add_pruner
 from retrieval.encode import default_device
 from retrieval.errors import CheckpointError, Interrupted, NumericalError
 from retrieval.features import Features, by_image
 from retrieval.fusion import Matcher
+from retrieval.interruption import interruption
 from retrieval.losses import contrastive_loss, listwise_loss, match_loss
 from retrieval.progress import Bar
 from retrieval.towers.weights import initialise_tower
@@ -122,7 +122,8 @@ class Trainer:
         self.data_digest = known.digest if known else data_digest(grasps)
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.matcher = build_matcher(config).to(self.device)
+        self.untaught = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, pruner_width=0))
+        self.matcher = build_matcher(self.untaught).to(self.device)
         trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
@@ -142,18 +143,22 @@ class Trainer:
             seed=settings.seed,
             positives=settings.positives_per_touch,
             negatives=settings.negatives_per_touch,
+            share_photos=not settings.freeze_towers,  # features that are kept cost nothing to draw from all objects
         )
 
     def run(self, quiet: bool = False) -> None:
         """Train from the current step to the last."""
         total = self.config.training.iterations
         quiet = quiet or distributed.rank() > 0
-        with (
-            interruption() as stop,
-            self.features,
-            Bar("train", total, "steps", done=self.step, quiet=quiet) as bar,
-        ):
-            upcoming = self._prepare(self.step) if self.step < total else None
+        with interruption() as stop, self.features:
+            if self.step < total:
+                self._steps(stop, quiet)
+            self._finish(stop, quiet)
+
+    def _steps(self, stop: threading.Event, quiet: bool) -> None:
+        total = self.config.training.iterations
+        with Bar("train", total, "steps", done=self.step, quiet=quiet) as bar:
+            upcoming: Future[Loaded] | None = self._prepare(self.step)
             while upcoming is not None:
                 loaded = upcoming.result()
                 upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
@@ -163,11 +168,30 @@ class Trainer:
                 # All ranks stop after the same step: one that went on would wait for the others for ever.
                 stopped = distributed.any_rank(stop.is_set(), self.device)
                 if stopped or self.step % self.config.training.validate_every == 0 or self.step == total:
-                    self._validate_and_save(finished=self.step == total)
+                    self._validate_and_save()
                 if stopped and self.step < total:
                     raise Interrupted(
                         f"stopped at step {self.step} of {total}; {self.out} is usable, --resume goes on from here"
                     )
+
+    def _finish(self, stop: threading.Event, quiet: bool) -> None:
+        """Add the pruner to the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
+        stopped = False
+        if not distributed.rank():
+            try:
+                self._add_pruner(stop, quiet)
+                state_path(self.out).unlink(missing_ok=True)
+            except Interrupted:
+                stopped = True
+        if distributed.any_rank(stopped, self.device):  # and no rank leaves before the files are there
+            raise Interrupted(f"stopped before the pruner was taught; {self.out} is usable, --resume teaches it")
+
+    def _add_pruner(self, stop: threading.Event, quiet: bool) -> None:
+        if not self.config.matcher.pruner_width:
+            return
+        train = [grasp for part in self.sampler.grasps for grasp in part]
+        held_out = self.validation.grasps if self.validation else []
+        add_pruner(self.out, self.config, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
 
     def _best_note(self) -> str:
         return "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
@@ -191,6 +215,8 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         distributed.average_gradients(self.matcher)
         self.optimizer.step()
+        # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
+        increment_version(list(self.matcher.parameters()))
         self.matcher.clamp_scale()
         self.step += 1
         return StepResult(loss.item(), pair_accuracy(logits.detach().cpu().numpy(), batch.labels))
@@ -203,22 +229,17 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = settings.learning_rate * factor
 
-    def _validate_and_save(self, finished: bool) -> None:
+    def _validate_and_save(self) -> None:
         distributed.average_buffers(self.matcher)
         metrics, calibration = self.validate()
         better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
         self.best = max(self.best, metrics.get("validation_auc", -math.inf))
         if not distributed.rank():
-            self._save(metrics, calibration, better, finished)
+            if better:
+                self._save_best(metrics, calibration)
+            if self.step < self.config.training.iterations or self.config.matcher.pruner_width:
+                self._save_state()
         distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
-
-    def _save(self, metrics: dict[str, float], calibration: Calibration | None, better: bool, finished: bool) -> None:
-        if better:
-            self._save_best(metrics, calibration)
-        if finished:
-            state_path(self.out).unlink(missing_ok=True)
-        else:
-            self._save_state()
 
     def validate(self) -> tuple[dict[str, float], Calibration | None]:
         """Judge the fixed validation pairs; nothing where the split has no validation objects."""
@@ -244,7 +265,7 @@ class Trainer:
         save_checkpoint(
             self.out,
             self.matcher,
-            self.config,
+            self.untaught,
             split=self.split,
             calibration=calibration,
             provenance=provenance,
@@ -279,7 +300,9 @@ class Trainer:
                     "configuration, or delete the file to start afresh"
                 )
         kept = self._own_checkpoint().matcher.state_dict()
-        self.matcher.load_state_dict({name: tensors.get(f"model.{name}", kept[name]) for name in kept})
+        self.matcher.load_state_dict(
+            {name: tensors.get(f"model.{name}", kept[name]) for name in self.matcher.state_dict()}
+        )
         for name, parameter in self.matcher.named_parameters():
             prefix = f"optimizer.{name}."
             kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
@@ -293,12 +316,8 @@ class Trainer:
         """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
         two writes): the steps since then are repeated to the same end."""
         kept = load_checkpoint(self.out)
-        identity = {
-            "config": kept.config.to_dict(),
-            "split": kept.split.to_dict() if kept.split else None,
-            "data_digest": kept.provenance.get("data_digest"),
-        }
-        if identity != self._identity():
+        mine = (kept.split, kept.provenance.get("data_digest")) == (self.split, self.data_digest)
+        if not mine or kept.config not in (self.untaught, self.config):  # before and after its pruner is taught
             raise CheckpointError(
                 f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
             )
@@ -374,22 +393,3 @@ def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> ND
         touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
         logits = matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index])
     return np.asarray(logits.cpu().numpy())
-
-
-@contextmanager
-def interruption() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second one raises KeyboardInterrupt as usual."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def on_interrupt(number: int, frame: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)

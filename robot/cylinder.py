@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from robot.cloud import Depth, Rays, Table, Thing, find_table, find_thing
 from robot.devices import RGBD, Box
-from robot.errors import PlanError
+from robot.errors import PlanError, RobotConfigError
 from robot.silhouette import fit_silhouette
 from robot.solids import CUT, Array, Block, Circle, Solid, Upright, fit_block, fit_circle, fit_lying, refine_circle
 
@@ -92,10 +92,14 @@ class CylinderFit:
 def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = None) -> CylinderFit:
     """Fit the cylinder of the largest thing on the table, inside `region` of the rig's frame where given.
 
-    extrinsics (4, 4): camera frame to rig frame, mm. Raises PlanError where nothing is seen, or too little to say.
+    extrinsics (4, 4): camera frame to rig frame, mm. Raises PlanError where nothing is seen, or too little to say,
+    RobotConfigError for extrinsics that are not finite.
     """
     if image.depth_m is None:
         raise PlanError("a cylinder needs a picture with depth; read the camera with depth=True")
+    if not np.isfinite(extrinsics).all():
+        numbers = np.asarray(extrinsics).tolist()
+        raise RobotConfigError(f"extrinsics must be finite, got {numbers}; calibrate the camera again")
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
     rays = Rays.of(image, np.asarray(extrinsics, np.float64))
     table = find_table(depth, rays)

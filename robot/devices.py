@@ -88,6 +88,11 @@ class Intrinsics:
     cx: float
     cy: float
 
+    def __post_init__(self) -> None:
+        """Raises DeviceError for focal lengths that are not above 0, or numbers that are not finite."""
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf and math.isfinite(self.cx + self.cy)):
+            raise DeviceError(f"intrinsics must be finite, with focal lengths above 0 pixels, got {self}")
+
 
 @dataclass(frozen=True, eq=False)
 class RGBD:
@@ -221,12 +226,17 @@ class Arm(Device):
                 lower, upper = self.workspace.lower, self.workspace.upper
                 raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
             self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
-            return self._move_to(pose, speed_mm_s)
+            return self._reached(self._move_to(pose, speed_mm_s))
 
     def pose(self) -> Pose:
         """Where the arm is now. Raises DeviceError."""
         with self._use("cannot say where it is"):
-            return self._pose()
+            return self._reached(self._pose())
+
+    def _reached(self, pose: Pose) -> Pose:
+        if not all(map(math.isfinite, pose.as_tuple())):
+            raise DeviceError(f"{self.name}: the pose that an arm reports must be finite, got {pose}")
+        return pose
 
     @abstractmethod
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:

@@ -21,13 +21,15 @@ import torch
 from numpy.typing import NDArray
 
 from retrieval.batches import BatchImages
+from retrieval.binomial import binomial_interval
 from retrieval.calibration import pair_accuracy
 from retrieval.config import load_config
 from retrieval.dataset import Grasp, PairSampler, Split, load_grasps
 from retrieval.encode import encode_photos, encode_touches
-from retrieval.evaluation.metrics import binomial_interval, guess_curve
+from retrieval.evaluation.metrics import guess_curve
 from retrieval.features import blurred
-from retrieval.images import read_rgb, resize
+from retrieval.images import read_rgb
+from retrieval.resize import resize
 from retrieval.train import train
 from robot.importers import load_importer
 

@@ -2,6 +2,8 @@
 
     python -m tests.shipped make FOLDER --init WEIGHTS   collect on the simulated rig, train, and store as float16 in
                                                          FOLDER/simulated-mobilenet.safetensors
+    python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
+                                                         recording and the features that `make` left in FOLDER
     python -m tests.shipped score FOLDER                 collect other objects into FOLDER/recording, and evaluate the
                                                          shipped checkpoint on them: FOLDER/report
 
@@ -15,12 +17,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from retrieval import cli, defaults
-from retrieval.checkpoint import Checkpoint, save_checkpoint
+from retrieval import cli, defaults, distil
+from retrieval.checkpoint import Checkpoint, load_checkpoint
 from retrieval.config import load_config
 from retrieval.dataset import Grasp, Split, data_digest, load_grasps, recording_source
-from retrieval.features import encode_recording
+from retrieval.encode import one_thread
+from retrieval.features import Features, encode_recording
+from retrieval.fusion import Matcher
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
 from retrieval.train import build_matcher
@@ -30,12 +35,14 @@ SEED_TRAINED, SEED_SCORED = 10_000, 30_000
 RIG = Path(__file__).with_name("shipped_rig.toml")
 VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
+DISTIL_STEPS = 1500
+"""Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
 FITTED = 10
 """Scored objects on which calibration and, as training objects, whatever else is fitted; the others are judged."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one of the two jobs."""
+    """Run one of the jobs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     jobs = parser.add_subparsers(dest="job", required=True)
     make = jobs.add_parser("make", help="collect and train the checkpoint that comes with the package")
@@ -44,6 +51,9 @@ def main(argv: list[str] | None = None) -> int:
     make.add_argument("--objects", type=int, default=1400)
     make.add_argument("--grasps", type=int, default=4)
     make.add_argument("--iterations", type=int, default=1500)
+    pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
+    pruner.add_argument("folder", type=Path)
+    pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
     score = jobs.add_parser("score", help="judge it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
@@ -52,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     for job in (make, score):
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    return make_shipped(arguments) if arguments.job == "make" else score_shipped(arguments)
+    return {"make": make_shipped, "distil": distil_shipped, "score": score_shipped}[arguments.job](arguments)
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
@@ -62,7 +72,8 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         return code
     grasps = load_grasps(recording)
     config = load_config("mobilenet")
-    training = dataclasses.replace(config.training, init=str(arguments.init), iterations=arguments.iterations)
+    taught = {"init": str(arguments.init), "iterations": arguments.iterations, "distil_steps": DISTIL_STEPS}
+    training = dataclasses.replace(config.training, **taught)
     config = dataclasses.replace(config, training=training)
     features = encode_recording(grasps, build_matcher(config).eval(), config, arguments.folder / "features")
     split = draw_split(grasps, train=None, validation=VALIDATION)
@@ -73,17 +84,36 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def distil_shipped(arguments: argparse.Namespace) -> int:
+    """Towers, head, calibration and split stay; the pruner reads the weights that are shipped, rounded as they are."""
+    shipped, preset = load_checkpoint(defaults.shipped_model()), load_config("mobilenet")
+    matcher = dataclasses.replace(shipped.config.matcher, pruner_width=preset.matcher.pruner_width)
+    training = dataclasses.replace(shipped.config.training, distil_steps=arguments.steps)
+    config = dataclasses.replace(shipped.config, matcher=matcher, training=training)
+    grasps = load_grasps(arguments.folder / "recording")
+    features = encode_recording(grasps, shipped.matcher, config, arguments.folder / "features")
+    assert shipped.split is not None
+    train, validation = (
+        halves(shipped.matcher, features.of_objects(part)) for part in (shipped.split.train, shipped.split.validation)
+    )
+    with one_thread():  # as training on features that stand still
+        made = distil.with_pruner(shipped, config, train, validation)
+    store(made, arguments.folder / defaults.SHIPPED)
+    return 0
+
+
+@torch.inference_mode()
+def halves(matcher: Matcher, features: Features) -> tuple[torch.Tensor, torch.Tensor]:
+    """Halves of touches and of photos (G, hidden)."""
+    touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
+    return matcher.touch_code(touch).half, matcher.photo_code(photo).half
+
+
 def store(made: Checkpoint, out: Path) -> None:
     """Write a checkpoint once more, as float16; where its first weights lay on this machine concerns nobody."""
     training = dataclasses.replace(made.config.training, init="imagenet")
-    save_checkpoint(
-        out,
-        made.matcher,
-        dataclasses.replace(made.config, training=training),
-        split=made.split,
-        calibration=made.calibration,
-        provenance=made.provenance,
-        float16=True,
+    distil.store(
+        dataclasses.replace(made, config=dataclasses.replace(made.config, training=training)), out, float16=True
     )
 
 

@@ -3,15 +3,17 @@
 import json
 import sys
 import time
+from importlib.util import find_spec
 
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import build, common, cylinder, rerank, step
+from tests.benchmarks import build, cold, common, cylinder, query, rerank, step
 from tests.conftest import TINY
 
 SMALLEST = {
     "rerank": (rerank.measure, {"candidates": (3, 40), "sample": 5, "repetitions": 1}, 2),
+    "query": (query.measure, {"photos": 40, "repetitions": 1}, 2 if find_spec("onnxruntime") else 1),
     "build": (build.measure, {"photos": 3, "photo_px": 64, "repetitions": 1}, 1),
     "step": (step.measure, {"touches": 2, "photos_each": 2, "repetitions": 1}, 1),
 }
@@ -31,6 +33,21 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
         assert str(line).startswith(f"{name}, small: ")
         assert all(value > 0 for value in line.figures.values())
         json.dumps(line.figures, allow_nan=False)
+
+
+def test_a_cold_query_is_told_step_by_step_for_each_backend(model):
+    lines = list(cold.measure(photos=12, repetitions=1, model=model))
+    assert len(lines) == 1 + SMALLEST["query"][2]
+    for line in lines[1:]:
+        steps = [name for name in line.figures if name.endswith(" ms")]
+        assert [f"{stage} ms" for stage in query.STAGES] == steps[-6:-2]
+        assert sum(line.figures[name] for name in steps) == pytest.approx(line.figures["total_ms"])
+
+
+def test_the_query_benchmark_of_the_shipped_model_ends_with_the_time_of_opening():
+    *queries, opening = query.measure_shipped(photos=40, repetitions=1)
+    assert len(queries) == SMALLEST["query"][2]
+    assert set(opening.figures) == {"photos", "open_s"}
 
 
 def test_the_table_of_cylinders_has_a_line_a_case():

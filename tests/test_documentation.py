@@ -49,10 +49,13 @@ def test_every_retrieve_command_of_the_readme_runs(home):
         "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
         "train": ["--iterations", "2"],
         "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
+        "frontier": ["--quick", "--only", "closing"],
     }
-    assert {line[1] for line in found} == {"import", *shorter, "check", "build-index", "query"}
+    assert {line[1] for line in found} == {"import", *shorter, "check", "build-index", "query", "export"}
     for line in found:
-        assert cli.main([*line[1:], *shorter.get(line[1], [])]) == 0, line
+        # An export that is not the faster one on this machine is refused, with exit code 1.
+        accepted = (0, 1) if line[1] == "export" else (0,)
+        assert cli.main([*line[1:], *shorter.get(line[1], [])]) in accepted, line
 
 
 def test_the_settings_in_the_readme_make_a_rig(tmp_path):

@@ -48,14 +48,16 @@ def test_a_thousand_copies_of_twenty_vectors_lose_naive_hnsw_and_not_ours(tmp_pa
         assert len(set(scores.tolist())) == 1
 
 
-@pytest.mark.parametrize("kind", ["hnsw", "ivf_flat", "ivf_pq"])
+@pytest.mark.parametrize("kind", ["hnsw", "ivf_flat", "ivf_sq8", "ivf_pq"])
 def test_approximate_kinds_find_most_of_the_best_in_clustered_data(kind):
     vectors = clustered(3000, 32, 60)
     index = load_kind(kind).build(vectors, threads=1)
     assert recall_against_exact(index, sample_queries(vectors, 100), 10) > 0.9
 
 
-@pytest.mark.parametrize(("kind", "setting"), [("hnsw", "ef_search"), ("ivf_flat", "probes"), ("ivf_pq", "refine")])
+@pytest.mark.parametrize(
+    ("kind", "setting"), [("hnsw", "ef_search"), ("ivf_flat", "probes"), ("ivf_sq8", "probes"), ("ivf_pq", "refine")]
+)
 def test_looking_further_finds_more(kind, setting):
     vectors = unit(2000, 32)
     index, queries = load_kind(kind).build(vectors, threads=1), sample_queries(vectors, 100)

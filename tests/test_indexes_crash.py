@@ -17,7 +17,7 @@ from indexes.generation import Generation
 from indexes.store import IndexStore
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 
-STEPS = ("fsync", "rename", "replace", "mkdir", "unlink", "rmdir")
+STEPS = ("fsync", "rename", "replace", "link", "mkdir", "unlink", "rmdir")
 
 KILLED_AT_EVERY_STEP = """
 import json, os, shutil, signal, sys
@@ -27,12 +27,15 @@ from indexes.store import IndexStore
 
 STEPS = json.loads(sys.argv[2])
 base, work = Path(sys.argv[1]) / "base", Path(sys.argv[1]) / "work"
-OLD, NEW = ["a", "b", "c"], ["b", "d"]
+NAMES = [f"{number:02d}" for number in range(40)]
+OLD, NEW = json.loads(sys.argv[3])
 
-def write(path, ids):
-    vectors = np.eye(4, dtype=np.float32)[["abcd".index(name) for name in ids]]
-    rows = [{"id": name} for name in ids]
-    more = {"fingerprint": {}, "kind": "exact"}
+def write(path, ids, parent=None):
+    # The vectors of rows that the parent has come from there.
+    known = parent.reusable(dict.fromkeys(ids, "1")) if parent else {}
+    vectors = np.eye(40, dtype=np.float32)[[NAMES.index(name) for name in ids if name not in known]].reshape(-1, 40)
+    rows = [{"id": name, "digest": "1"} for name in ids]
+    more = {"fingerprint": {}, "kind": "exact", "parent": parent}
     IndexStore(path).write(rows, vectors, {"halves": vectors}, {"calibration": {}}, **more)
 
 def killed(path, number):
@@ -47,7 +50,7 @@ def killed(path, number):
         return call
     for name in STEPS:
         setattr(os, name, wrapped(getattr(os, name)))
-    write(path, NEW)
+    write(path, NEW, parent)
     os._exit(0)
 
 for _ in range(3):
@@ -58,6 +61,7 @@ while not alive:
     number += 1
     shutil.rmtree(work, ignore_errors=True)
     shutil.copytree(base, work)
+    parent = IndexStore(work).open() if sys.argv[4] == "grown" else None
     child = os.fork()
     if child == 0:
         killed(work, number)
@@ -65,6 +69,7 @@ while not alive:
     store = IndexStore(work)
     found = store.open()
     found.self_check()
+    assert np.array_equal(found.arrays["halves"], np.eye(40)[[NAMES.index(row["id"]) for row in found.rows]])
     ids = [row["id"] for row in found.rows]
     seen.append("old" if ids == OLD else "new" if ids == NEW else "broken")
     write(work, NEW)
@@ -87,8 +92,19 @@ def run(program: str, *arguments: str) -> str:
     return done.stdout
 
 
-def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_whole(tmp_path):
-    seen = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS)))
+NAMES = [f"{number:02d}" for number in range(40)]
+CHANGES = {
+    "fresh": (["00", "01", "02"], ["01", "03"]),
+    "grown": (NAMES[:30], NAMES[2:33]),  # the parent's files are shared, rows are removed and added
+    "joined": (NAMES[:3], NAMES[:20]),  # the new segment takes in the old one
+    "compacted": (NAMES[:30], NAMES[9:31]),
+}
+
+
+@pytest.mark.parametrize("how", CHANGES)
+def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_whole(tmp_path, how):
+    states, parent = json.dumps(CHANGES[how]), "fresh" if how == "fresh" else "grown"
+    seen = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS), states, parent))
     assert set(seen) == {"old", "new"}
     assert seen == sorted(seen, reverse=True)  # the switch happens once: old up to it, new after it
     assert len(seen) > 15
@@ -151,12 +167,15 @@ class Steps:
 def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
     filled(tmp_path)
     steps = Steps(monkeypatch, None)
-    filled(tmp_path, arrays={"halves": np.ones((20, 2))}, documents={"calibration": {}})
+    filled(tmp_path, kind="hnsw", arrays={"halves": np.ones((20, 2))}, documents={"calibration": {}})
     beside, suffix = f"CURRENT.tmp-{os.getpid()}", f".tmp-{os.getpid()}"
     calls = [call for call in steps.calls if call[0] != "mkdir"]
-    content = ["rows.jsonl", "embeddings.npy", "halves.npy", "calibration.json", "vectors.faiss"]
     assert calls == [
-        *(("fsync", name) for name in content),
+        *(("fsync", f"{name}.new") for name in ("rows", "embeddings", "halves")),
+        ("rename", "rows.new"),
+        ("fsync", "table-000002.npy"),
+        *(("rename", f"{name}.new") for name in ("halves", "embeddings")),
+        *(("fsync", name) for name in ("calibration.json", "vectors.faiss")),
         ("fsync", "manifest.json"),
         ("fsync", f"gen-000002{suffix}"),
         ("rename", f"gen-000002{suffix}"),

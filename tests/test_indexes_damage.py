@@ -12,7 +12,8 @@ from indexes.manifest import _own_digest
 from indexes.store import IndexStore
 from tests.test_indexes_store import FINGERPRINT, filled, unit
 
-FILES = ["manifest.json", "rows.jsonl", "embeddings.npy", "vectors.faiss", "halves.npy", "calibration.json"]
+SEGMENT = ["rows-000001.jsonl", "table-000001.npy", "embeddings-000001.npy", "halves-000001.npy"]
+FILES = ["manifest.json", "vectors.faiss", "calibration.json", *SEGMENT]
 
 
 @pytest.fixture
@@ -143,25 +144,28 @@ def test_without_verifying_the_content_is_trusted(folder):
         reopened(folder)
 
 
-@pytest.mark.parametrize("name", ["rows.jsonl", "embeddings.npy", "vectors.faiss", "halves.npy"])
+@pytest.mark.parametrize("name", ["vectors.faiss", *SEGMENT])
 def test_garbage_of_the_right_size_never_escapes_as_a_raw_exception(folder, name):
     path = folder / name
     path.write_bytes(b"\x93" * path.stat().st_size)
     with pytest.raises(CorruptIndex):
-        reopened(folder, verify=False)
+        reopened(folder, verify=False).rows[3]  # rows are read when somebody looks
 
 
 def test_a_pickled_array_is_not_loaded(folder):
-    path = folder / "halves.npy"
+    path = folder / "halves-000001.npy"
     np.save(path, np.array([{"a": 1}] * 20, dtype=object), allow_pickle=True)
     files = json.loads((folder / "manifest.json").read_text())["files"]
-    files["halves.npy"]["bytes"] = path.stat().st_size
+    files["halves-000001.npy"]["bytes"] = path.stat().st_size
     rewrite_manifest(folder, files=files)
     with pytest.raises(CorruptIndex, match="cannot be read"):
         reopened(folder, verify=False)
 
 
-@pytest.mark.parametrize(("version", "words"), [(2, "has format 2.*update"), (0, "older format 0"), (-1, "older")])
+@pytest.mark.parametrize(
+    ("version", "words"),
+    [(3, "has format 3.*update"), (1, "older format 1.*build-index"), (0, "older format 0"), (-1, "older")],
+)
 def test_other_formats_say_whether_they_are_newer_or_older(folder, version, words):
     rewrite_manifest(folder, format=version)
     with pytest.raises(UnsupportedFormat, match=words):
@@ -188,7 +192,7 @@ def test_a_manifest_that_is_no_object_is_corrupt(folder, text):
         reopened(folder)
 
 
-@pytest.mark.parametrize("field", ["rows", "slots", "tombstones"])
+@pytest.mark.parametrize("field", ["rows", "records", "slots", "tombstones"])
 def test_counts_that_the_files_do_not_bear_out_are_corrupt(folder, field):
     counts = json.loads((folder / "manifest.json").read_text())["counts"]
     rewrite_manifest(folder, counts=counts | {field: counts[field] + 1})
@@ -203,7 +207,7 @@ def test_missing_and_unknown_fields_are_named(folder):
 
 
 def test_a_structure_of_other_vectors_is_corrupt(folder):
-    rewrite_manifest(folder, kind="flat", parameters={}, asked={})
+    rewrite_manifest(folder, kind="ivf_flat", parameters={}, asked={})
     with pytest.raises(CorruptIndex, match="IndexHNSWFlat"):
         reopened(folder)
 

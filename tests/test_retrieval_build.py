@@ -1,21 +1,26 @@
 """Building an index over a folder of photos: what is embedded, what is taken over, what is left out and said."""
 
+import dataclasses
 import json
+import os
 import shutil
 import time
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from indexes.errors import LockedIndex, ParameterError, VectorError
 from indexes.store import IndexStore
-from retrieval import build
-from retrieval.build import ahead, build_index
+from retrieval import build, embed, operating
+from retrieval.ahead import ahead
+from retrieval.build import build_index
 from retrieval.catalogue import list_catalogue
 from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.encode import encode_photos
+from retrieval.encode import encode_photos, for_inference
 from retrieval.errors import BadInput, DatasetError, NumericalError
+from retrieval.fusion import Matcher
 from retrieval.search import Searcher
 from tests import synthetic
 
@@ -46,7 +51,7 @@ def embedded(monkeypatch):
         sizes.append(len(photos))
         return encode_photos(matcher, photos, batch)
 
-    monkeypatch.setattr(build, "encode_photos", counted)
+    monkeypatch.setattr(embed, "encode_photos", counted)
     return sizes
 
 
@@ -79,7 +84,7 @@ PROVENANCE = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics":
 
 def test_a_first_build_embeds_every_photo_once_in_batches(own, checkpoint, index, embedded):
     report = build_index(own, checkpoint, index, quiet=True)
-    assert embedded == [16, 8]
+    assert sorted(embedded) == [8, 16]
     assert (report.photos, report.objects, report.embedded, report.reused, report.removed) == (24, 8, 24, 0, 0)
     assert report.skipped == []
 
@@ -91,10 +96,46 @@ def test_an_unchanged_catalogue_embeds_none_and_searches_the_same(own, checkpoin
     report = build_index(own, checkpoint, index, quiet=True)
     after = IndexStore(index).open()
     assert embedded == []
-    assert (report.embedded, report.reused, report.generation) == (0, 24, "gen-000002")
+    assert (report.embedded, report.reused, report.generation) == (0, 24, "gen-000001")
     assert after.rows == before.rows
     np.testing.assert_array_equal(after.arrays["halves"], before.arrays["halves"])
     np.testing.assert_array_equal(after.embeddings[after.slots], before.embeddings[before.slots])
+
+
+def test_a_rebuild_with_nothing_changed_writes_nothing_and_says_so(own, checkpoint, index):
+    assert build_index(own, checkpoint, index, quiet=True).written
+    (own / "note.txt").write_text("no photo")
+    (own / "broken.png").write_bytes(b"no photo either")
+    before = {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name != "LOCK"}
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert not report.written
+    assert {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name != "LOCK"} == before
+    assert "nothing changed, by the content of every file: the index stays as it is" in list(report.lines())
+    assert (report.ignored, [item.path for item in report.skipped]) == (["note.txt"], ["broken.png"])
+
+
+def test_a_photo_replaced_by_another_of_its_size_and_time_is_noticed(own, checkpoint, index):
+    """A rebuild that trusts sizes and times would keep the old picture."""
+    photo = own / "twin.bmp"
+    cv2.imwrite(str(photo), np.zeros((8, 8, 3), np.uint8))
+    build_index(own, checkpoint, index, quiet=True)
+    before = photo.stat()
+    cv2.imwrite(str(photo), np.full((8, 8, 3), 255, np.uint8))
+    os.utime(photo, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (photo.stat().st_size, photo.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.embedded, report.written) == (1, True)
+
+
+def test_another_wish_or_another_place_is_written_though_nothing_is_embedded(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    embedded.clear()
+    assert build_index(own, checkpoint, index, kind="hnsw", quiet=True).written
+    assert not build_index(own, checkpoint, index, kind="hnsw", quiet=True).written
+    moved = own.rename(own.with_name("elsewhere"))
+    assert build_index(moved, checkpoint, index, kind="hnsw", quiet=True).written
+    assert Searcher.open(index).catalogue == moved
+    assert embedded == []
 
 
 def test_a_rebuild_embeds_only_changed_and_new_photos(own, checkpoint, index, embedded):
@@ -109,7 +150,7 @@ def test_a_rebuild_embeds_only_changed_and_new_photos(own, checkpoint, index, em
     assert (report.photos, report.embedded, report.reused, report.removed) == (25, 2, 23, 0)
     after = IndexStore(index).open()
     name = changed.relative_to(own).as_posix()
-    for row_id in before._number:
+    for row_id in [row["id"] for row in before.rows]:
         old, new = (part.arrays["halves"][part.row_number(row_id)] for part in (before, after))
         assert np.array_equal(old, new) == (row_id != name)
 
@@ -187,7 +228,7 @@ def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, e
 
 def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
     build_index(own, checkpoint, index, quiet=True)
-    halves = index / "gen-000001" / "halves.npy"
+    halves = index / "gen-000001" / "halves-000001.npy"
     halves.write_bytes(halves.read_bytes()[:-1])
     report = build_index(own, checkpoint, index, quiet=True)
     assert report.embedded == 24
@@ -276,7 +317,7 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, own, checkpoint, 
     def spoil(module, inputs, output):
         return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
 
-    checkpoint.matcher.get_submodule(part).register_forward_hook(spoil)
+    for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(spoil)
     with pytest.raises((NumericalError, VectorError), match=list_catalogue(own).photos[3].photo_id):
         build_index(own, checkpoint, index, quiet=True)
     assert IndexStore(index).current() == "gen-000001"
@@ -286,6 +327,10 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, own, checkpoint, 
 def test_what_cannot_be_built_is_refused_before_anything_is_embedded(own, checkpoint, index, embedded):
     with pytest.raises(ParameterError, match="flat"):
         build_index(own, checkpoint, index, kind="tree", quiet=True)
+    with pytest.raises(ParameterError, match="ivf_pq needs 624 or more vectors to train its codes; got 24"):
+        build_index(own, checkpoint, index, kind="ivf_pq", quiet=True)
+    with pytest.raises(BadInput, match="least winner recall"):
+        build_index(own, checkpoint, index, min_recall=2.0, quiet=True)
     for budget in (0, -1, float("nan")):
         with pytest.raises(BadInput, match="must be above 0 ms"):
             build_index(own, checkpoint, index, max_ms=budget, quiet=True)
@@ -328,8 +373,7 @@ def test_exact_search_is_the_default_and_an_impossible_budget_is_answered_aloud(
     assert Searcher.open(index).generation.manifest.kind == "hnsw"
 
 
-def test_without_a_budget_no_vector_is_gathered_or_measured(own, checkpoint, index, monkeypatch):
-    build_index(own, checkpoint, index, quiet=True)
+def test_without_a_budget_no_vector_is_measured(own, checkpoint, index, monkeypatch):
     asked = []
 
     def choose(vectors, budget_ms, **more):
@@ -340,7 +384,71 @@ def test_without_a_budget_no_vector_is_gathered_or_measured(own, checkpoint, ind
     monkeypatch.setattr(build, "choose_kind", choose)
     build_index(own, checkpoint, index, quiet=True)
     build_index(own, checkpoint, index, max_ms=1000.0, quiet=True)
-    assert asked == [(0, None), (24, 1000.0)]
+    assert asked == [(24, 1000.0)]
+
+
+def test_few_photos_are_all_judged_and_nothing_is_measured(own, queried, index, monkeypatch):
+    monkeypatch.setattr(build, "Bench", None)
+    report = build_index(own, queried, index, quiet=True)
+    assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
+    assert "candidate search: flat. The classifier judges all 24 photos." in list(report.lines())
+
+
+@pytest.fixture
+def queried(checkpoint, tmp_path):
+    """A checkpoint with a pruner, and touches to measure with."""
+    config = dataclasses.replace(
+        checkpoint.config, matcher=dataclasses.replace(checkpoint.config.matcher, pruner_width=8)
+    )
+    torch.manual_seed(3)
+    matcher = Matcher(config.matcher)
+    matcher.load_state_dict(checkpoint.matcher.state_dict(), strict=False)
+    halves = np.random.default_rng(3).normal(size=(30, config.matcher.hidden)).astype(np.float16)
+    path = tmp_path / "queried.safetensors"
+    save_checkpoint(path, matcher, config, split=None, calibration=None, provenance=PROVENANCE, queries=halves)
+    return load_checkpoint(path)
+
+
+def test_the_measured_operating_point_stands_in_the_manifest_and_is_said(own, queried, index, monkeypatch):
+    monkeypatch.setattr(operating, "FIRST", 4)
+    report = build_index(own, queried, index, min_recall=0.5, quiet=True)
+    record = IndexStore(index).open().manifest.about["candidates"]
+    assert record == report.candidates
+    assert (record["queries"], record["photos"], record["asked"]["min_recall"]) == (30, 24, 0.5)
+    assert record["winner_recall"] >= 0.5
+    assert "validation touches (95 % interval" in "\n".join(report.lines())
+
+
+def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(own, queried, index, monkeypatch):
+    monkeypatch.setattr(operating, "FIRST", 4)
+    benches = []
+    monkeypatch.setattr(build, "Bench", lambda *made, **how: benches.append(made[1:]) or operating.Bench(*made, **how))
+    build_index(own, queried, index, quiet=True)
+    other_picture(own / "newcomer" / "1.jpg", seed=78)
+    assert build_index(own, queried, index, quiet=True).candidates["changed"] == 1
+    other_picture(own / "newcomer" / "2.jpg", seed=79)
+    other_picture(own / "newcomer" / "3.jpg", seed=80)
+    assert build_index(own, queried, index, quiet=True).candidates["photos"] == 27
+    assert [len(halves) for *_, halves in benches] == [24, 27]
+    generation, (vectors, slots, halves) = IndexStore(index).open(), benches[1]
+    np.testing.assert_array_equal(halves[:], generation.arrays["halves"][:])
+    np.testing.assert_array_equal(vectors[slots], generation.embeddings[generation.slots])
+
+
+def test_the_recall_of_neighbours_is_measured_with_touches_where_the_checkpoint_keeps_some(
+    own, checkpoint, queried, index, tmp_path
+):
+    build_index(own, queried, index, kind="hnsw", quiet=True)
+    build_index(own, checkpoint, tmp_path / "other", kind="hnsw", quiet=True)
+    with_touches, without = (IndexStore(path).open().manifest.recall for path in (index, tmp_path / "other"))
+    assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the queries that were given")
+    assert without["how"] == "measured on moved own vectors"
+
+
+def test_a_bound_without_touches_to_measure_with_is_answered_by_neighbours_aloud(own, checkpoint, index):
+    report = build_index(own, checkpoint, index, max_ms=1e9, quiet=True)
+    assert report.candidates is None
+    assert "keeps no touches to measure candidates with, so recall is that of nearest neighbours" in report.reason
 
 
 # The threads that read and decode ------------------------------------------------------------------------------
@@ -367,7 +475,7 @@ def test_an_error_on_a_thread_comes_out_where_the_item_would():
     def fail(number):
         return 1 / (number - 3)
 
-    results = ahead(fail, range(9))
+    results = ahead(fail, range(9), threads=2, window=4)
     assert [next(results) for _ in range(3)] == [-1 / 3, -1 / 2, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import softmax
 
 from retrieval.calibration import SLOPE_BOUNDS, fit_calibration
-from retrieval.errors import BadInput
+from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.calibrate import (
     Choice,
     calibrate,
@@ -168,6 +168,12 @@ def test_constant_scores_say_nothing_and_get_even_chances(value):
 def constant(value):
     owner = np.repeat(np.arange(6), 4)
     return table_of(np.full((24, 24), value), owner)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_choice_with_a_score_that_is_not_finite_is_refused_and_named(bad):
+    with pytest.raises(NumericalError, match="every score of a choice must be finite; choice 1"):
+        fit_slope([[1.0, 0.0], [bad, 0.0]])
 
 
 def test_scores_that_say_the_opposite_get_the_smallest_slope():

@@ -329,6 +329,15 @@ def test_what_is_no_calibration_is_refused(change, message):
         Calibration.from_dict(FITTED.to_dict() | change)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_logit_that_is_not_finite_has_no_odds(bad):
+    """Compared with a threshold, a NaN is never above it: it would be called "no match" without a word."""
+    assert not math.nan >= FITTED.reject_log_odds
+    for ask in (FITTED.log_odds, FITTED.probability):
+        with pytest.raises(NumericalError, match="every logit must be finite to be calibrated; got"):
+            ask([0.0, bad])
+
+
 @pytest.mark.parametrize("data", [{}, {"slope": 1.0}, [], None, 3, "slope"], ids=repr)
 def test_a_calibration_must_have_all_its_numbers(data):
     with pytest.raises(BadInput, match="calibration must hold exactly slope, intercept, reject_log_odds"):

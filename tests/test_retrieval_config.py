@@ -54,8 +54,17 @@ def test_the_preset_paper_holds_the_papers_numbers():
     assert (preprocessing.touch_px, preprocessing.photo_px, preprocessing.background) == (128, 256, "none")
 
 
-def test_the_defaults_are_the_papers():
-    assert Config() == load_config("paper")
+def test_the_defaults_are_the_papers_which_has_no_pruner():
+    paper = load_config("paper")
+    assert paper.matcher.pruner_width > 0
+    assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, pruner_width=0))
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_has_embeddings_to_search_candidates_by(name):
+    config = load_config(name)
+    assert config.matcher.pruner_width > 0
+    assert config.has_embeddings
 
 
 # Files -----------------------------------------------------------------------------------------------------

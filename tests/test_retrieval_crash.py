@@ -16,7 +16,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from retrieval.build import build_index
-from retrieval.catalogue import list_catalogue, read_photos
+from retrieval.catalogue import list_catalogue, read_photo
 from retrieval.checkpoint import load_checkpoint
 from retrieval.search import Searcher
 from tests import synthetic
@@ -67,7 +67,8 @@ def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=ma
 
 def content(catalogue):
     """What the rows of an index over this folder must be: {id: digest}."""
-    return {item.photo.photo_id: item.digest for item in read_photos(list_catalogue(catalogue))}
+    listed = list_catalogue(catalogue)
+    return {photo.photo_id: read_photo(listed, photo).digest for photo in listed.photos}
 
 
 def changed_copy(catalogue, path):

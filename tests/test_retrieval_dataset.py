@@ -279,10 +279,10 @@ def test_the_seed_of_a_split_is_a_whole_number(seed):
 
 
 @settings(max_examples=50, deadline=None)
-@given(counts=counts, seed=seeds, step=st.integers(0, 10**6), touches=st.integers(1, 7))
-def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, seed, step, touches):
+@given(counts=counts, seed=seeds, step=st.integers(0, 10**6), touches=st.integers(1, 7), share=st.booleans())
+def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, seed, step, touches, share):
     grasps = grasps_of(*counts)
-    batch = PairSampler(grasps, seed=seed).batch(step, touches)
+    batch = PairSampler(grasps, seed=seed, share_photos=share).batch(step, touches)
     rows = pairs(batch)
     assert len(rows) == 8 * touches
     assert float(batch.labels.mean()) == 0.5
@@ -295,9 +295,10 @@ def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, se
 
 
 @settings(max_examples=50, deadline=None)
-@given(counts=counts, seed=seeds, positives=st.integers(1, 5), negatives=st.integers(1, 5))
-def test_other_numbers_of_photos_are_drawn_as_asked(counts, seed, positives, negatives):
-    sampler = PairSampler(grasps_of(*counts), seed=seed, positives=positives, negatives=negatives)
+@given(counts=counts, seed=seeds, positives=st.integers(1, 5), negatives=st.integers(1, 5), share=st.booleans())
+def test_other_numbers_of_photos_are_drawn_as_asked(counts, seed, positives, negatives, share):
+    grasps = grasps_of(*counts)
+    sampler = PairSampler(grasps, seed=seed, positives=positives, negatives=negatives, share_photos=share)
     for _, labels in _labels_by_touch(sampler.batch(3, 5)).items():
         assert labels == [1] * positives + [0] * negatives
 
@@ -310,9 +311,9 @@ def _labels_by_touch(batch):
 
 
 @settings(max_examples=50, deadline=None)
-@given(counts=counts, seed=seeds, touches=st.integers(1, 9))
-def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used(counts, seed, touches):
-    batch = PairSampler(grasps_of(*counts), seed=seed).batch(0, touches)
+@given(counts=counts, seed=seeds, touches=st.integers(1, 9), share=st.booleans())
+def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used(counts, seed, touches, share):
+    batch = PairSampler(grasps_of(*counts), seed=seed, share_photos=share).batch(0, touches)
     assert len(batch.photos) == len(set(batch.photos)) == len(batch.photo_objects)
     assert set(batch.photo_index.tolist()) == set(range(len(batch.photos)))
     names = sorted({item.object_id for item in grasps_of(*counts)})
@@ -390,6 +391,51 @@ def test_negatives_draw_the_object_first_so_that_one_with_many_photos_is_not_met
     # 500 fair draws: the deviation is 11, and six of them are allowed.
     assert abs(met[1] - 250) < 67
     assert met[1] + met[2] == 500
+
+
+def test_shared_photos_are_half_as_many_and_each_is_some_touchs_positive():
+    grasps = grasps_of(*[9] * 12)
+    for step in range(2):  # these two batches are one round of the objects
+        shared = PairSampler(grasps, seed=0, share_photos=True).batch(step, 6)
+        assert (len(shared.photos), len(shared.labels)) == (24, 48)
+        assert len(PairSampler(grasps, seed=0).batch(step, 6).photos) > 36
+        rows = pairs(shared)
+        assert {photo for *_, photo, label in rows if not label} <= {photo for *_, photo, label in rows if label}
+        for touch in range(6):  # its negatives are of four different objects
+            assert len({owner for row, _, _, owner, label in rows if row == touch and not label}) == 4
+
+
+def test_shared_negatives_meet_every_other_object_and_every_photo_of_it_alike():
+    """As those drawn from all: a touch's negatives are any other object's photos with the same chance."""
+    grasps = grasps_of(*[4] * 5, 8)
+    met: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
+    for share, seen in met.items():
+        sampler = PairSampler(grasps, seed=1, share_photos=share, positives=3, negatives=2)
+        for step in range(2000):
+            batch = sampler.batch(step, 3)
+            for touch, photo, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True):
+                if not label and batch.touch_objects[touch] == 0:
+                    seen[str(batch.photos[photo])] += 1
+    total = sum(met[True].values())
+    assert total == sum(met[False].values()) == 2000
+    for seen in met.values():
+        for name, count in seen.items():
+            share = total / 5 / (8 if name.startswith("object-05") else 4)
+            assert abs(count - share) < 6 * share**0.5, name  # six deviations of a fair draw
+        assert len(seen) == 4 * 4 + 8
+
+
+def test_a_batch_of_one_object_finds_its_negatives_outside():
+    batch = PairSampler(grasps_of(3, 3, 3), seed=0, share_photos=True).batch(0, 1)
+    assert batch.labels.tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
+    assert all((batch.photo_objects[batch.photo_index] == batch.touch_objects[0]) == (batch.labels == 1))
+
+
+def test_the_pairs_for_evaluation_are_not_shared():
+    """They are judged against each other's negatives nowhere: every checkpoint so far was chosen on these."""
+    grasps = grasps_of(3, 1, 5)
+    every = [contents(PairSampler(grasps, seed=0, share_photos=share).every_touch()) for share in (False, True)]
+    assert every[0] == every[1]
 
 
 def test_the_pairs_for_evaluation_hold_every_touch_once_and_are_the_same_each_time():

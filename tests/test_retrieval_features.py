@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from retrieval.dataset import load_grasps
-from retrieval.errors import BadInput, DatasetError
+from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.features import Features, blurred, by_image, encode_recording
 from retrieval.train import build_matcher
 from tests.conftest import TINY
@@ -183,6 +183,16 @@ def test_equal_features_have_equal_digests_and_others_have_not():
 def test_features_of_another_shape_or_type_are_refused(touch, photo):
     with pytest.raises(BadInput, match="features must be"):
         Features(("a", "b", "c", "d"), ("m",) * 4, touch, photo)
+
+
+@pytest.mark.parametrize("part", ["touch", "photo"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_feature_that_is_not_finite_is_refused_and_its_grasp_named(part, value):
+    features = some_features()
+    spoilt = {"touch": features.touch.copy(), "photo": features.photo.copy()}
+    spoilt[part][1, ..., 0] = value
+    with pytest.raises(NumericalError, match=f"{part} features must be finite; grasp {features.grasp_ids[1]} has"):
+        Features(features.grasp_ids, features.object_ids, **spoilt)
 
 
 def test_features_are_found_by_grasp_and_by_photo_file(grasps, matcher):

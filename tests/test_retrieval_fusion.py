@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from retrieval import judge
 from retrieval.config import MatcherConfig
 from retrieval.errors import BadInput, NumericalError
 from retrieval.fusion import FusionHead, Matcher, score_halves
@@ -86,15 +87,16 @@ def small_head(hidden=32, seed=0):
     return FusionHead(10, 10, hidden, 0.5)
 
 
-def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_the_block():
+@pytest.mark.parametrize("block", [1, 5, 37, 1000])
+def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_the_block(block, monkeypatch):
+    monkeypatch.setattr(judge, "BLOCK", block)
     head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)
     touches = torch.randn(3, 32)
     with torch.inference_mode():
         expected = [
             sum(float(head(touch[None], torch.from_numpy(photo[None]))) for touch in touches) for photo in photos
         ]
-    for block in (1, 5, 37, 1000):
-        np.testing.assert_allclose(score_halves(head, touches, photos, block=block), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(score_halves(head, touches, photos), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_scoring_ignores_dropout_and_picks_the_asked_rows():

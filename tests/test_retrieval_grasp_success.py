@@ -348,6 +348,15 @@ def test_the_bound_is_a_probability_of_exactly_one_half(monkeypatch, logits, acc
     assert gate(fingers(0)) is accepted
 
 
+def test_a_logit_that_is_not_finite_is_no_failed_grasp():
+    """Finite weights can overflow; NaN >= 0 is false, and every grasp would be thrown away without a word."""
+    net = GraspNet()
+    torch.nn.init.constant_(net.last.weight, 3e38)
+    torch.nn.init.constant_(net.layers[0].bias, 3e38)
+    with pytest.raises(NumericalError, match=r"finger 0 of grasp 0 has (nan|inf|-inf); train the gate again"):
+        Gate(net, DURING)(fingers(0))
+
+
 def test_a_change_of_one_grey_level_stays_one_and_never_wraps(trained):
     """In uint8, one level darker is 255 brighter."""
     gate, darker = load_gate(trained[0]), Frames(LEAN, LEAN - np.uint8(1))

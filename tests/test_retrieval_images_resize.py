@@ -8,8 +8,10 @@ import pytest
 from PIL import Image
 
 from retrieval import images
+from retrieval import resize as resizing
 from retrieval.errors import BadInput, ConfigError, NumericalError
-from retrieval.images import BACKGROUNDS, Preprocessing, resize, subtract_background, to_float
+from retrieval.images import BACKGROUNDS, Preprocessing, subtract_background, to_float
+from retrieval.resize import resize
 from tests.test_retrieval_images import sample_files, saved
 
 ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1
@@ -174,7 +176,7 @@ def test_the_reference_is_read_only_by_a_policy_that_needs_it(tmp_path, monkeypa
 
 def test_no_reference_is_resized_under_policy_none(monkeypatch):
     calls = []
-    monkeypatch.setattr(images, "_resize_axis", lambda image, axis, length: calls.append(axis) or image)
+    monkeypatch.setattr(resizing, "_resize_axis", lambda image, axis, length: calls.append(axis) or image)
     Preprocessing(touch_px=2).touch(grey(1), grey(2))
     assert len(calls) == 2
 

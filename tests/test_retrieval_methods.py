@@ -154,20 +154,16 @@ def test_it_must_be_fitted_before_use(name):
         method.score_sets(np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32), np.zeros((1, 1), np.int64))
 
 
-def spoiled(features, value):
-    photo = features.photo.copy()
-    photo[3, 5] = value
-    return Features(features.grasp_ids, features.object_ids, features.touch, photo)
-
-
 @every_method
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_features_that_are_not_finite_are_refused(name, value):
-    for train, validation in ((spoiled(TRAIN, value), VALIDATION), (TRAIN, spoiled(VALIDATION, value))):
-        with pytest.raises(NumericalError, match=r"photo features of .* at \(3, 5\)"):
-            build_method(name, Setting(CONFIG)).fit(train, validation)
+    photo = TEST.photo.copy()
+    photo[3, 5] = value
     with pytest.raises(NumericalError, match=r"photo features must be finite; got .* at \(3, 5\)"):
-        fitted(name).encode_photo(spoiled(TEST, value).photo)
+        fitted(name).encode_photo(photo)
+    # Nothing can be fitted to them: there are no `Features` that hold them.
+    with pytest.raises(NumericalError, match="photo features must be finite; grasp "):
+        Features(TEST.grasp_ids, TEST.object_ids, TEST.touch, photo)
 
 
 @every_method
@@ -235,6 +231,14 @@ def test_the_worth_of_scores_is_what_loops_count():
         by_object.setdefault(touch_owner[i], []).append(np.mean(wins))
     expected = np.mean([np.mean(values) for values in by_object.values()])
     assert ranking_auc(scores, touch_owner, photo_owner, left_out) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_worth_is_never_made_of_scores_that_are_not_finite(bad):
+    scores = np.zeros((2, 3))
+    scores[1, 2] = bad
+    with pytest.raises(NumericalError, match="every score must be finite; touch 1 has"):
+        ranking_auc(scores, np.array([0, 1]), np.array([0, 1, 1]), np.zeros((2, 3), dtype=bool))
 
 
 def test_every_object_has_its_share_of_the_grasps_to_choose_by():

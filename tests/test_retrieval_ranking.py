@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.errors import BadInput
+from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.ranking import (
     FirstRelevant,
     average_precision,
@@ -125,6 +125,16 @@ def test_what_is_not_shown_takes_no_place():
     assert measures([9, 8, 7, 6], [0, 1, 0, 1], [0, 0, 1, 1]) == measures([7, 6], [0, 1])
     # An own photo that scores highest would otherwise count as found.
     assert measures([9, 8, 7, 6], [1, 0, 0, 1], [0, 1, 1, 1])["mrr"] == pytest.approx(1 / 3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_score_that_is_not_finite_is_refused_and_its_row_named(bad):
+    scores, relevant = np.zeros((2, 3)), np.array([[True, False, False]] * 2)
+    scores[1, 0] = bad
+    shown = np.ones_like(relevant)
+    for measure in (first_relevant, average_precision):
+        with pytest.raises(NumericalError, match="every score must be finite to be ranked; row 1"):
+            measure(scores, relevant, shown)
 
 
 def test_a_query_with_nothing_to_find_is_refused_and_named():

@@ -10,7 +10,8 @@ import pytest
 
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
-from retrieval.report import print_table, query_html
+from retrieval.report.query import query_html
+from retrieval.report.terminal import print_table
 from retrieval.search import Match, QueryResult, Searcher
 from tests.pages import Page
 

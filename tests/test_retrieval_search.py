@@ -1,5 +1,6 @@
 """From gel images to ranked objects, against two plain loops over the whole network."""
 
+import copy
 import dataclasses
 import shutil
 from functools import cache
@@ -38,6 +39,12 @@ def searcher(index):
 
 
 @pytest.fixture(scope="module")
+def matcher(model):
+    """The model of the index, in PyTorch."""
+    return load_checkpoint(model).matcher
+
+
+@pytest.fixture(scope="module")
 def grasps(tmp_path_factory):
     """Three grasps of one object of the catalogue."""
     objects = synthetic.make_objects(2, seed=9)[1:]
@@ -72,9 +79,9 @@ def variant(model, path, **changes):
 
 
 @pytest.fixture(scope="module")
-def oracle(searcher, catalogue):
+def oracle(searcher, matcher, catalogue):
     """Touches -> {photo path: sum of match logits}: the full network on every touch with every photo, pair by pair."""
-    matcher, pre = searcher.checkpoint.matcher, searcher.checkpoint.config.preprocessing
+    pre = searcher.checkpoint.config.preprocessing
     photos = {path.relative_to(catalogue).as_posix(): pre.load_photo(path) for path in catalogue.rglob("*.jpg")}
 
     @cache
@@ -98,10 +105,8 @@ def best_by_object(logits):
 
 def half_tolerance(searcher, grasps):
     """How far rounding the halves can move a logit: through |second| and |out|, as ReLU never enlarges a change."""
-    head = searcher.checkpoint.matcher.head.requires_grad_(False)
-    halves = torch.from_numpy(np.abs(np.asarray(searcher.generation.arrays["halves"], np.float32)))
-    moved = halves.max(dim=0).values * HALF_STEP
-    return grasps * float(head.out.weight.abs() @ (head.second.weight.abs() @ moved)) + 1e-5
+    moved = np.abs(np.asarray(searcher.generation.arrays["halves"], np.float32)).max(axis=0) * HALF_STEP
+    return grasps * float(np.abs(searcher.judge.out) @ (np.abs(searcher.judge.second) @ moved)) + 1e-5
 
 
 # The ranking ---------------------------------------------------------------------------------------------------
@@ -125,7 +130,7 @@ def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, searcher, 
         assert expected[photo] == pytest.approx(logit, abs=2 * tolerance)
 
 
-def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, grasps, oracle, catalogue, monkeypatch):
+def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, matcher, grasps, oracle, catalogue, monkeypatch):
     """The rounding taken away, what is left is ranking: no tie, no tolerance."""
     expected = best_by_object(oracle(grasps[:1]))
     logits = np.array([logit for _, _, logit in expected])
@@ -134,7 +139,7 @@ def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, grasps, or
     photos = [checkpoint.config.preprocessing.load_photo(catalogue / row["path"]) for row in rows]
     with torch.inference_mode():
         images = torch.from_numpy(np.stack(photos)).permute(0, 3, 1, 2)
-        halves = checkpoint.matcher.photo_code(checkpoint.matcher.photo_features(images)).half.numpy()
+        halves = matcher.photo_code(matcher.photo_features(images)).half.numpy()
     monkeypatch.setitem(searcher.generation.arrays, "halves", halves)
     result = searcher.query(grasps[:1])
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected]
@@ -159,7 +164,7 @@ def scores(searcher, touches, rows):
 
 def only(searcher, rows):
     """A searcher that judges these rows and no others."""
-    limited = Searcher(searcher.index, searcher.generation, searcher.checkpoint)
+    limited = copy.copy(searcher)
     limited._candidates = lambda embeddings, k: rows
     return limited
 
@@ -262,13 +267,13 @@ def test_the_classifier_judges_at_least_as_many_photos_as_objects_are_wanted(sea
 
 
 @torch.inference_mode()
-def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, grasps, oracle):
+def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, matcher, grasps, oracle):
     """Two plain loops: the 5 best inner products of each grasp, then the full network on their union."""
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, near = checkpoint.config.preprocessing.load_touch, set()
     for grasp in grasps:
-        touch = checkpoint.matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
-        products = generation.embeddings[generation.slots] @ checkpoint.matcher.touch_code(touch).embedding[0].numpy()
+        touch = matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
+        products = generation.embeddings[generation.slots] @ matcher.touch_entry(touch).embedding[0].numpy()
         near |= {generation.rows[row]["path"] for row in np.argsort(-products)[:5]}
     logits = oracle(grasps)
     expected = best_by_object({photo: logits[photo] for photo in near})
@@ -299,18 +304,12 @@ def test_the_probability_is_the_calibrated_logit_and_follows_its_order(count, se
     assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_objects_with_saturated_probabilities_are_still_ranked_by_logit(searcher, touch):
+def test_objects_with_saturated_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
     """float32 sigmoids of logits beyond 17 all equal 1: ranked by probability, they would be one tie."""
-    head = searcher.checkpoint.matcher.head
-    weights = {name: value.clone() for name, value in head.out.state_dict().items()}
-    plain = searcher.query([touch]).results
-    try:
-        with torch.no_grad():
-            head.out.weight *= 100
-            head.out.bias.mul_(100).add_(100)
-        large = searcher.query([touch]).results
-    finally:
-        head.out.load_state_dict(weights)
+    plain, head = searcher.query([touch]).results, searcher.judge
+    larger = dataclasses.replace(head, out=100 * head.out, out_bias=100 * head.out_bias + 100)
+    monkeypatch.setattr(searcher, "judge", larger)
+    large = searcher.query([touch]).results
     naive = torch.sigmoid(torch.tensor([match.logit for match in large]))
     assert len(set(naive.tolist())) == 1
     assert [match.object_id for match in large] == [match.object_id for match in plain]
@@ -372,6 +371,13 @@ def test_a_missing_a_truncated_and_a_textual_gel_image_are_named(searcher, touch
     for path, reason in ((tmp_path / "none.png", "no such file"), (cut, "truncated"), (text, "not a PNG")):
         with pytest.raises(ImageError, match=rf"{path.name}: .*{reason}"):
             searcher.query([(a, path)])
+
+
+def test_of_several_bad_files_the_first_is_told_however_long_each_takes(searcher, touch, tmp_path):
+    large = tmp_path / "large.png"
+    large.write_text("no picture" * 1_000_000)
+    with pytest.raises(ImageError, match=r"large\.png"):
+        searcher.query([touch, (touch[0], large), (tmp_path / "none.png", touch[1])])
 
 
 @pytest.fixture(scope="module")
@@ -460,3 +466,61 @@ def test_a_model_trained_again_at_the_same_path_is_refused(moved, model):
     variant(model, there.with_name("here.safetensors"), training__seed=5)
     with pytest.raises(MismatchedIndex):
         Searcher.open(index)
+
+
+# The best of each object -----------------------------------------------------------------------------------------
+
+
+def by_two_loops(names, rows, logits, top):
+    """[(row, logit)] of the best photo of each object, ties by the object's name, then by row."""
+    best = {}
+    for row, logit in zip(rows.tolist(), logits.tolist(), strict=True):
+        if names[row] not in best or logit > best[names[row]][1]:
+            best[names[row]] = (row, logit)
+    ordered = sorted(best.items(), key=lambda item: (-item[1][1], item[0]))
+    return [pair for _, pair in ordered[:top]]
+
+
+@pytest.mark.parametrize("levels", [1, 3, 10_000])
+@pytest.mark.parametrize("top", [1, 2, 7, 40, 1000])
+def test_the_best_of_each_object_are_those_of_two_plain_loops(top, levels, searcher, monkeypatch):
+    rng = np.random.default_rng(top + levels)
+    names = [f"object-{number}" for number in rng.integers(0, 40, 500)]
+    made_up = copy.copy(searcher)
+    made_up.generation = copy.copy(searcher.generation)
+    made_up.generation.rows = [{"object_id": name} for name in names]
+    seen = list(dict.fromkeys(names))
+    made_up._object_of_row = np.array([seen.index(name) for name in names])
+    rows = np.sort(rng.choice(500, 300, replace=False))
+    logits = rng.integers(0, levels, 300).astype(np.float32)
+    assert made_up._best_of_objects(rows, logits, top) == by_two_loops(names, rows, logits, top)
+
+
+def test_photos_of_equal_bytes_get_the_logit_of_the_first_of_them_among_the_judged(searcher):
+    made_up = copy.copy(searcher)
+    made_up._original = np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
+    rows, logits = np.array([2, 3, 4, 5]), np.array([0.25, 0.5, 0.75, 0.26], dtype=np.float32)
+    assert made_up._equal_for_equals(rows, logits).tolist() == [0.25, 0.5, 0.75, 0.25]
+
+
+@pytest.mark.parametrize(
+    ("measured", "expected"), [({"k": 5, "winner_recall": 0.99}, [5]), (None, []), ({"k": 24}, [])]
+)
+def test_the_index_says_how_many_candidates_are_judged_unless_the_query_does(
+    measured, expected, searcher, touch, searches, monkeypatch
+):
+    about = searcher.generation.manifest.about
+    monkeypatch.setitem(about, "candidates", measured)
+    searcher.query([touch], top=2)
+    assert searches == expected
+    searcher.query([touch], top=2, candidates=9)
+    assert searches == [*expected, 9]
+
+
+def test_a_damaged_model_is_told_from_another_one(moved):
+    index, there = moved
+    data = bytearray(there.read_bytes())
+    data[-3] ^= 1
+    there.write_bytes(data)
+    with pytest.raises(CheckpointError, match="is damaged: its checksum does not fit"):
+        Searcher.open(index, model=there)

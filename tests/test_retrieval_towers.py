@@ -168,6 +168,17 @@ def test_weights_of_another_architecture_are_refused_by_name():
         load_tower_state(build_tower("resnet18"), {}, "empty.pth")
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_first_weight_that_is_not_finite_is_refused_and_named(value):
+    """It would be found at the first step, as a learning rate that is too high."""
+    state = dict(build_tower("resnet18").state_dict())
+    state["layer1.0.conv1.weight"] = torch.full_like(state["layer1.0.conv1.weight"], value)
+    tower = build_tower("resnet18")
+    with pytest.raises(CheckpointError, match=r"r\.pth holds a NaN or infinite weight in layer1\.0\.conv1\.weight"):
+        load_tower_state(tower, state, "r.pth")
+    assert all(bool(torch.isfinite(weight).all()) for weight in tower.state_dict().values())
+
+
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04broken zip"])
 def test_damaged_weight_files_are_one_clear_error(tmp_path, content):
     path = tmp_path / "weights.pth"

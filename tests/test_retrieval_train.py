@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from retrieval import distil
 from retrieval.batches import FrozenFeatures, TrainedFeatures
 from retrieval.checkpoint import load_checkpoint, read_tensors
 from retrieval.dataset import PairSampler, Split, load_grasps, make_split
@@ -104,6 +105,85 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recordin
     assert whole.best == resumed.best
     assert (tmp_path / "a.safetensors").read_bytes() == parts.read_bytes()
     assert not state_path(parts).exists()
+
+
+PRUNED = dataclasses.replace(
+    with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, pruner_width=8)
+)
+TINY_UNTAUGHT = dataclasses.replace(PRUNED, matcher=TINY.matcher)
+
+
+def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, tmp_path):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", PRUNED)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(trainer, 4)
+    underway = load_checkpoint(trainer.out)
+    assert underway.config == TINY_UNTAUGHT
+    assert underway.queries is None
+    trainer = trainer_for(recording, trainer.out, PRUNED)
+    trainer.run(quiet=True)
+    made = load_checkpoint(trainer.out)
+    assert made.config == PRUNED
+    assert made.matcher.pruner is not None
+    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.hidden)
+    assert not state_path(trainer.out).exists()
+
+
+def test_a_pruner_changes_nothing_else_that_training_makes(recording, tmp_path):
+    for name, config in (("a", PRUNED), ("b", TINY)):
+        trainer_for(recording, tmp_path / f"{name}.safetensors", config).run(quiet=True)
+    with_one, without = (load_checkpoint(tmp_path / f"{name}.safetensors").matcher.state_dict() for name in "ab")
+    assert same_weights(without, with_one)
+    assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"pruner"}
+
+
+def power_cut(*_):
+    raise RuntimeError("power cut")
+
+
+def power_cut_before_deleting(path):
+    unlink = Path.unlink
+
+    def guarded(file, missing_ok=False):
+        return power_cut() if file == path else unlink(file, missing_ok)
+
+    return guarded
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_a_power_cut_while_the_pruner_is_taught_changes_no_bit(written, recording, tmp_path, monkeypatch):
+    """Before its checkpoint is written, and after that, while the state of the training still lies there."""
+    trainer_for(recording, tmp_path / "a.safetensors", PRUNED).run(quiet=True)
+    broken = trainer_for(recording, tmp_path / "b.safetensors", PRUNED)
+    with monkeypatch.context() as cut:
+        if written:
+            cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
+        else:
+            cut.setattr("retrieval.distil.order_loss", power_cut)
+        with pytest.raises(RuntimeError, match="power cut"):
+            broken.run(quiet=True)
+    assert (load_checkpoint(broken.out).matcher.pruner is not None) == written
+    resumed = trainer_for(recording, broken.out, PRUNED)
+    resumed.resume()
+    assert resumed.step == PRUNED.training.iterations
+    resumed.run(quiet=True)
+    assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
+    assert not state_path(broken.out).exists()
+
+
+def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_one(recording, tmp_path, monkeypatch):
+    out, taught = tmp_path / "m.safetensors", distil.order_loss
+
+    def interrupted(*given):
+        os.kill(os.getpid(), signal.SIGINT)
+        return taught(*given)
+
+    monkeypatch.setattr("retrieval.distil.order_loss", interrupted)
+    with pytest.raises(Interrupted, match=r"before the pruner was taught; .* is usable, --resume teaches it"):
+        train(recording, out, PRUNED, quiet=True)
+    assert load_checkpoint(out).config == TINY_UNTAUGHT
+    monkeypatch.undo()
+    assert train(recording, out, PRUNED, resume=True, quiet=True).config == PRUNED
 
 
 def stop_after(trainer, steps):

@@ -13,7 +13,7 @@ import pytest
 from robot.cloud import Rays
 from robot.cylinder import CylinderFit, fit_cylinder
 from robot.devices import RGBD, Box
-from robot.errors import PlanError
+from robot.errors import PlanError, RobotConfigError
 from robot.solids import fit_circle
 from tests import views
 from tests.views import Ball, Block, Lying, Upright, view
@@ -208,6 +208,14 @@ def test_depths_that_are_none_are_unknown(value):
     with np.errstate(all="raise"):
         fit = fit_cylinder(RGBD(image.colour, holes, image.intrinsics, 0.0), views.camera_pose())
     assert off_centre(fit) < 1.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_calibration_that_is_not_finite_is_not_taken_for_an_empty_table(value):
+    pose = views.camera_pose()
+    pose[0, 3] = value
+    with pytest.raises(RobotConfigError, match="extrinsics must be finite"):
+        fit_cylinder(view(Upright(33, 120, X, Y)), pose)
 
 
 def test_an_object_at_the_border_is_noted_or_refused():

@@ -144,6 +144,24 @@ def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
         assert arm.pose() == Pose(150, -150, 8, 0)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_place_that_is_no_number_never_leaves_the_arm(bad, monkeypatch):
+    for place in range(4):
+        lost = Pose(*(bad if axis == place else 9.0 for axis in range(4)))
+        monkeypatch.setattr(FakeArm, "_pose", lambda arm, lost=lost: lost)
+        monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed, lost=lost: lost)
+        with FakeArm(World(0)) as arm:
+            for ask in (arm.pose, lambda arm=arm: arm.move_to(Pose(0, 0, 100, 0), 100)):
+                with pytest.raises(DeviceError, match="fake arm: the pose that an arm reports must be finite"):
+                    ask()
+
+
+@pytest.mark.parametrize("lens", [(math.nan, 1, 0, 0), (1, 0, 0, 0), (1, math.inf, 0, 0), (1, 1, math.nan, 0)])
+def test_a_lens_that_is_no_lens_is_refused(lens):
+    with pytest.raises(DeviceError, match="intrinsics must be finite, with focal lengths above 0 pixels"):
+        Intrinsics(*lens)
+
+
 @pytest.mark.parametrize("speed", [0, -1, math.nan, math.inf, 1001])
 def test_an_impossible_speed_never_reaches_the_arm(speed):
     with FakeArm(World(0)) as arm, pytest.raises(DeviceError, match="speed must be"):

@@ -94,6 +94,18 @@ def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
         replace(model, degree=3)
 
 
+@pytest.mark.parametrize("place", ["weights", "flat", "limits"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_fitted_numbers_that_are_not_finite_are_refused_where_they_are_read(place, value):
+    """JSON as Python reads it knows NaN; a sensor of NaN would render black."""
+    model = fitted_optics.optics_to_json(fitted())
+    part = model["limits"] if place == "limits" else model[place][1]
+    part["steepest" if place == "limits" else 2] = value
+    content = json.loads(json.dumps({"format": 1, "model": model}))
+    with pytest.raises(BadRobotInput, match=f"{place} of fitted optics must be finite"):
+        fitted_optics.optics_from_json(content)
+
+
 @pytest.mark.parametrize("name", fitted_names())
 def test_the_shipped_fits_name_their_source_and_licence_and_stay_small(name):
     content = fitted_optics.fitted_document(name)

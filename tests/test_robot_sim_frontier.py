@@ -32,7 +32,7 @@ def errors(points, *words):
 
 
 def test_every_point_says_what_it_measured_against_what(points):
-    assert len(points) == 2 * 2 + 2 * 2 * 2
+    assert len(points) == 2 * 2 + 2 * 2 * 2 + 2 * 2
     for point in points:
         assert point.seconds > 0.0
         assert math.isfinite(point.error)
@@ -41,7 +41,7 @@ def test_every_point_says_what_it_measured_against_what(points):
 
 
 def test_a_finer_grid_is_nearer_to_hertz_and_to_the_finest_grid(points):
-    for kind in (("half-space", "0.001"), ("layer", "0.001", "padded")):
+    for kind in (("half-space", "0.001"), ("layer", "0.001", "padded"), ("gel image", "0.001")):
         coarse, fine = errors(points, *kind)
         assert fine < coarse
 
@@ -90,7 +90,7 @@ def test_the_benchmark_prints_a_line_for_each_row(options, monkeypatch, capsys):
     made = (
         closing_points(steps_s=(1e-2,))[0],
         Check("ball", "depth", "2x2", 3.0, 2.0),
-        HardCase("a", "b", "c", "d", True),
+        HardCase("k", "a", "b", "c", "d", True, False),
     )
     monkeypatch.setattr(benchmark, "rows", lambda: iter(made))
     benchmark.main(options)

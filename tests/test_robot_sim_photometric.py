@@ -118,6 +118,24 @@ def test_what_is_no_pack_of_presses_is_refused_and_nothing_is_unpickled(tmp_path
         read_presses(write(tmp_path, **changes), "gelsight")
 
 
+@pytest.mark.parametrize("key", ["touch_center", "touch_radius"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_label_that_is_not_finite_is_refused_and_its_press_named(tmp_path, key, value):
+    drawn, _ = draw_presses(2)
+    labels = {"touch_center": drawn.centres, "touch_radius": drawn.radii}[key].copy()
+    labels[1, ...] = value
+    with pytest.raises(BadRobotInput, match=r"dataPack\.npz must hold labels that are finite, .*; press 1 has"):
+        read_presses(write(tmp_path, **{key: labels}), "gelsight")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_picture_that_is_not_finite_is_not_compared(value):
+    picture = np.full((11, 11, 3), 250.0)
+    picture[4, 5, 1] = value
+    with pytest.raises(BadRobotInput, match=r"must be finite to be compared, got (nan|inf) at \(4, 5, 1\)"):
+        compare(picture, np.full((11, 11, 3), 250, np.uint8))
+
+
 def test_missing_and_broken_files_and_unknown_sensors_are_refused(tmp_path, monkeypatch):
     with pytest.raises(BadRobotInput, match="must hold"):
         read_presses(tmp_path, "gelsight")

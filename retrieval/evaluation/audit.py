@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 
 from retrieval.check import check_split
 from retrieval.dataset import Grasp, Split, finger_count
-from retrieval.images import decode_rgb, read_bytes, resize
+from retrieval.images import decode_rgb, read_bytes
 from retrieval.progress import Bar
+from retrieval.resize import resize
 
 THUMBNAIL_PX = 32
 CLOSE_GREY_LEVELS = 0.75

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, log_softmax, softmax
 
 from retrieval.calibration import SLOPE_BOUNDS, Calibration, fit_calibration
-from retrieval.errors import BadInput
+from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.protocols import asked
 from retrieval.evaluation.table import ScoreTable, object_scores
 
@@ -122,9 +122,12 @@ def fit_slope(scores: ArrayLike) -> float:
 
     Targets are smoothed as Platt's are, a test more for every candidate: (Q + 1) / (Q + k) for the true one, so that
     scores that never err still have a finite optimum. The loss is convex in the factor: the root of its derivative,
-    within `SLOPE_BOUNDS`.
+    within `SLOPE_BOUNDS`. Raises NumericalError for a score that is not finite.
     """
     z = np.asarray(scores, dtype=np.float64)
+    if not np.isfinite(z).all():
+        row = int(np.flatnonzero(~np.isfinite(z).all(axis=1))[0])
+        raise NumericalError(f"every score of a choice must be finite; choice {row} holds a NaN or infinite one")
     z = z - z[:, :1]
     tests, k = z.shape
     targets = np.append((tests + 1) / (tests + k), np.full(k - 1, 1 / (tests + k)))

@@ -5,8 +5,8 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta
 
+from retrieval.binomial import binomial_interval, clopper_pearson
 from retrieval.errors import BadInput, NumericalError
 
 
@@ -45,20 +45,6 @@ def _curve(higher: int, equal: int, others: int, k: int) -> NDArray[np.float64]:
     return curve
 
 
-def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a share (Clopper and Pearson 1934): never too narrow for independent trials."""
-    if not 0 <= successes <= trials or trials < 1:
-        raise BadInput(f"successes must lie within 0..trials, and trials be at least 1; got {successes} of {trials}")
-    return _clopper_pearson(successes, trials, level)
-
-
-def _clopper_pearson(successes: float, trials: float, level: float) -> tuple[float, float]:
-    tail = (1 - level) / 2
-    low = beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
-    high = beta.ppf(1 - tail, successes + 1, trials - successes) if successes < trials else 1.0
-    return float(low), float(high)
-
-
 def grouped_interval(right: Sequence[Sequence[bool]]) -> tuple[float, float]:
     """95 % interval of the share of right answers, given group by group (as object by object).
 
@@ -73,4 +59,4 @@ def grouped_interval(right: Sequence[Sequence[bool]]) -> tuple[float, float]:
     share = correct / total
     squares = sum((sum(part) - share * len(part)) ** 2 for part in right) * len(right) / (len(right) - 1)
     worth = total / max(1.0, squares / (total * share * (1 - share)))
-    return _clopper_pearson(share * worth, worth, 0.95)
+    return clopper_pearson(share * worth, worth, 0.95)

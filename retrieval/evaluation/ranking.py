@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.errors import BadInput
+from retrieval.errors import BadInput, NumericalError
 
 Scores = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -25,11 +25,20 @@ class FirstRelevant(NamedTuple):
 
 
 def first_relevant(scores: Scores, relevant: Mask, shown: Mask) -> FirstRelevant:
-    """scores, relevant, shown: all (Q, N). Raises BadInput where a row is shown nothing relevant."""
+    """scores, relevant, shown: all (Q, N). Raises BadInput where a row is shown nothing relevant, NumericalError for a
+    score that is not finite."""
     good = _checked(relevant, shown)
+    _require_finite(scores)
     best = np.where(good, scores, -np.inf).max(1, keepdims=True)
     equal = shown & (scores == best)
     return FirstRelevant((shown & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1))
+
+
+def _require_finite(scores: Scores) -> None:
+    """A NaN is neither above nor equal to anything: measures would count it away without a word."""
+    bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
+    if len(bad):
+        raise NumericalError(f"every score must be finite to be ranked; row {bad[0]} holds a NaN or infinite one")
 
 
 def _checked(relevant: Mask, shown: Mask) -> Mask:
@@ -83,8 +92,10 @@ def average_precision(scores: Scores, relevant: Mask, shown: Mask) -> NDArray[np
     """(Q,) expected average precision over the FULL ranking (McSherry and Najork 2008, section 2.5).
 
     scores, relevant, shown: all (Q, N). Cut at some rank, average precision is another measure and does not compare.
+    Raises as `first_relevant` does.
     """
     good = _checked(relevant, shown)
+    _require_finite(scores)
     harmonic = np.append(0.0, np.cumsum(1 / np.arange(1.0, scores.shape[1] + 1)))
     rows = zip(scores, good, shown, strict=True)
     return np.array([_precision_of_row(row[seen], row[mine], harmonic) for row, mine, seen in rows])

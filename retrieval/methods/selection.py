@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.errors import NumericalError
 from retrieval.features import Features
 
 MOST_JUDGED = 512
@@ -28,8 +29,11 @@ def ranking_auc(
 
     scores (T, N); left_out (T, N): photos taken in the row's own grasps, which do not count (where the object has no
     other, they do). Mean over the pairs of a touch, over the touches of an object, over objects; a constant scorer
-    has exactly 0.5.
+    has exactly 0.5. Raises NumericalError for a score that is not finite: in a count of what is higher a NaN is a loss.
     """
+    bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
+    if len(bad):
+        raise NumericalError(f"every score must be finite; touch {bad[0]} has a NaN or infinite one")
     values = np.empty(len(scores))
     for row, (score, owner) in enumerate(zip(scores, touch_owner, strict=True)):
         same = photo_owner == owner

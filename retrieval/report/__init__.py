@@ -1,6 +1,4 @@
-"""Results for people: a query's table and page, and the report of an evaluation."""
+"""Results for people: a query's table and page, the report of an evaluation, and that of the frontier.
 
-from retrieval.report.evaluation import write_report
-from retrieval.report.query import print_table, query_html
-
-__all__ = ["print_table", "query_html", "write_report"]
+Nothing is imported here: a query's table should not pay for plots.
+"""

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import ImageError
-from retrieval.images import read_rgb, resize
+from retrieval.images import read_rgb
+from retrieval.resize import resize
 
 Thumbnail = NDArray[np.uint8]
 """(H, W, 3) red first."""

@@ -229,7 +229,7 @@ def reliability(results: Results, method: str) -> Figure:
     return figure
 
 
-def _logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
+def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
     """Ticks of a logarithmic axis, so many times a power of ten, as plain numbers: matplotlib's own are formulas."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -247,7 +247,7 @@ def _diagram(panel: Axes, counts: Axes, diagram: Any, colour: str) -> None:
     panel.set_xlim(-2, 102)
     counts.bar(said, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
     counts.set_yscale("log")
-    _logarithmic(counts.yaxis, (1,))
+    logarithmic(counts.yaxis, (1,))
     counts.set_xlabel("probability given, %")
 
 
@@ -288,7 +288,7 @@ def accuracy_and_time(results: Results, measure: str = "guesses_k5") -> Figure:
         _front(panel, [(time, _first(summary)[0]) for _, time, summary in points])
         panel.set_xscale("log")
         low, high = panel.get_xlim()
-        _logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
+        logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
         panel.set_xlabel(title)
     percent_axis(panels[0], "right first guess among 5 objects, %")
     _legend(figure, results.methods)

@@ -65,6 +65,8 @@ def load_tower_state(tower: Tower, state: dict[str, Tensor], source: str) -> Non
     if shapes:
         got, want = tuple(state[shapes[0]].shape), tuple(wanted[shapes[0]].shape)
         raise CheckpointError(f"{source} does not fit {type(tower).__name__}: {shapes[0]} is {got}, must be {want}")
+    if bad := [key for key in wanted if key in state and not bool(torch.isfinite(state[key]).all())]:
+        raise CheckpointError(f"{source} holds a NaN or infinite weight in {bad[0]}; give another file")
     if any(key.startswith(optional[0]) and key not in state for key in wanted):
         log.warning("%s has no 1000-way layer; that layer starts random", source)
     tower.load_state_dict({key: state.get(key, value) for key, value in wanted.items()})

@@ -49,7 +49,7 @@ class Limits(NamedTuple):
 class FittedOptics(Optics):
     """A fitted sensor. `weights`: (features x places, 3) row by row; `flat`: (terms, 3) of the backdrop.
 
-    Raises BadRobotInput where the sizes do not belong together.
+    Raises BadRobotInput where the sizes do not belong together, or a number is not finite.
     """
 
     degree: int
@@ -68,6 +68,10 @@ class FittedOptics(Optics):
                 f"weights and flat must be {wanted} and {flat} numbers for this degree, "
                 f"got {np.shape(self.weights)} and {np.shape(self.flat)}; fit again"
             )
+        limits = np.hstack(self.limits)
+        for name, numbers in (("weights", self.weights), ("flat", self.flat), ("limits", limits)):
+            if not np.isfinite(numbers).all():
+                raise BadRobotInput(f"{name} of fitted optics must be finite, got a NaN or infinite one; fit again")
 
     def backdrop(self, field: Field) -> Array:
         return _maps(self, field)[0].copy()

@@ -25,13 +25,16 @@ def compare(picture: NDArray[Any], truth: NDArray[Any]) -> ImageError:
     """Errors of `picture` (rows, cols, channels; rounded and clipped to 0..255) against `truth` (uint8).
 
     PSNR is 20 log10(255 / rms), infinite for equal pictures. Raises BadRobotInput for pictures that differ in shape
-    or are smaller than SSIM's window (11 x 11).
+    or are smaller than SSIM's window (11 x 11), and for a pixel that is NaN or infinite.
     """
     if picture.shape != truth.shape or picture.ndim != 3 or min(picture.shape[:2]) < 2 * _SSIM_REACH + 1:
         raise BadRobotInput(
             "two pictures of one shape, 11 x 11 x channels or more, must be given, "
             f"got {picture.shape} and {truth.shape}"
         )
+    if not np.isfinite(picture).all():
+        place = tuple(map(int, np.argwhere(~np.isfinite(picture))[0]))
+        raise BadRobotInput(f"a picture must be finite to be compared, got {picture[place]} at {place}")
     shown = np.clip(np.rint(picture.astype(np.float64)), 0, 255)
     difference = shown - truth
     mse = float(np.mean(difference**2))

@@ -104,7 +104,17 @@ def read_presses(folder: str | Path, name: str) -> Presses:
     ):
         shapes = [array.shape for array in found]
         raise BadRobotInput(f"{path} must hold uint8 pictures of one size, {CROP} pixels or more, got {shapes}")
+    _check_labels(path, np.c_[centres, radii].astype(np.float64))
     return Presses(name, untouched, pictures, centres.astype(np.float64), radii.astype(np.float64))
+
+
+def _check_labels(path: Path, labels: Matrix) -> None:
+    """labels (count, 3): x, y, radius. A NaN among them would make every fitted weight NaN."""
+    bad = np.flatnonzero(~(np.isfinite(labels).all(axis=1) & (labels[:, 2] > 0)))
+    if len(bad):
+        raise BadRobotInput(
+            f"{path} must hold labels that are finite, with radii above 0; press {bad[0]} has {labels[bad[0]]}"
+        )
 
 
 @lru_cache(maxsize=256)

@@ -8,11 +8,16 @@ import json
 import torch
 
 from retrieval.towers import TOWERS
-from tests.benchmarks import build, cylinder, grasp, rerank, step
+from tests.benchmarks import build, cold, cylinder, grasp, query, rerank, step
 from tests.benchmarks.common import config_of
 
-BENCHMARKS = {"rerank": rerank.measure, "build": build.measure, "step": step.measure}
-WITHOUT_TOWER = {"cylinder": cylinder.measure, "grasp": grasp.measure}
+BENCHMARKS = {"rerank": rerank.measure, "query": query.measure, "build": build.measure, "step": step.measure}
+WITHOUT_TOWER = {
+    "cylinder": cylinder.measure,
+    "grasp": grasp.measure,
+    "shipped": query.measure_shipped,
+    "cold": cold.measure,
+}
 
 
 def main() -> None:

@@ -1,4 +1,9 @@
-"""Building an index from JPEG files end to end, against the bare photo tower on images that are ready."""
+"""Building an index from JPEG files end to end, against encoding images that are ready, and against building again.
+
+Bare is what the build itself uses: `encode_photos`, batch by batch, with PyTorch's own team of threads. What is left
+of 1 is reading, decoding and resizing, where the tower is large; where it is small these are most of the work, and no
+order of doing them hides them.
+"""
 
 import tempfile
 from collections.abc import Iterator
@@ -6,12 +11,12 @@ from itertools import count
 from pathlib import Path
 
 import cv2
-import torch
 
-from retrieval.build import BATCH, build_index
+from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.config import Config
-from retrieval.encode import to_batch
+from retrieval.embed import BATCH
+from retrieval.encode import encode_photos
 from tests import synthetic
 from tests.benchmarks.common import Line, as_text, in_turns, matcher_of
 
@@ -30,24 +35,24 @@ def measure(config: Config, photos: int | None = None, photo_px: int = 512, repe
         save_checkpoint(model, matcher, config, split=None, calibration=None, provenance=provenance)
         checkpoint, fresh = load_checkpoint(model), count()
         images = [config.preprocessing.load_photo(path) for path in sorted(catalogue.rglob("*.jpg"))]
-        ready = [to_batch(images[start : start + BATCH]) for start in range(0, number, BATCH)]
 
-        @torch.inference_mode()
         def bare() -> None:
-            for batch in ready:
-                matcher.photo_features(batch)
+            encode_photos(checkpoint.matcher, images, BATCH)
 
-        def build() -> None:
-            build_index(catalogue, checkpoint, folder / f"index{next(fresh)}", quiet=True)
+        def build(out: str) -> None:
+            build_index(catalogue, checkpoint, folder / out, quiet=True)
 
-        times = in_turns({"build": build, "bare": bare}, repetitions)
-    ours, other, ratio = number / times.median("build"), number / times.median("bare"), times.ratio("build", "bare")
+        build("index")
+        arms = {"build": lambda: build(f"index{next(fresh)}"), "bare": bare, "again": lambda: build("index")}
+        times = in_turns(arms, repetitions)
+    ours, other, ratio = number / times.median("build"), number / times.median("bare"), times.ratio("bare", "build")
+    again = times.ratio("build", "again")
     yield Line(
         "build",
         config.matcher.tower,
         f"{ours:.3g} photos per second end to end ({number} JPEG files of {photo_px} px), {other:.3g} through the bare "
-        f"tower: the build takes {as_text(ratio)} as long",
-        {"photos": number, "build_per_s": ours, "bare_per_s": other, "ratio": ratio[0]},
+        f"tower: {as_text(ratio)} its rate; building again with nothing changed is faster {as_text(again)}",
+        {"photos": number, "build_per_s": ours, "bare_per_s": other, "ratio": ratio[0], "ratio_again": again[0]},
     )
 
 

@@ -1,0 +1,90 @@
+"""Resizing pictures: averages where an axis shrinks, straight lines where it grows; numpy alone.
+
+scipy's sparse matrices give the same numbers, bit for bit, and importing them takes longer than a query.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from retrieval.errors import BadInput
+
+RgbImage = npt.NDArray[np.float32]
+"""(H, W, 3) float32, red first, 0..1 (-1..1 after a background was subtracted)."""
+
+
+def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
+    """Resize `image` (H, W, 3) float32 to `size` = (height, width) pixels.
+
+    Aspect is not kept and nothing is cropped: the paper tried cropping and found it worse.
+    An axis that shrinks is averaged over the exact area of each new pixel, an axis that grows is interpolated
+    linearly between pixel centres (the edge repeats), an equal axis is left as it is. Each axis is mixed with
+    weights that sum to 1, so a constant stays constant (cv2.INTER_AREA drops overlaps below 0.001 pixel:
+    5000 to 4999 turns 1.0 into 0.9992). float32 sums of n samples: error below n * 6e-8. Raises BadInput.
+    """
+    check_rgb(image, "image")
+    if min(size) < 1:
+        raise BadInput(f"the new size must be at least 1 x 1 pixel, got {size[0]} x {size[1]}")
+    for axis in sorted((0, 1), key=lambda axis: size[axis] / image.shape[axis]):  # shrink before growing
+        if image.shape[axis] != size[axis]:
+            image = _resize_axis(image, axis, size[axis])
+    return image
+
+
+def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
+    """Mix rows, or columns where they lie: to turn the image over, so that columns are rows, takes five times as long
+    as to mix them."""
+    table = np.ascontiguousarray(image).reshape(image.shape[0], -1)
+    columns, weights = _axis_weights(image.shape[axis], length, channels=3 if axis else 1)
+    weights = weights[:, None, :] if axis else weights[:, :, None]
+    mixed = table.take(columns[0], axis=axis)
+    mixed *= weights[0]
+    part = np.empty_like(mixed)
+    for column, weight in zip(columns[1:], weights[1:], strict=True):
+        np.take(table, column, axis=axis, out=part, mode="clip")  # other modes copy once more; all columns are inside
+        part *= weight
+        mixed += part
+    out: RgbImage = mixed.reshape((-1, length, 3) if axis else (length, -1, 3))
+    return out
+
+
+@lru_cache(maxsize=16)
+def _axis_weights(old: int, new: int, channels: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
+    """Both (n, new * channels): the n old samples that each new one is mixed from, and their weights, of sum 1; for
+    samples that lie `channels` apart, so that each channel has its own."""
+    rows, columns, weights = (_area_weights if new < old else _linear_weights)(old, new)
+    order = np.argsort(rows, kind="stable")
+    rows, columns = rows[order], columns[order]
+    first = np.searchsorted(rows, np.arange(new))
+    place = np.arange(len(rows)) - first[rows]
+    taken = np.tile(columns[first], (place.max() + 1, 1))  # samples of weight 0 where a new one has fewer
+    shares = np.zeros(taken.shape, dtype=np.float32)
+    taken[place, rows], shares[place, rows] = columns, weights[order]
+    each = channels * taken[..., None] + np.arange(channels)
+    return each.reshape(len(taken), -1), np.repeat(shares, channels, axis=1)
+
+
+_Triplets = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]
+
+
+def _area_weights(old: int, new: int) -> _Triplets:
+    """Cut the axis, old * new units long, at all edges of old and new pixels: a piece lies in one of each."""
+    cuts = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)
+    return cuts[:-1] // old, cuts[:-1] // new, np.diff(cuts) / old
+
+
+def _linear_weights(old: int, new: int) -> _Triplets:
+    position = np.clip((np.arange(new) + 0.5) * (old / new) - 0.5, 0, old - 1)
+    left = np.minimum(position.astype(np.int64), max(old - 2, 0))
+    right = np.minimum(left + 1, old - 1)
+    share = position - left
+    rows = np.tile(np.arange(new), 2)
+    return rows, np.concatenate([left, right]), np.concatenate([1 - share, share])
+
+
+def check_rgb(image: RgbImage, what: str) -> None:
+    """Raise BadInput unless `image`, called `what`, is (H, W, 3) float32."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0 or image.dtype != np.float32:
+        shape = " x ".join(map(str, image.shape))
+        raise BadInput(f"{what} must be H x W x 3 float32 in 0..1, got {shape} {image.dtype}; see to_float")

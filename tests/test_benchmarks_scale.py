@@ -1,0 +1,64 @@
+"""The benchmark of scale runs, at sizes that say nothing about time."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval.checkpoint import Checkpoint
+from retrieval.fusion import judge_of
+from tests.benchmarks import scale
+from tests.benchmarks.common import matcher_of
+from tests.conftest import TINY
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=8))
+    matcher = matcher_of(config)
+    checkpoint = Checkpoint.__new__(Checkpoint)
+    object.__setattr__(checkpoint, "matcher", matcher)
+    rng = np.random.default_rng(0)
+    photos, touches = (rng.normal(size=(n, config.matcher.hidden)).astype(np.float32) for n in (50, 12))
+    return scale.Crowd(checkpoint, judge_of(matcher.head), photos, touches)
+
+
+def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
+    monkeypatch.setattr(scale, "ADDED", 20)
+    size = scale.measure(crowd, 700, ("flat", "ivf_sq8"), tmp_path / "index", queries=5)
+    assert (size.photos, size.queries) == (700, 5)
+    for kind in ("flat", "ivf_sq8"):
+        figures = size.kinds[kind]
+        assert 0 <= figures["low"] <= figures["recall"] <= figures["high"] <= 1
+        assert all(
+            figures[name] > 0 for name in ("k", "search_s", "rerank_s", "structure_s", "add_s", "open_s", "gain")
+        )
+        assert figures["add_mb"] < figures["disk_mb"]
+    text = "\n".join(scale.lines(size))
+    assert "700 photos: written in " in text
+    assert "  flat {}: " in text
+    json.dumps(vars(size), allow_nan=False)
+
+
+def test_a_kind_that_needs_more_photos_says_so(crowd, tmp_path):
+    size = scale.measure(crowd, 100, ("ivf_sq8",), tmp_path / "index", queries=2)
+    assert "624 or more vectors" in "\n".join(scale.lines(size))
+
+
+def test_the_winner_is_the_photo_that_the_classifier_puts_first(crowd):
+    halves = np.concatenate([block.arrays["halves"] for block in crowd.blocks(0, 60, 0)])
+    winners, seconds = scale._winners(crowd.judge, crowd.touches[:3], halves)
+    with torch.inference_mode():
+        head, photos = crowd.checkpoint.matcher.head, torch.from_numpy(halves.astype(np.float32))
+        must = [int(head(torch.from_numpy(touch[None]), photos).argmax()) for touch in crowd.touches[:3]]
+    assert winners.tolist() == must
+    assert seconds > 0
+
+
+def test_the_slope_of_a_power_of_n_is_its_exponent():
+    sizes = [
+        scale.Size(n, 1, {"exhaustive_s": 3 * n**0.7}, {"flat": {"search_s": 2.0 * n}}) for n in (10**3, 10**4, 10**6)
+    ]
+    assert dict(scale.slopes(sizes)) == pytest.approx({"exhaustive_s": 0.7, "flat search_s": 1.0})

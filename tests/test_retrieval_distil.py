@@ -1,0 +1,264 @@
+"""Teaching the pruner: its loss, its data, that it finds the classifier's winner, and that nothing else changes."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval import distil
+from retrieval.checkpoint import Checkpoint, load_checkpoint
+from retrieval.config import Config, MatcherConfig, TrainingConfig
+from retrieval.dataset import load_grasps, make_split
+from retrieval.errors import Interrupted, NumericalError
+from retrieval.features import encode_recording
+from retrieval.fusion import Matcher
+from retrieval.methods.base import Setting
+from retrieval.methods.late_fusion import LateFusion
+from retrieval.methods.prune_rerank import PruneRerank
+from retrieval.train import build_matcher
+from tests.conftest import TINY
+
+HIDDEN = 16
+UNTAUGHT = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
+
+
+@pytest.fixture
+def matcher():
+    """Its head says how far apart touch and photo are: minus the sum of |t - v|, each as relu(t - v) + relu(v - t)."""
+    torch.manual_seed(3)
+    matcher = Matcher(UNTAUGHT).eval()
+    with torch.no_grad():
+        matcher.head.second.weight.copy_(torch.eye(HIDDEN))
+        matcher.head.second.bias.zero_()
+        matcher.head.out.weight.fill_(-1.0)
+    return matcher
+
+
+@pytest.fixture(autouse=True)
+def _small_batches(monkeypatch):
+    monkeypatch.setattr(distil, "TOUCHES", 16)
+    monkeypatch.setattr(distil, "PHOTOS", 256)
+    monkeypatch.setattr(distil, "LEARNING_RATE", 0.02)
+
+
+def drawn(count, seed, sign):
+    """Halves that vary in two directions, as a tower's vary in few: of touches with sign 1, of photos with -1."""
+    directions = torch.randn(2, HIDDEN // 2, generator=torch.Generator().manual_seed(4))
+    seen = torch.randn(count, 2, generator=torch.Generator().manual_seed(seed)) @ directions
+    return sign * torch.cat([seen, -seen], dim=1)
+
+
+@pytest.fixture
+def halves():
+    return drawn(60, 5, sign=1), drawn(400, 6, sign=-1)
+
+
+def taught(matcher, halves, steps=5, seed=0, **given):
+    distil.distil(matcher, *halves, width=32, steps=steps, seed=seed, quiet=True, **given)
+    return {name: tensor.clone() for name, tensor in matcher.pruner.state_dict().items()}
+
+
+def same(left, right):
+    return all(torch.equal(left[name], right[name]) for name in left)
+
+
+# The loss --------------------------------------------------------------------------------------------------
+
+
+def test_the_loss_is_nothing_for_scores_that_are_the_logits_up_to_a_constant_of_each_touch():
+    logits = torch.tensor([[3.0, -1.0, 0.5], [200.0, -200.0, 0.0]])
+    loss = distil.order_loss(logits + torch.tensor([[7.0], [-20.0]]), logits)
+    torch.testing.assert_close(loss, torch.tensor(0.0), rtol=0, atol=1e-5)
+
+
+def test_the_loss_is_the_divergence_and_a_share_of_the_error_by_hand():
+    scores, logits = np.array([[0.0, 1.0], [2.0, 2.0]]), np.array([[1.0, 0.0], [3.0, 5.0]])
+    chances = [np.exp(row) / np.exp(row).sum() for row in logits]
+    other = [np.exp(row) / np.exp(row).sum() for row in scores]
+    divergence = np.mean([(p * np.log(p / q)).sum() for p, q in zip(chances, other, strict=True)])
+    centred = [row - row.mean() for row in scores], [row - row.mean() for row in logits]
+    error = np.mean((np.array(centred[0]) - np.array(centred[1])) ** 2) / logits.var(ddof=1)
+    loss = distil.order_loss(torch.tensor(scores), torch.tensor(logits))
+    assert loss.item() == pytest.approx(divergence + distil.SPREAD_WEIGHT * error)
+
+
+def test_logits_that_lie_far_apart_have_a_finite_loss_where_probabilities_have_none():
+    scores, logits = torch.tensor([[-300.0, 300.0]]), torch.tensor([[300.0, -300.0]])
+    chances = logits.softmax(1)
+    assert (chances * (chances / scores.softmax(1)).log()).sum().isnan()
+    assert distil.order_loss(scores, logits).item() > 600
+
+
+def test_a_loss_that_is_not_finite_is_told_and_the_matcher_stays_as_it_was(matcher, halves):
+    with torch.no_grad():
+        matcher.head.out.bias.fill_(torch.inf)
+    with pytest.raises(NumericalError, match="loss must stay finite"):
+        taught(matcher, halves)
+    assert matcher.pruner is None
+    assert matcher.config == UNTAUGHT
+
+
+# Its data --------------------------------------------------------------------------------------------------
+
+
+def test_a_blend_of_halves_is_the_half_of_the_blend_of_features(matcher):
+    features = torch.randn(5, matcher.photo_tower.feature_count)
+    blends = [distil.blend(rows, 50, torch.Generator().manual_seed(1)) for rows in (features, _half(matcher, features))]
+    torch.testing.assert_close(_half(matcher, blends[0]), blends[1], rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def _half(matcher, features):
+    return matcher.photo_code(features).half
+
+
+def test_a_blend_lies_between_two_rows_and_nearer_to_one():
+    corners = torch.eye(3)
+    blends = distil.blend(corners, 200, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(blends.sum(1), torch.ones(200))
+    assert ((blends > 0).sum(1) <= 2).all()
+    assert (blends.max(1).values >= 0.5).all()
+    assert len(blends.unique(dim=0)) > 100
+
+
+def test_every_touch_is_judged_with_every_photo(matcher, halves):
+    touches, photos = halves[0][:4], halves[1][:6]
+    table = distil.all_logits(matcher.head, touches, photos)
+    for row, column in itertools.product(range(4), range(6)):
+        one = matcher.head(touches[row][None], photos[column][None])
+        torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)
+
+
+# What is taught --------------------------------------------------------------------------------------------
+
+
+def test_the_winner_is_found_among_few_where_an_untaught_pruner_misses_it(matcher, halves):
+    """On touches that were not taught, among 400 photos."""
+    unseen = drawn(100, 8, sign=1)
+    taught(matcher, halves, steps=1)
+    before = distil.winner_ranks(matcher, unseen, halves[1])
+    taught(matcher, halves, steps=60)
+    after = distil.winner_ranks(matcher, unseen, halves[1])
+    assert (before < 40).mean() < 0.3
+    assert (after < 40).mean() > 0.8
+
+
+def test_the_rank_of_a_winner_counts_the_photos_nearer_than_it(matcher, halves):
+    taught(matcher, halves)
+    touches, photos = halves[0][:10], halves[1]
+    ranks = distil.winner_ranks(matcher, touches, photos)
+    for touch, rank in zip(touches, ranks, strict=True):
+        logits = [matcher.head(touch[None], photo[None]).item() for photo in photos]
+        nearness = (matcher.pruner.touch(touch[None]) @ matcher.pruner.photo(photos).T)[0].tolist()
+        assert rank == sum(near > nearness[int(np.argmax(logits))] for near in nearness)
+
+
+def test_the_seed_decides_and_neither_the_pruner_before_nor_other_random_numbers_do(matcher, halves):
+    first = taught(matcher, halves)
+    torch.manual_seed(99)
+    state = torch.get_rng_state()
+    assert same(taught(matcher, halves), first)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not same(taught(matcher, halves, seed=1), first)
+
+
+def test_nothing_but_the_pruner_changes(matcher, halves):
+    before = {name: tensor.clone() for name, tensor in matcher.state_dict().items()}
+    taught(matcher, halves)
+    after = matcher.state_dict()
+    assert same(before, after)
+    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"pruner"}
+    assert matcher.config == dataclasses.replace(UNTAUGHT, pruner_width=32)
+    assert all(parameter.grad is None for name, parameter in matcher.named_parameters() if "pruner" not in name)
+
+
+def test_a_stop_leaves_the_matcher_as_it_was(matcher, halves):
+    asked = iter([False, False, True])
+    with pytest.raises(Interrupted):
+        taught(matcher, halves, stopped=lambda: next(asked))
+    assert matcher.pruner is None
+
+
+# Into a checkpoint -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def checkpoint(matcher, tmp_path):
+    about = {"step": 1, "source": "test", "data_digest": "0", "metrics": {"validation_auc": 0.75}}
+    return Checkpoint(
+        path=tmp_path / "m.safetensors",
+        digest="",
+        matcher=matcher,
+        config=Config(UNTAUGHT),
+        split=None,
+        calibration=None,
+        provenance=about,
+    )
+
+
+def wanted(steps=20):
+    return Config(dataclasses.replace(UNTAUGHT, pruner_width=32), TrainingConfig(distil_steps=steps))
+
+
+def test_a_checkpoint_gets_a_pruner_queries_and_the_pruners_own_measure(checkpoint, halves):
+    held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
+    assert not checkpoint.config.has_embeddings
+    path = checkpoint.path
+    distil.store(distil.with_pruner(checkpoint, wanted(), halves, held_out, quiet=True), path)
+    made = load_checkpoint(path)
+    assert made.config == wanted()
+    assert made.config.has_embeddings
+    np.testing.assert_array_equal(made.queries, held_out[0].half().numpy())
+    ranks = distil.winner_ranks(
+        made.matcher, torch.from_numpy(made.queries).float(), torch.cat([halves[1], held_out[1]])
+    )
+    metrics = made.provenance["metrics"]
+    assert metrics == {"validation_auc": 0.75, "pruner_finds_winner_in_nearest_percent": (ranks < 4).mean()}
+    assert "pruner finds winner in nearest percent" in path.with_suffix(".md").read_text()
+
+
+def test_without_validation_objects_there_are_neither_queries_nor_a_measure(checkpoint, halves):
+    made = distil.with_pruner(checkpoint, wanted(2), halves, quiet=True)
+    assert made.queries is None
+    assert made.provenance["metrics"] == {"validation_auc": 0.75}
+
+
+def test_queries_are_as_many_as_are_kept_and_only_what_float16_holds():
+    halves = torch.arange(1200.0)[:, None] * torch.ones(1, 2)
+    halves[7, 1] = 70_000.0
+    queries = distil.kept_queries(halves, seed=0)
+    assert queries.dtype == np.float16
+    assert queries.shape == (distil.QUERIES, 2)
+    assert len(np.unique(queries[:, 0])) == distil.QUERIES
+    assert np.isfinite(queries).all()
+    np.testing.assert_array_equal(queries, distil.kept_queries(halves, seed=0))
+    assert halves.half()[7, 1].isinf()
+    assert distil.kept_queries(halves[7:8], seed=0) is None
+
+
+def test_an_older_checkpoint_without_a_word_of_pruners_searches_by_its_contrastive_embeddings():
+    tables = TINY.to_dict()
+    del tables["matcher"]["pruner_width"], tables["training"]["distil_steps"]
+    config = Config.from_dict(tables)
+    assert (config.matcher.pruner_width, config.has_embeddings) == (0, True)
+    assert Matcher(config.matcher).pruner is None
+
+
+# In the harness --------------------------------------------------------------------------------------------
+
+
+def test_with_a_pruner_the_best_of_a_few_candidates_is_late_fusions_best_photo(recording, tmp_path):
+    training = dataclasses.replace(TINY.training, freeze_towers=True, distil_steps=60, iterations=30)
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=32), training=training)
+    grasps = load_grasps(recording)
+    features = encode_recording(grasps, build_matcher(config).eval(), config, None, quiet=True)
+    split = make_split(grasps, validation=0.25, test=0.2, seed=0)
+    parts = [features.of_objects(part) for part in (split.train, split.validation)]
+    best = []
+    for method in (LateFusion(Setting(config, folder=tmp_path)), PruneRerank(Setting(config, folder=tmp_path))):
+        method.fit(*parts)
+        best.append(method.score(method.encode_touch(features.touch), method.encode_photo(features.photo)).argmax(1))
+    assert method.chosen["judged_share"] == 0.25
+    np.testing.assert_array_equal(*best)

@@ -1,0 +1,185 @@
+"""The towers as they run in a query and in a build, against the towers as they are trained."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils import parameters_to_vector
+
+from retrieval.checkpoint import load_checkpoint
+from retrieval.config import MatcherConfig
+from retrieval.defaults import shipped_model
+from retrieval.encode import (
+    encode_photos,
+    encode_touches,
+    for_inference,
+    photo_features,
+    to_batch,
+    touch_batch,
+    touch_features,
+)
+from retrieval.errors import NumericalError
+from retrieval.fusion import Matcher
+from retrieval.towers import OUTPUTS, TOWERS
+
+SIDE = 48
+SMALL = MatcherConfig(tower="small", tower_output="pooled", hidden=8)
+
+
+def matcher_with_statistics(tower, output):
+    """A matcher in evaluation mode whose batch normalisations have seen pictures, and scale and shift."""
+    torch.manual_seed(0)
+    matcher = Matcher(MatcherConfig(tower=tower, tower_output=output, hidden=16, standardise=True, pruner_width=8))
+    for module in matcher.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.uniform_(module.bias, -0.5, 0.5)
+            module.momentum = None
+    with torch.no_grad():
+        matcher.train()(torch.rand(4, 2, 3, SIDE, SIDE), torch.rand(4, 3, SIDE, SIDE))
+    return matcher.eval()
+
+
+def images(count, seed=1):
+    return list(np.random.default_rng(seed).random((count, SIDE, SIDE, 3), dtype=np.float32))
+
+
+@pytest.mark.parametrize("tower", sorted(TOWERS))
+@torch.inference_mode()
+def test_folded_towers_are_as_near_to_float64_as_the_plain_ones(tower):
+    """These weights were never trained, and 50 layers of them enlarge any rounding; they do so for both."""
+    matcher, photos = matcher_with_statistics(tower, "stages"), images(2)
+    plain, ours = matcher.photo_features(to_batch(photos)), photo_features(matcher, photos)
+    double = copy.deepcopy(matcher.photo_tower).double()
+    exact = double._encode((to_batch(photos).double() - double.mean) / double.std)
+    rounding, error = (float((features - exact).abs().max() / exact.abs().max()) for features in (plain, ours))
+    assert error <= 3 * rounding + 1e-6
+    assert error <= 1e-3
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_every_output_of_a_tower_and_a_touch_of_two_fingers_stay_the_same(output):
+    matcher, touches = matcher_with_statistics("resnet18", output), [images(2, seed) for seed in (2, 3)]
+    with torch.inference_mode():
+        plain = matcher.touch_features(touch_batch(touches))
+    torch.testing.assert_close(touch_features(matcher, touches), plain, rtol=1e-4, atol=1e-4 * float(plain.abs().max()))
+
+
+@torch.inference_mode()
+def test_the_shipped_model_gives_the_halves_and_embeddings_of_its_plain_towers():
+    matcher = load_checkpoint(shipped_model()).matcher
+    photos = smooth_pictures()
+    plain, ours = matcher.photo_entry(matcher.photo_features(to_batch(photos))), encode_photos(matcher, photos)
+    assert float((ours.half - plain.half).abs().max() / plain.half.abs().max()) <= 1e-5
+    assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-5
+
+
+def smooth_pictures():
+    """Smooth pictures, nearer to photos than noise is."""
+    axis = np.linspace(0, 6, 224, dtype=np.float32)
+    waves = [np.sin(k * axis)[:, None] * np.cos((k + 1) * axis)[None] for k in range(1, 5)]
+    return [np.stack([wave, wave.T, wave**2], axis=2) / 2 + 0.5 for wave in waves]
+
+
+@pytest.mark.parametrize("tower", sorted(TOWERS))
+def test_no_batch_normalisation_is_left_in_a_tower_that_runs(tower):
+    fast = for_inference(matcher_with_statistics(tower, "pooled"))
+    for name in ("touch_tower", "photo_tower"):
+        assert not [part for part in fast.get_submodule(name).modules() if isinstance(part, nn.BatchNorm2d)]
+
+
+def test_the_matcher_itself_stays_as_it_is():
+    matcher = matcher_with_statistics("resnet18", "pooled")
+    before = copy.deepcopy(matcher.state_dict())
+    encode_photos(matcher, images(2))
+    after = matcher.state_dict()
+    assert list(after) == list(before)
+    for name, tensor in before.items():
+        assert torch.equal(after[name], tensor)
+        assert after[name].stride() == tensor.stride()
+
+
+def test_a_tower_is_prepared_once():
+    matcher = Matcher(SMALL).eval()
+    first = for_inference(matcher)
+    assert for_inference(matcher).photo_tower is first.photo_tower
+    assert for_inference(matcher).touch_tower is first.touch_tower
+
+
+def written_in_place(matcher):
+    with torch.no_grad():
+        next(matcher.photo_tower.parameters()).mul_(2)
+
+
+def loaded(matcher):
+    matcher.load_state_dict({name: tensor + 1 for name, tensor in matcher.state_dict().items()})
+
+
+def replaced(matcher):
+    matcher.photo_tower.stages[0].weight = nn.Parameter(2 * matcher.photo_tower.stages[0].weight.detach())
+
+
+def given_other_data(matcher):
+    weight = matcher.photo_tower.stages[0].weight
+    weight.data = 2 * weight.data
+
+
+def one_step_of_training(matcher):
+    optimiser = torch.optim.SGD(matcher.parameters(), lr=1.0)
+    matcher.photo_features(to_batch(images(2))).sum().backward()
+    optimiser.step()
+
+
+@pytest.mark.parametrize("change", [written_in_place, loaded, replaced, given_other_data, one_step_of_training])
+def test_weights_that_change_are_the_ones_that_run_next(change):
+    torch.manual_seed(0)
+    matcher = Matcher(SMALL).eval()
+    before = photo_features(matcher, images(2))
+    vector = parameters_to_vector(matcher.photo_tower.parameters()).detach().clone()
+    change(matcher)
+    assert not torch.equal(parameters_to_vector(matcher.photo_tower.parameters()).detach(), vector)
+    with torch.inference_mode():
+        expected = matcher.photo_features(to_batch(images(2)))
+    torch.testing.assert_close(photo_features(matcher, images(2)), expected, rtol=1e-5, atol=1e-5)
+    assert not torch.equal(before, expected)
+
+
+def test_a_head_or_pruner_that_changes_is_used_at_once():
+    matcher = matcher_with_statistics("small", "pooled")
+    before = encode_touches(matcher, [images(2)])
+    with torch.no_grad():
+        matcher.head.touch_half.bias += 1
+    torch.testing.assert_close(encode_touches(matcher, [images(2)]).half, before.half + 1)
+    matcher.pruner = None
+    with torch.inference_mode():
+        expected = matcher.touch_code(touch_features(matcher, [images(2)])).embedding
+    assert torch.equal(encode_touches(matcher, [images(2)]).embedding, expected)
+
+
+def test_a_tower_in_training_mode_is_not_folded_as_its_normalisation_looks_at_the_batch():
+    matcher = matcher_with_statistics("resnet18", "pooled").train()
+    fast = for_inference(matcher)
+    assert fast.photo_tower is matcher.photo_tower
+    batch = to_batch(images(4))
+    with torch.inference_mode():
+        together, alone = matcher.photo_features(batch)[:1], matcher.eval().photo_features(batch[:1])
+    assert not torch.allclose(together, alone, rtol=0.01)  # folding would give the second
+
+
+def test_the_code_does_not_depend_on_the_batch():
+    matcher = matcher_with_statistics("mobilenet_v2", "stages")
+    photos = images(7)
+    ways = [encode_photos(matcher, photos, batch) for batch in (1, 3, 7)]
+    for way in ways[1:]:
+        torch.testing.assert_close(way.half, ways[0].half, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(way.embedding, ways[0].embedding, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_pixel_that_is_not_finite_is_refused_by_a_folded_tower_too(bad):
+    photo = images(1)[0]
+    photo[3, 4, 1] = bad
+    with pytest.raises(NumericalError, match="finite pixels"):
+        encode_photos(matcher_with_statistics("resnet18", "pooled"), [photo])

@@ -1,0 +1,218 @@
+"""Operating points: how many candidates are judged and in which index, by the classifier's own winners."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from indexes.errors import ParameterError
+from retrieval import operating
+from retrieval.checkpoint import Checkpoint
+from retrieval.errors import BadInput
+from retrieval.fusion import Matcher
+from retrieval.operating import Asked, Bench, Point, all_judged, can_measure, kept, needs_measuring, sentence, settle
+from tests.conftest import TINY
+
+PHOTOS, TOUCHES = 70, 40
+
+
+def checkpoint_of(pruner_width=8, queries=TOUCHES):
+    """A matcher with random weights whose queries are random halves."""
+    torch.manual_seed(0)
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=pruner_width))
+    halves = np.random.default_rng(1).normal(size=(queries, config.matcher.hidden)).astype(np.float16)
+    matcher = Matcher(config.matcher).eval()
+    return Checkpoint(Path("m"), "0" * 64, config, {}, matcher=matcher, split=None, calibration=None, queries=halves)
+
+
+@pytest.fixture
+def checkpoint():
+    return checkpoint_of()
+
+
+@pytest.fixture
+def gallery(checkpoint):
+    """Distinct vectors, each photo's place among them, and halves; the last ten photos are copies of the first ten, and
+    the first vector is nobody's."""
+    halves = np.random.default_rng(2).normal(size=(PHOTOS, checkpoint.config.matcher.hidden)).astype(np.float16)
+    halves[-10:] = halves[:10]
+    with torch.inference_mode():
+        embeddings = checkpoint.matcher.pruner.photo(torch.from_numpy(halves.astype(np.float32))).numpy()
+    slots = np.concatenate([np.arange(PHOTOS - 10), np.arange(10)]) + 1
+    return np.concatenate([embeddings[50:51], embeddings[:-10]]), slots, halves
+
+
+@pytest.fixture(autouse=True)
+def _short_ladder(monkeypatch):
+    monkeypatch.setattr(operating, "FIRST", 4)
+
+
+def winners_found(checkpoint, vectors, slots, halves, k):
+    """By plain loops: of how many touches the best photo, or its copy, has fewer than k distinct better embeddings."""
+    embeddings, found = vectors[slots], 0
+    for touch in torch.from_numpy(checkpoint.queries.astype(np.float32)):
+        with torch.inference_mode():
+            logits = [
+                float(checkpoint.matcher.head(touch, torch.from_numpy(half))) for half in halves.astype(np.float32)
+            ]
+            query = checkpoint.matcher.pruner.touch(touch).numpy()
+        best = embeddings[int(np.argmax(logits))]
+        better = {row.tobytes() for row in embeddings if row @ query > best @ query}
+        found += len(better) < k
+    return found
+
+
+@pytest.mark.parametrize("k", [4, 8, 16, 32])
+def test_the_winner_recall_is_that_of_two_plain_loops(k, checkpoint, gallery):
+    bench = Bench(checkpoint, *gallery)
+    point = bench.point(bench.built("flat"), k)
+    assert (point.found, point.queries) == (winners_found(checkpoint, *gallery, k), TOUCHES)
+
+
+def test_judging_every_photo_finds_every_winner_and_searches_nothing(checkpoint, gallery, monkeypatch):
+    bench = Bench(checkpoint, *gallery)
+    index = bench.built("flat")
+    monkeypatch.setattr(index, "search", None)
+    point = bench.point(index, PHOTOS)
+    assert (point.recall, point.search_ms, point.judge_ms) == (1.0, 0.0, bench.exhaustive_ms)
+
+
+def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall(checkpoint, gallery):
+    settled = settle(Bench(checkpoint, *gallery), Asked())
+    enough = [k for k in (4, 8, 16, 32, 64) if winners_found(checkpoint, *gallery, k) >= 0.99 * TOUCHES]
+    assert settled.kind == "flat"
+    assert settled.candidates["k"] == min([*enough, PHOTOS])
+    assert settled.candidates["winner_recall"] >= 0.99
+    assert settled.candidates["interval"][0] < settled.candidates["winner_recall"]
+
+
+def test_a_lower_recall_takes_fewer_candidates(checkpoint, gallery):
+    bench = Bench(checkpoint, *gallery)
+    low, high = (settle(bench, Asked("flat", min_recall=recall)).candidates["k"] for recall in (0.3, 1.0))
+    assert low < high
+
+
+def test_fewer_touches_are_asked_of_more_photos_but_never_too_few(checkpoint, gallery, monkeypatch):
+    one = 2.0 * PHOTOS * checkpoint.config.matcher.hidden**2
+    monkeypatch.setattr(operating, "LEAST_QUERIES", 5)
+    for flops, queries in ((1e12, TOUCHES), (20 * one, 20), (one, 5)):
+        monkeypatch.setattr(operating, "MEASURING", flops)
+        assert Bench(checkpoint, *gallery).queries == queries
+
+
+class Scripted:
+    """A bench whose points are written down: {(kind, k): (found of 100, search ms, judging ms)}; k = 1000 is all."""
+
+    count, exhaustive_ms = 1000, 50.0
+
+    def __init__(self, points):
+        self.points, self.built_kinds = points, []
+
+    def built(self, kind):
+        self.built_kinds.append(kind)
+        return dataclasses.make_dataclass("Built", ["kind"])(kind)
+
+    def point(self, index, k):
+        found, search, judge = (100, 0.0, 50.0) if k >= self.count else self.points.get((index.kind, k), (0, 1.0, 1.0))
+        return Point(index.kind, operating.load_kind("flat").parameters_type(), k, found, 100, search, judge)
+
+    def times(self, index, k):
+        point = self.point(index, k)
+        return point.search_ms, point.judge_ms
+
+
+@pytest.fixture
+def flat_ladders(monkeypatch):
+    """Kinds without settings to try."""
+    monkeypatch.setattr(operating, "FIRST", 250)
+    monkeypatch.setattr(operating, "ladder", lambda built: iter([built]))
+
+
+EXACT = {("flat", 250): (97, 2.0, 1.0), ("flat", 500): (99, 2.0, 2.5), ("flat", 100): (90, 2.0, 0.5)}
+QUICK = {**EXACT, ("ivf_flat", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.5)}
+
+
+@pytest.mark.parametrize(
+    ("asked", "points", "kind", "k", "said"),
+    [
+        (Asked(), QUICK, "flat", 500, ""),
+        (Asked(min_recall=0.95), EXACT | {("ivf_flat", 500): (99, 0.1, 2.0)}, "ivf_flat", 500, ""),
+        (Asked(min_recall=0.99), QUICK, "flat", 500, ""),  # the search takes less than the judging
+        (Asked(max_ms=5), QUICK, "flat", 500, ""),
+        (Asked(max_ms=4), QUICK, "ivf_flat", 500, ""),
+        (Asked(max_ms=2.8), QUICK, "hnsw", 500, ""),
+        (Asked(max_ms=2.6), QUICK, "flat", 100, "reaches a winner recall of 0.99; this is the nearest"),
+        (Asked(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the nearest"),
+        (Asked(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the nearest"),
+        (Asked("ivf_flat"), QUICK, "ivf_flat", 500, ""),
+        (Asked("ivf_flat"), EXACT, "ivf_flat", 1000, ""),  # all are judged before a winner is lost
+        (Asked("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
+    ],
+)
+def test_what_was_asked_for_decides(asked, points, kind, k, said, flat_ladders):
+    settled = settle(Scripted(points), asked)
+    assert (settled.kind, settled.candidates["k"]) == (kind, k)
+    assert said in settled.reason
+    assert bool(said) == ("nearest" in settled.reason)
+
+
+def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do(flat_ladders):
+    for asked, built in ((Asked(), {"flat"}), (Asked(max_ms=5), {"flat"}), (Asked(max_ms=4), {"flat", "ivf_flat"})):
+        bench = Scripted(QUICK)
+        settle(bench, asked)
+        assert set(bench.built_kinds) == built
+
+
+def test_few_photos_are_all_judged_unless_that_may_be_too_slow():
+    assert not needs_measuring(4, Asked())
+    assert not needs_measuring(4, Asked(min_recall=1.0))
+    assert needs_measuring(5, Asked())
+    assert needs_measuring(4, Asked(max_ms=5))
+    assert sentence(all_judged(4, Asked())) == "The classifier judges all 4 photos."
+
+
+def test_a_measurement_stands_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
+    made = settle(Bench(checkpoint, *gallery), Asked()).candidates
+    assert kept(made, Asked(), PHOTOS, 0) == made
+    after = kept(made, Asked(), PHOTOS + 4, 4)
+    assert after == {**made, "changed": 4}
+    assert kept(after, Asked(), PHOTOS + 7, 3)["changed"] == 7
+    assert kept(after, Asked(), PHOTOS + 8, 4) is None
+    assert kept(made, Asked(min_recall=0.5), PHOTOS, 0) is None
+    assert kept(all_judged(4, Asked()), Asked(), 5, 1) is None
+    assert kept(None, Asked(), PHOTOS, 0) is None
+
+
+def test_where_all_were_judged_newcomers_are_too():
+    made = {**all_judged(1000, Asked()), "queries": 50}
+    assert kept(made, Asked(), 1001, 1)["k"] == 1001
+
+
+def test_a_point_is_told_in_one_sentence_with_its_interval():
+    record = {"k": 500, "winner_recall": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
+    record |= {"exhaustive_ms": 50.0, "asked": dataclasses.asdict(Asked()), "photos": 1000}
+    assert sentence(record) == (
+        "The classifier judges the best 500 of 1000 photos: these hold its winner for 99 of 100 validation touches "
+        "(95 % interval 0.946 to 1.000), in 4.5 ms against 50 ms for all."
+    )
+
+
+def test_measuring_needs_touches_and_embeddings_that_are_made_from_them():
+    assert can_measure(checkpoint_of())
+    assert not can_measure(checkpoint_of(pruner_width=0))
+    assert not can_measure(checkpoint_of(queries=0))
+    with pytest.raises(BadInput, match="must keep touches to measure with"):
+        operating.query_codes(checkpoint_of(pruner_width=0))
+
+
+def test_what_cannot_be_asked_for_is_refused():
+    with pytest.raises(ParameterError, match="must be one of"):
+        Asked("tree")
+    for recall in (0, -0.1, 1.01, float("nan")):
+        with pytest.raises(BadInput, match="least winner recall"):
+            Asked(min_recall=recall)
+    for ms in (0, -1, float("nan")):
+        with pytest.raises(BadInput, match="must be above 0 ms"):
+            Asked(max_ms=ms)
