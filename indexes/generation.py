@@ -167,7 +167,10 @@ class Generation:
             held |= {segment_name(column, number): array for column, array in columns.items()}
         for number, part in zip(numbers["vectors"], parts_of(self.embeddings), strict=True):
             held[segment_name("embeddings", number)] = part
-        return memoryview(held[name].base)  # type: ignore[arg-type]  # the mapping of the whole file
+        array = held[name]
+        while isinstance(array.base, np.ndarray):
+            array = array.base
+        return memoryview(array.base)  # type: ignore[arg-type]  # the mapping of the whole file
 
     @cached_property
     def _digests(self) -> NDArray[np.bytes_]:
@@ -242,8 +245,9 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
 
 
 def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
-    text = np.memmap(folder / segment_name("rows", number), np.uint8, "r")
-    table = mapped(folder / segment_name("table", number))
+    # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
+    text = np.asarray(np.memmap(folder / segment_name("rows", number), np.uint8, "r"))
+    table = np.asarray(mapped(folder / segment_name("table", number)))
     arrays = {name: mapped(folder / segment_name(name, number)) for name in manifest.arrays}
     must = {"fields": RECORD, "bytes of text": len(text)} | dict.fromkeys(arrays, len(table))
     got = {"fields": table.dtype, "bytes of text": int(table["stop"][-1])}

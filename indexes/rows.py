@@ -125,7 +125,7 @@ class Rows(Sequence[dict[str, Any]]):
 
     def _parsed(self, place: int) -> dict[str, Any]:
         try:
-            row = json.loads(self.records.line(place))
+            row = json.loads(self.records.line(place).decode())
             row["id"]
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise CorruptIndex(

@@ -371,12 +371,14 @@ TINY_TOML = """
 tower = "small"
 tower_output = "pooled"
 hidden = 16
+pruner_width = 8
 embedding_dim = 8
 standardise = true
 [training]
 init = "random"
 iterations = 40
 touches_per_batch = 2
+distil_steps = 3
 validate_every = 30
 validation_fraction = 0.25
 contrastive_weight = 1.0
@@ -409,7 +411,9 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
-    assert load_checkpoint(out).provenance["step"] == 2
+    made = load_checkpoint(out)
+    assert made.provenance["step"] == 2
+    assert made.matcher.pruner is not None
 
 
 def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):

@@ -54,7 +54,8 @@ def index_kinds(sample: Sample) -> Row:
         "Kind of index",
         f"Search over {len(embeddings):,} blended photos by the {used[0]}. What counts for an answer is whether the "
         "classifier's winner is among the candidates; whether nearest neighbours are found is what such indexes are "
-        "usually judged by, and another thing.",
+        "usually judged by, and another thing. Exact search is used unless `build-index` is given a bound: it needs no "
+        "training, and what it finds does not hang on the catalogue.",
         (
             _panel(
                 f"missed winners among k = {k:,} candidates", k, "every photo judged", 100 / len(queries), of_winners
