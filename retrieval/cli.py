@@ -231,9 +231,10 @@ def _training_config(arguments: argparse.Namespace) -> "Config":
     from retrieval.config import load_config
 
     config = load_config(arguments.config or DEFAULT_PRESET)
-    given = {name: getattr(arguments, name) for name in ("init", "iterations", "seed")}
+    given = {name: getattr(arguments, name) for name in ("init", "seed")}
     changed = {name: value for name, value in given.items() if value is not None}
-    return dataclasses.replace(config, training=dataclasses.replace(config.training, **changed))
+    steps = config.training.iterations if arguments.iterations is None else arguments.iterations
+    return dataclasses.replace(config, training=dataclasses.replace(config.training.of_steps(steps), **changed))
 
 
 def _read_split(path: Path | None) -> "Split | None":

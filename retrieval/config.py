@@ -101,6 +101,10 @@ class TrainingConfig:
             f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
         )
 
+    def of_steps(self, iterations: int) -> "TrainingConfig":
+        """The same with so many optimiser steps, and at most as many to teach the pruner."""
+        return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
+
 
 SCHEDULES = ("constant", "cosine")
 PRECISIONS = ("auto", "float32", "bfloat16")
@@ -118,6 +122,10 @@ class Config:
     def has_embeddings(self) -> bool:
         """Whether embeddings are trained, so that candidates can be searched by them."""
         return self.matcher.pruner_width > 0 or self.training.contrastive_weight > 0
+
+    def without_pruner(self) -> "Config":
+        """The same with no pruner to be taught."""
+        return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, as in a TOML file."""

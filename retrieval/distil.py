@@ -22,6 +22,7 @@ from retrieval.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.config import Config
 from retrieval.dataset import Grasp, PairBatch
 from retrieval.errors import Interrupted, NumericalError
+from retrieval.features import Features
 from retrieval.fusion import FusionHead, Matcher
 from retrieval.progress import Bar
 from retrieval.pruner import Pruner, Spread
@@ -169,6 +170,13 @@ def recorded_halves(
             bar.advance(len(rows))
     touches, photos = zip(*parts, strict=True)
     return torch.cat(touches), torch.cat(photos)
+
+
+@torch.inference_mode()
+def feature_halves(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
+    """Halves (G, hidden) of the touches and of the photos of features."""
+    touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
+    return matcher.touch_code(touch).half, matcher.photo_code(photo).half
 
 
 def _unpaired(grasps: list[Grasp]) -> PairBatch:

@@ -122,7 +122,7 @@ class Trainer:
         self.data_digest = known.digest if known else data_digest(grasps)
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.untaught = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, pruner_width=0))
+        self.untaught = config.without_pruner()
         self.matcher = build_matcher(self.untaught).to(self.device)
         trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.

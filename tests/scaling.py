@@ -92,7 +92,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _config(arguments: argparse.Namespace) -> Config:
     config = load_config(arguments.preset)
-    training = dataclasses.replace(config.training, init=arguments.init, iterations=arguments.iterations)
+    training = dataclasses.replace(config.training.of_steps(arguments.iterations), init=arguments.init)
     touch_px = arguments.touch_px or config.preprocessing.touch_px
     preprocessing = dataclasses.replace(config.preprocessing, touch_px=touch_px)
     return dataclasses.replace(config, training=training, preprocessing=preprocessing)

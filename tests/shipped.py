@@ -17,7 +17,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from retrieval import cli, defaults, distil
 from retrieval.checkpoint import Checkpoint, load_checkpoint
@@ -25,7 +24,6 @@ from retrieval.config import load_config
 from retrieval.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.encode import one_thread
 from retrieval.features import Features, encode_recording
-from retrieval.fusion import Matcher
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
 from retrieval.train import build_matcher
@@ -72,41 +70,36 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         return code
     grasps = load_grasps(recording)
     config = load_config("mobilenet")
-    taught = {"init": str(arguments.init), "iterations": arguments.iterations, "distil_steps": DISTIL_STEPS}
-    training = dataclasses.replace(config.training, **taught)
+    training = dataclasses.replace(config.training, init=str(arguments.init), iterations=arguments.iterations)
     config = dataclasses.replace(config, training=training)
     features = encode_recording(grasps, build_matcher(config).eval(), config, arguments.folder / "features")
     split = draw_split(grasps, train=None, validation=VALIDATION)
     parts = (features.of_objects(split.train), features.of_objects(split.validation))
     made = trained_checkpoint(Setting(config, folder=arguments.folder, quiet=False), *parts)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
-    store(dataclasses.replace(made, provenance=made.provenance | about), arguments.folder / defaults.SHIPPED)
+    made = dataclasses.replace(made, provenance=made.provenance | about)
+    store(taught(made, features, DISTIL_STEPS), arguments.folder / defaults.SHIPPED)
     return 0
 
 
 def distil_shipped(arguments: argparse.Namespace) -> int:
     """Towers, head, calibration and split stay; the pruner reads the weights that are shipped, rounded as they are."""
-    shipped, preset = load_checkpoint(defaults.shipped_model()), load_config("mobilenet")
-    matcher = dataclasses.replace(shipped.config.matcher, pruner_width=preset.matcher.pruner_width)
-    training = dataclasses.replace(shipped.config.training, distil_steps=arguments.steps)
-    config = dataclasses.replace(shipped.config, matcher=matcher, training=training)
+    shipped = load_checkpoint(defaults.shipped_model())
     grasps = load_grasps(arguments.folder / "recording")
-    features = encode_recording(grasps, shipped.matcher, config, arguments.folder / "features")
-    assert shipped.split is not None
-    train, validation = (
-        halves(shipped.matcher, features.of_objects(part)) for part in (shipped.split.train, shipped.split.validation)
-    )
-    with one_thread():  # as training on features that stand still
-        made = distil.with_pruner(shipped, config, train, validation)
-    store(made, arguments.folder / defaults.SHIPPED)
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    store(taught(shipped, features, arguments.steps), arguments.folder / defaults.SHIPPED)
     return 0
 
 
-@torch.inference_mode()
-def halves(matcher: Matcher, features: Features) -> tuple[torch.Tensor, torch.Tensor]:
-    """Halves of touches and of photos (G, hidden)."""
-    touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
-    return matcher.touch_code(touch).half, matcher.photo_code(photo).half
+def taught(made: Checkpoint, features: Features, steps: int) -> Checkpoint:
+    """A checkpoint with a pruner of the preset's width."""
+    assert made.split is not None
+    matcher = dataclasses.replace(made.config.matcher, pruner_width=load_config("mobilenet").matcher.pruner_width)
+    training = dataclasses.replace(made.config.training, distil_steps=steps)
+    config = dataclasses.replace(made.config, matcher=matcher, training=training)
+    parts = (features.of_objects(part) for part in (made.split.train, made.split.validation))
+    with one_thread():  # as training on features that stand still
+        return distil.with_pruner(made, config, *(distil.feature_halves(made.matcher, part) for part in parts))
 
 
 def store(made: Checkpoint, out: Path) -> None:

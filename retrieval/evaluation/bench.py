@@ -84,7 +84,8 @@ class Bench:
         return self.checkpoint is not None and isinstance(build_method(name, Setting(self.config)), LateFusion)
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
-        method = build_method(name, Setting(self.config, seed, self.folder / "fits", self.quiet))
+        config = self.config.without_pruner() if self.shuffled else self.config  # no order is there to be taught
+        method = build_method(name, Setting(config, seed, self.folder / "fits", self.quiet))
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))

@@ -27,7 +27,7 @@ from retrieval.onnx_encoder import OnnxEncoder, sealed
 LOGIT_TOLERANCE = 0.05
 """Largest error of a match logit that nobody will see: the probability moves by a percent at most."""
 FLIP_TOLERANCE = 1.0
-MOST_TOUCHES = 40
+MOST_TOUCHES = 20
 """Encoded in every format of the towers: bfloat16 is emulated, slowly, where the processor has none."""
 _BATCH = 16
 

@@ -58,7 +58,7 @@ class LateFusion(Method):
 
 def trained_checkpoint(setting: Setting, train: Features, validation: Features) -> Checkpoint:
     """Train on features and keep the checkpoint in `setting.folder`; one that is there from the same fit is taken as
-    it is, an unfinished one gone on with.
+    it is, an unfinished one gone on with. It has no pruner: judging every photo needs none.
 
     The towers of the checkpoint are those of `frozen_matcher`: it serves as any other where they made the features.
     Raises BadInput for features that no such towers make, Interrupted after Ctrl-C.
@@ -86,7 +86,7 @@ def frozen_matcher(config: Config) -> Matcher:
 def _config(setting: Setting, train: Features) -> Config:
     matcher = dataclasses.replace(setting.config.matcher, fingers=train.touch.shape[1])
     training = dataclasses.replace(setting.config.training, seed=setting.seed, freeze_towers=True)
-    return dataclasses.replace(setting.config, matcher=matcher, training=training)
+    return dataclasses.replace(setting.config, matcher=matcher, training=training).without_pruner()
 
 
 def _grasps(features: Features) -> Iterator[Grasp]:

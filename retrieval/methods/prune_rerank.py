@@ -1,13 +1,17 @@
-"""What users run: candidates by the embedding, judged by the match logit; shares its training with late fusion."""
+"""What users run: candidates by the embedding, judged by the match logit; shares late fusion's training."""
+
+import dataclasses
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from retrieval.checkpoint import Checkpoint
+from retrieval.distil import feature_halves, with_pruner
+from retrieval.features import Features
 from retrieval.fusion import score_halves
 from retrieval.methods.base import Array, Setting
-from retrieval.methods.late_fusion import LateFusion
+from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
 
 SHARE = 0.25
 
@@ -23,6 +27,16 @@ class PruneRerank(LateFusion):
     def __init__(self, setting: Setting, share: float = SHARE) -> None:
         super().__init__(setting)
         self.share = share
+
+    def _fit(self, train: Features, validation: Features) -> None:
+        made = trained_checkpoint(self.setting, train, validation)
+        if width := self.setting.config.matcher.pruner_width:
+            config = dataclasses.replace(
+                made.config, matcher=dataclasses.replace(made.config.matcher, pruner_width=width)
+            )
+            halves = (feature_halves(made.matcher, part) for part in (train, validation))
+            made = with_pruner(made, config, *halves, quiet=self.setting.quiet)
+        self._take(made)
 
     def _take(self, checkpoint: Checkpoint) -> None:
         super()._take(checkpoint)
