@@ -44,7 +44,7 @@ def gel_optics(sample: Sample) -> Row:
     text = (
         "Pictures of real balls pressed into a real gel that were left out of the fit, and what the model says of them."
     )
-    return Row(title, text, _panels(sample.simulation["gel_optics"](), {"": 5.0}, "one picture of 240 x 320 pixels"))
+    return Row(title, text, _panels(sample.simulation["gel_optics"](), {"": 3.5}, "one picture of 240 x 320 pixels"))
 
 
 def _panels(points: Sequence[SimulationPoint], tolerances: Mapping[str, float], time: str) -> tuple[Panel, ...]:

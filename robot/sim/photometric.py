@@ -218,6 +218,7 @@ def optics_points(name: str = "gelsight") -> list[Point]:
             error=math.sqrt(figures[by_degree(degree)]["mse"]["mean"]),
             unit="grey levels rms",
             reference="real presses held out",
+            is_default=degree == shipped.degree,
         )
         for degree in DEGREES
     ]
