@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.cylinder import fit_cylinder
-from robot.devices import MAX_AGE_S, RGBD, Box, Pose
+from robot.devices import MAX_AGE_S
 from robot.errors import DeviceError, PlanError, RobotConfigError
 from robot.grasp import GraspPlan, GraspSettings, plan_grasp
+from robot.readings import RGBD, Box, Pose
 from robot.rig import Rig, check_seed
 from robot.storage import file_content
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import RGBD, Box
 from robot.errors import PlanError
+from robot.readings import RGBD, Box
 
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
@@ -53,6 +53,7 @@ class Rays:
     def of(cls, image: RGBD, extrinsics: Array) -> "Rays":
         """For the pixels of `image`."""
         lens, (rows, columns) = image.intrinsics, image.colour.shape[:2]
+        assert lens is not None, "a picture with depth has intrinsics"
         x = (np.arange(columns, dtype=np.float32) - lens.cx) / lens.fx
         y = (np.arange(rows, dtype=np.float32) - lens.cy) / lens.fy
         return cls(x.astype(np.float32), y.astype(np.float32), extrinsics)

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.cloud import Depth, Rays, Table, Thing, find_table, find_thing
-from robot.devices import RGBD, Box
 from robot.errors import PlanError, RobotConfigError
+from robot.readings import RGBD, Box
 from robot.silhouette import fit_silhouette
 from robot.solids import CUT, Array, Block, Circle, Solid, Upright, fit_block, fit_circle, fit_lying, refine_circle
 

@@ -7,123 +7,28 @@ is the force on each finger. Images are uint8 RGB, row 0 on top.
 The base classes check what goes in and what comes out and raise DeviceError, so that nothing out of range reaches a
 driver and nothing stale reaches a recording; a driver writes `_connect`, `_close` and the few methods that its base
 class names with an underscore. It may raise DeviceError or OSError there. A device connects whole or not at all;
-closing works at any time, twice, and after a failure.
+closing works at any time, twice, and after a failure. What moves is stopped when a call ends with an exception.
 """
 
 import contextlib
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
+from robot.readings import RGBD, Box, Frame, GripperState, Pose
 
 MAX_AGE_S = 0.5
 _CLOCK_SLACK_S = 0.05
 """A frame may carry a time this far ahead of the clock: two clocks never agree better."""
 
 Clock = Callable[[], float]
-Status = Literal["idle", "moving", "holding", "no_part", "part_lost"]
-STATUSES: tuple[Status, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
-
-
-# What devices say ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Pose:
-    """The point between the fingertips, and the direction (cos yaw, sin yaw) in which the jaws close.
-
-    Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers.
-    """
-
-    x_mm: float
-    y_mm: float
-    z_mm: float
-    yaw_rad: float
-
-    def as_tuple(self) -> tuple[float, float, float, float]:
-        """x, y, z in mm and yaw in rad, as a recording holds them."""
-        return self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
-
-
-@dataclass(frozen=True)
-class Box:
-    """An upright box (mm) in the rig's frame, its faces included."""
-
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError unless lower < upper, all finite."""
-        numbers = [*self.lower, *self.upper]
-        if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not np.less(self.lower, self.upper).all():
-            raise RobotConfigError(f"a box must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
-
-    def contains(self, pose: Pose) -> bool:
-        """Whether the point of the pose lies in the box."""
-        point = pose.as_tuple()[:3]
-        return all(low <= value <= high for low, value, high in zip(self.lower, point, self.upper, strict=True))
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and when it was taken."""
-
-    pixels: npt.NDArray[np.uint8]
-    time_s: float
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without distortion, in pixels; the centre of the first pixel is (0, 0)."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def __post_init__(self) -> None:
-        """Raises DeviceError for focal lengths that are not above 0, or numbers that are not finite."""
-        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf and math.isfinite(self.cx + self.cy)):
-            raise DeviceError(f"intrinsics must be finite, with focal lengths above 0 pixels, got {self}")
-
-
-@dataclass(frozen=True, eq=False)
-class RGBD:
-    """Colour (H, W, 3) uint8, and depth along the optical axis (H, W) float32 in METRE, NaN where unknown, or None."""
-
-    colour: npt.NDArray[np.uint8]
-    depth_m: npt.NDArray[np.float32] | None
-    intrinsics: Intrinsics
-    time_s: float
-
-
-@dataclass(frozen=True)
-class GripperState:
-    """Distance between the fingers, clamping force, and what the gripper makes of it.
-
-    holding: something is clamped. no_part: the jaws closed and met nothing. part_lost: what was held is gone.
-    """
-
-    opening_mm: float
-    force_n: float
-    status: Status
-
-    def __post_init__(self) -> None:
-        """Raises DeviceError for a status that is not of the contract, or numbers that are not finite."""
-        if self.status not in STATUSES:
-            raise DeviceError(f"a gripper's status must be one of {', '.join(STATUSES)}, got {self.status!r}")
-        if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):
-            raise DeviceError(f"a gripper must report finite numbers, got {self.opening_mm} mm, {self.force_n} N")
-
-
-# Devices ---------------------------------------------------------------------------------------------------
 
 
 class Device(ABC):
@@ -131,6 +36,8 @@ class Device(ABC):
 
     def __init__(self, name: str, *, clock: Clock = time.monotonic) -> None:
         self.name, self.clock = name, clock
+        self.refused: dict[str, str] = {}
+        """Settings that the device did not take, each with what it was asked and what it has instead."""
         self._connected = False
 
     @property
@@ -164,6 +71,14 @@ class Device(ABC):
         with self._use("cannot say its settings"):
             return self._settings()
 
+    def recover(self) -> None:
+        """Make the device usable again after a DeviceError, as far as that is safe with nobody near.
+
+        A driver says aloud (logging) what it does. Raises DeviceError where a person must see to it first.
+        """
+        with self._use("cannot be brought back"):
+            self._recover()
+
     def __enter__(self) -> Self:
         self.connect()
         return self
@@ -181,6 +96,9 @@ class Device(ABC):
 
     def _settings(self) -> dict[str, Any]:
         return {}
+
+    def _recover(self) -> None:  # noqa: B027
+        """Nothing by default: a device that keeps no fault."""
 
     @contextlib.contextmanager
     def _use(self, failure: str) -> Iterator[None]:
@@ -210,22 +128,52 @@ class Device(ABC):
             )
 
 
-class Arm(Device):
+class Actuator(Device):
+    """Something that moves, at most at `max_speed_mm_s`. An exception, Ctrl-C included, leaves it standing still."""
+
+    def __init__(self, name: str, *, max_speed_mm_s: float, clock: Clock = time.monotonic) -> None:
+        super().__init__(name, clock=clock)
+        self.max_speed_mm_s = max_speed_mm_s
+
+    def stop(self) -> None:
+        """Stand still now and stay usable. Raises DeviceError."""
+        with self._use("cannot be stopped"):
+            self._stop()
+
+    @abstractmethod
+    def _stop(self) -> None:
+        """Also called when it stands still already, and after a command that failed half-way."""
+
+    @contextlib.contextmanager
+    def _moving(self, failure: str) -> Iterator[None]:
+        """As `_use`, and stops on any exception; what that itself raises is added to it as a note."""
+        with self._use(failure):
+            try:
+                yield
+            except BaseException as error:
+                try:
+                    self._stop()
+                except Exception as second:
+                    error.add_note(f"and while {self.name} was stopped: {second}")
+                raise
+
+
+class Arm(Actuator):
     """Moves the gripper, held upright, inside `workspace` (limits of the point between the fingertips)."""
 
     def __init__(
         self, name: str, workspace: Box, *, max_speed_mm_s: float = 1000.0, clock: Clock = time.monotonic
     ) -> None:
-        super().__init__(name, clock=clock)
-        self.workspace, self.max_speed_mm_s = workspace, max_speed_mm_s
+        super().__init__(name, max_speed_mm_s=max_speed_mm_s, clock=clock)
+        self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         """Go there and return the pose reached. Raises DeviceError, also for a pose outside the workspace."""
-        with self._use("cannot move"):
-            if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
-                lower, upper = self.workspace.lower, self.workspace.upper
-                raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
-            self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
+        if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
+            lower, upper = self.workspace.lower, self.workspace.upper
+            raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
+        self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
+        with self._moving("cannot move"):
             return self._reached(self._move_to(pose, speed_mm_s))
 
     def pose(self) -> Pose:
@@ -240,14 +188,17 @@ class Arm(Device):
 
     @abstractmethod
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Return when the arm is there; on any exception, KeyboardInterrupt included, leave it standing still."""
+        """Return when the arm is there."""
 
     @abstractmethod
     def _pose(self) -> Pose: ...
 
 
-class Gripper(Device):
-    """Two parallel jaws, `stroke_mm` apart at most, that clamp with `min_force_n` to `max_force_n`."""
+class Gripper(Actuator):
+    """Two parallel jaws, `stroke_mm` apart at most, that clamp with `min_force_n` to `max_force_n`.
+
+    A driver may learn these limits when it connects; they never rise above what it was given.
+    """
 
     def __init__(
         self,
@@ -259,8 +210,8 @@ class Gripper(Device):
         max_speed_mm_s: float = 420.0,
         clock: Clock = time.monotonic,
     ) -> None:
-        super().__init__(name, clock=clock)
-        self.stroke_mm, self.max_speed_mm_s = stroke_mm, max_speed_mm_s
+        super().__init__(name, max_speed_mm_s=max_speed_mm_s, clock=clock)
+        self.stroke_mm = stroke_mm
         self.min_force_n, self.max_force_n = min_force_n, max_force_n
 
     def state(self) -> GripperState:
@@ -270,14 +221,15 @@ class Gripper(Device):
 
     def open(self, opening_mm: float) -> GripperState:
         """Move the jaws apart to `opening_mm`, 0 to the stroke; lets go of what is held. Raises DeviceError."""
-        with self._use("cannot open"):
-            return self._open(self._check("opening", opening_mm, 0.0, self.stroke_mm, "mm"))
+        self._check("opening", opening_mm, 0.0, self.stroke_mm, "mm")
+        with self._moving("cannot open"):
+            return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
         """Close until `force_n` is reached or nothing is met; returns when the jaws stand. Raises DeviceError."""
-        with self._use("cannot grasp"):
-            self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
-            self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
+        self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
+        self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
+        with self._moving("cannot grasp"):
             return self._grasp(float(force_n), float(speed_mm_s))
 
     @abstractmethod
@@ -297,10 +249,13 @@ class TactileSensor(Device):
         super().__init__(name, clock=clock)
         self.finger = finger
 
-    def read(self, max_age_s: float = MAX_AGE_S) -> Frame:
-        """The newest picture. Raises DeviceError, also for one older than `max_age_s`."""
+    def read(self, max_age_s: float = MAX_AGE_S, near_s: float | None = None) -> Frame:
+        """The newest picture, or of those it still has the one taken nearest to `near_s`.
+
+        Raises DeviceError, also for one older than `max_age_s`.
+        """
         with self._use("cannot be read"):
-            frame = self._read()
+            frame = self._read() if near_s is None else self._read_near(near_s)
             _check_colour(self.name, frame.pixels)
             self._check_age(frame.time_s, max_age_s)
             return frame
@@ -308,10 +263,31 @@ class TactileSensor(Device):
     @abstractmethod
     def _read(self) -> Frame: ...
 
+    def _read_near(self, time_s: float) -> Frame:
+        """The newest by default: a sensor that keeps no older ones."""
+        return self._read()
+
+
+def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
+    """A picture of every finger taken as nearly at once as they allow, and how far apart in time they are (s).
+
+    Each is the one nearest to the oldest of the newest. Raises DeviceError.
+    """
+    newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
+    common = min(frame.time_s for frame in newest.values())
+    frames = {
+        finger: frame if frame.time_s == common else sensors[finger].read(max_age_s, near_s=common)
+        for finger, frame in newest.items()
+    }
+    times = [frame.time_s for frame in frames.values()]
+    return frames, max(times) - min(times)
+
 
 class Camera(Device):
     """Looks at the table. `extrinsics` (4, 4): camera frame (x right, y down, z forward; mm) to the rig's frame, as
-    calibrated, which may be 5 to 10 mm off."""
+    calibrated, which may be 5 to 10 mm off. has_depth: without it a grasp cannot be planned from the picture."""
+
+    has_depth: bool = True
 
     def __init__(self, name: str, extrinsics: npt.ArrayLike, *, clock: Clock = time.monotonic) -> None:
         super().__init__(name, clock=clock)
@@ -320,6 +296,8 @@ class Camera(Device):
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
         """The newest picture; without `depth` none is computed or returned. Raises DeviceError, also when stale."""
         with self._use("cannot be read"):
+            if depth and not self.has_depth:
+                raise DeviceError(f"{self.name} sees colour only: ask it with depth=False")
             image = self._read(depth)
             _check_colour(self.name, image.colour)
             self._check_age(image.time_s, max_age_s)
@@ -342,6 +320,8 @@ def _check_depth(name: str, image: RGBD) -> None:
     if depth is None or depth.dtype != np.float32 or depth.shape != image.colour.shape[:2]:
         got = "none" if depth is None else f"{depth.shape} {depth.dtype}"
         raise DeviceError(f"{name}: depth must be float32 of the colour's {image.colour.shape[:2]}, got {got}")
+    if image.intrinsics is None:
+        raise DeviceError(f"{name}: a picture with depth must come with its intrinsics")
 
 
 def _rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:

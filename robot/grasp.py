@@ -14,8 +14,9 @@ from typing import Any, Self
 import numpy as np
 
 from robot.cylinder import CylinderFit
-from robot.devices import Arm, Box, Gripper, Pose
+from robot.devices import Arm, Gripper
 from robot.errors import PlanError, RobotConfigError
+from robot.readings import Box, Pose
 
 
 @dataclass(frozen=True)

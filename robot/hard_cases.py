@@ -12,8 +12,8 @@ import numpy.typing as npt
 from robot.attempt import depth_in_mm
 from robot.cloud import Rays, find_table
 from robot.cylinder import fit_cylinder
-from robot.devices import RGBD, Intrinsics
 from robot.gates import ContactAreaGate, GraspFrames
+from robot.readings import RGBD, Intrinsics
 from robot.sim.hard_cases import HardCase as HardCase
 from robot.sim.hard_cases import stability_sweep
 from robot.sim.hard_pictures import picture_cases, refused

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.cloud import Array, Depth, Mask, Patch, Rays, Table, height_above, largest_patch
-from robot.devices import Box
 from robot.errors import PlanError
+from robot.readings import Box
 
 _COLOUR_LEVELS = 12.0
 _LEAST_PX = 60

@@ -9,8 +9,9 @@ import zlib
 
 import numpy as np
 
-from robot.devices import Arm, Box, Camera, Frame, Gripper, GripperState, Intrinsics, Pose, TactileSensor
+from robot.devices import Arm, Camera, Gripper, TactileSensor
 from robot.errors import DeviceError
+from robot.readings import Box, Frame, GripperState, Intrinsics, Pose
 from robot.rig import Rig
 from tests import views
 
@@ -99,6 +100,9 @@ class FakeArm(Arm):
     def _close(self):
         self.world.called("arm.close")
 
+    def _stop(self):
+        self.world.called("arm.stop")
+
     def _move_to(self, pose, speed_mm_s):
         self.world.called("arm")
         self.world.sleep(math.dist(self.world.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
@@ -120,6 +124,9 @@ class FakeGripper(Gripper):
 
     def _close(self):
         self.world.called("gripper.close")
+
+    def _stop(self):
+        self.world.called("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}

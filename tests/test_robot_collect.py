@@ -11,10 +11,10 @@ import pytest
 from robot.attempt import Attempter, AttemptSettings, depth_in_mm
 from robot.attempt_log import acceptance, read_attempts
 from robot.collect import CollectSettings, Progress, collect, name_of
-from robot.devices import RGBD
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
 from robot.gates import ContactAreaGate
 from robot.grasp import GraspSettings
+from robot.readings import RGBD
 from robot.recording import RecordingWriter, read_recording
 from tests.fake_rig import FakeRig
 
@@ -308,7 +308,7 @@ def test_a_gripper_that_never_stops_moving_is_a_fault(monkeypatch):
 
 def test_a_frozen_gel_is_a_fault_and_not_a_recording(monkeypatch):
     """A stream that stands still gives the frame from before the grasp as the frame of the grasp."""
-    from robot.devices import Frame
+    from robot.readings import Frame
     from tests.fake_rig import FakeSensor
 
     real, kept = FakeSensor._read, {}

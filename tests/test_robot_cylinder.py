@@ -12,8 +12,8 @@ import pytest
 
 from robot.cloud import Rays
 from robot.cylinder import CylinderFit, fit_cylinder
-from robot.devices import RGBD, Box
 from robot.errors import PlanError, RobotConfigError
+from robot.readings import RGBD, Box
 from robot.solids import fit_circle
 from tests import views
 from tests.views import Ball, Block, Lying, Upright, view

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from robot.devices import RGBD, Box, Camera, Device, Frame, GripperState, Intrinsics, Pose, TactileSensor
+from robot.devices import Camera, Device, TactileSensor
 from robot.errors import DeviceError, RobotConfigError
+from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, World
 
 

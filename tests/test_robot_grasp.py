@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from robot.cylinder import CylinderFit
-from robot.devices import Box
 from robot.errors import PlanError, RobotConfigError
 from robot.grasp import GraspSettings, plan_grasp
+from robot.readings import Box
 from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
 
 FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from robot.devices import STATUSES, Pose
 from robot.errors import DeviceError
+from robot.readings import STATUSES, Pose
 from robot.rig import Rig, load_rig
 from tests.fake_rig import FakeRig
 

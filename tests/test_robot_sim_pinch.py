@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from robot.devices import Pose
 from robot.errors import SceneError
+from robot.readings import Pose
 from robot.sim.body import Body
 from robot.sim.camera import Placement
 from robot.sim.gel import draw_sensor

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from robot.devices import Pose
 from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.readings import Pose
 from robot.rig import load_rig
 from robot.sim.rig import STROKE_MM, SimRig
 

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from robot.devices import Pose
 from robot.errors import SceneError
+from robot.readings import Pose
 from robot.sim.camera import Placement
 from robot.sim.gel import draw_sensor
 from robot.sim.objects import draw_object

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from robot.devices import RGBD, Intrinsics
+from robot.readings import RGBD, Intrinsics
 
 KINECT = Intrinsics(365.0, 365.0, 255.5, 211.5)
 KINECT_PX = (424, 512)

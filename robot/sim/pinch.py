@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Pose
 from robot.errors import SceneError
+from robot.readings import Pose
 from robot.sim.camera import Placement
 from robot.sim.contact import Contact, press
 from robot.sim.gel import GelSensor

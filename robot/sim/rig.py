@@ -12,9 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import RGBD, Arm, Box, Frame, Gripper, GripperState, Intrinsics, Pose, TactileSensor
+from robot.devices import Arm, Gripper, TactileSensor
 from robot.devices import Camera as CameraDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
+from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from robot.recorded_grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.sim.camera import Camera, Placement
@@ -266,6 +267,8 @@ class SimArm(Arm):
 
     def _close(self) -> None: ...
 
+    def _stop(self) -> None: ...
+
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         before = self._world.pose.as_tuple()[:3]
         self._world.clock.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
@@ -288,6 +291,8 @@ class SimGripper(Gripper):
     def _connect(self) -> None: ...
 
     def _close(self) -> None: ...
+
+    def _stop(self) -> None: ...
 
     def _settings(self) -> dict[str, Any]:
         return {"stroke_mm": STROKE_MM, "force_n": list(FORCE_N)}

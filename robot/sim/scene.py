@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Pose
 from robot.errors import SceneError
+from robot.readings import Pose
 from robot.sim import camera as cameras
 from robot.sim.camera import Camera, Lighting, Placement
 from robot.sim.gel import GelSensor

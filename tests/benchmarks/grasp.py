@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from robot.collect import CollectSettings, collect
-from robot.devices import Pose
+from robot.readings import Pose
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
 from robot.sim.scene import Grip, Scene

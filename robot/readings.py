@@ -1,0 +1,105 @@
+"""What devices say: poses, pictures, states. Lengths in mm, forces in N, angles in rad, times in s; frames as in
+robot.devices."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import DeviceError, RobotConfigError
+
+Status = Literal["idle", "moving", "holding", "no_part", "part_lost"]
+STATUSES: tuple[Status, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The point between the fingertips, and the direction (cos yaw, sin yaw) in which the jaws close.
+
+    Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers.
+    """
+
+    x_mm: float
+    y_mm: float
+    z_mm: float
+    yaw_rad: float
+
+    def as_tuple(self) -> tuple[float, float, float, float]:
+        """x, y, z in mm and yaw in rad, as a recording holds them."""
+        return self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
+
+
+@dataclass(frozen=True)
+class Box:
+    """An upright box (mm) in the rig's frame, its faces included."""
+
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError unless lower < upper, all finite."""
+        numbers = [*self.lower, *self.upper]
+        if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not np.less(self.lower, self.upper).all():
+            raise RobotConfigError(f"a box must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
+
+    def contains(self, pose: Pose) -> bool:
+        """Whether the point of the pose lies in the box."""
+        point = pose.as_tuple()[:3]
+        return all(low <= value <= high for low, value, high in zip(self.lower, point, self.upper, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and when it was taken."""
+
+    pixels: npt.NDArray[np.uint8]
+    time_s: float
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion, in pixels; the centre of the first pixel is (0, 0)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        """Raises DeviceError for focal lengths that are not above 0, or numbers that are not finite."""
+        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf and math.isfinite(self.cx + self.cy)):
+            raise DeviceError(f"intrinsics must be finite, with focal lengths above 0 pixels, got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class RGBD:
+    """Colour (H, W, 3) uint8, and depth along the optical axis (H, W) float32 in METRE, NaN where unknown, or None.
+
+    A camera without depth need not know its intrinsics.
+    """
+
+    colour: npt.NDArray[np.uint8]
+    depth_m: npt.NDArray[np.float32] | None
+    intrinsics: Intrinsics | None
+    time_s: float
+
+
+@dataclass(frozen=True)
+class GripperState:
+    """Distance between the fingers, clamping force, and what the gripper makes of it.
+
+    holding: something is clamped. no_part: the jaws closed and met nothing. part_lost: what was held is gone.
+    """
+
+    opening_mm: float
+    force_n: float
+    status: Status
+
+    def __post_init__(self) -> None:
+        """Raises DeviceError for a status that is not of the contract, or numbers that are not finite."""
+        if self.status not in STATUSES:
+            raise DeviceError(f"a gripper's status must be one of {', '.join(STATUSES)}, got {self.status!r}")
+        if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):
+            raise DeviceError(f"a gripper must report finite numbers, got {self.opening_mm} mm, {self.force_n} N")
