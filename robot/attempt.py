@@ -15,58 +15,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.cylinder import fit_cylinder
-from robot.devices import MAX_AGE_S
-from robot.errors import DeviceError, PlanError, RobotConfigError
-from robot.grasp import GraspPlan, GraspSettings, plan_grasp
+from robot.attempt_settings import AttemptSettings
+from robot.cylinder import CylinderFit, fit_cylinder
+from robot.devices import MAX_AGE_S, read_together
+from robot.errors import DeviceError, PlanError
+from robot.grasp import GraspPlan, plan_grasp
 from robot.readings import RGBD, Box, Pose
 from robot.rig import Rig, check_seed
 from robot.storage import file_content
 
-OUTPUTS = ("depth", "before", "after")
-"""What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
-
 _OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
 _SIGHT_MM = 150.0
 """An object may stand so far outside the workspace and still be looked for."""
-
-
-@dataclass(frozen=True)
-class AttemptSettings:
-    """How attempts are made. outputs: which of OUTPUTS are recorded; nothing is asked of a device for the others.
-
-    settle_s: wait between closing and the picture. hold_s: wait between lifting and judging. release_mm: an object is
-    let go so far above where it was grasped, on the inner `table_share` of the workspace. retries: how often an attempt
-    is begun again after a device has failed. jpeg_quality: of colour pictures, 0 to 100; depth is kept exactly.
-    """
-
-    grasp: GraspSettings = field(default_factory=GraspSettings)
-    outputs: tuple[str, ...] = OUTPUTS
-    travel_mm_s: float = 200.0
-    approach_mm_s: float = 50.0
-    closing_mm_s: float = 80.0
-    settle_s: float = 1.0
-    hold_s: float = 1.0
-    release_mm: float = 5.0
-    table_share: float = 0.7
-    retries: int = 2
-    jpeg_quality: int = 95
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
-        if unknown := sorted(set(self.outputs) - set(OUTPUTS)):
-            raise RobotConfigError(f"outputs must be of {', '.join(OUTPUTS)}; got {unknown[0]!r}")
-        for name in ("travel_mm_s", "approach_mm_s", "closing_mm_s"):
-            self._require(name, 1e-3, math.inf)
-        for name in ("settle_s", "hold_s", "release_mm", "retries"):
-            self._require(name, 0.0, 1e6)
-        self._require("table_share", 0.0, 1.0)
-        self._require("jpeg_quality", 0, 100)
-
-    def _require(self, name: str, least: float, most: float) -> None:
-        value = getattr(self, name)
-        if not least <= value <= most or math.isinf(value):
-            raise RobotConfigError(f"{name} must be from {least:g} to {most:g}, got {value}")
 
 
 @dataclass(frozen=True)
@@ -108,6 +68,8 @@ class Attempter:
         """
         for trial in range(self.settings.retries + 1):
             try:
+                if trial:
+                    self.rig.recover()
                 return self._once(object_id, number)
             except DeviceError as error:
                 self._let_go()
@@ -121,9 +83,15 @@ class Attempter:
         raise AssertionError("the loop returns or raises")
 
     def _let_go(self) -> None:
-        """Open the jaws; the first error matters more than that this one may fail too."""
-        with contextlib.suppress(Exception):
-            self.rig.gripper.open(self.rig.gripper.stroke_mm)
+        """Open the jaws, of a gripper that must be brought back first where it must; the error at hand matters more
+        than that this may fail too."""
+        gripper = self.rig.gripper
+        try:
+            gripper.open(gripper.stroke_mm)
+        except Exception:
+            with contextlib.suppress(Exception):
+                gripper.recover()
+                gripper.open(gripper.stroke_mm)
 
     def _once(self, object_id: str, number: int) -> Attempt:
         rig = self.rig
@@ -132,9 +100,9 @@ class Attempter:
         rig.arm.move_to(self._home, self.settings.travel_mm_s)
         rig.prepare(object_id, number)
         start = rig.clock()
-        image = rig.camera.read()
+        image = rig.camera.read(depth=self._needs_depth)
         try:
-            fit = fit_cylinder(image, rig.camera.extrinsics, self._sight)
+            fit = self._fit(image)
             plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
         except PlanError as error:
             lasted = round(rig.clock() - start, 3)
@@ -156,6 +124,15 @@ class Attempter:
             lasted_s=round(rig.clock() - start, 3),
         )
 
+    @property
+    def _needs_depth(self) -> bool:
+        """Whether a grasp is planned from depth, or depth is to be recorded and there is any."""
+        return self.rig.given is None or (self.rig.camera.has_depth and "depth" in self.settings.outputs)
+
+    def _fit(self, image: RGBD) -> CylinderFit:
+        """The object as it was given, or as the camera sees it."""
+        return self.rig.given or fit_cylinder(image, self.rig.camera.extrinsics, self._sight)
+
     def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
         """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
         rig, settings = self.rig, self.settings
@@ -166,16 +143,25 @@ class Attempter:
         closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
         rig.sleep(settings.settle_s)
         at = rig.clock()
-        touches |= self._feel("", settings.settle_s)
+        during, skew_s = self._feel_at_once("", settings.settle_s)
         rig.arm.move_to(plan.above, settings.approach_mm_s)
         rig.sleep(settings.hold_s)
-        fields = {"force_n": plan.force_n, "opening_mm": closed.opening_mm, "pose": reached.as_tuple()}
-        return touches, fields, at
+        fields = {
+            "force_n": plan.force_n,
+            "opening_mm": closed.opening_mm,
+            "pose": reached.as_tuple(),
+            "touch_skew_s": round(skew_s, 6),
+        }
+        return touches | during, fields, at
 
     def _feel(self, moment: str, since_s: float) -> dict[str, bytes]:
         """Gel images by column; none older than what has just been waited for, which may have been before it."""
-        frames = {finger: sensor.read(max_age_s=min(MAX_AGE_S, since_s)) for finger, sensor in self.rig.sensors.items()}
-        return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}
+        return self._feel_at_once(moment, since_s)[0]
+
+    def _feel_at_once(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
+        """Gel images by column, and how far apart in time they were taken (s)."""
+        frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
+        return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
 
     def _outcome(self) -> str:
         status = self.rig.gripper.state().status

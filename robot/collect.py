@@ -16,7 +16,7 @@ import time
 import zlib
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.attempt import Attempt, Attempter, AttemptSettings
+from robot.attempt import Attempt, Attempter
 from robot.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
+from robot.attempt_settings import AttemptSettings
 from robot.errors import RecordingError, RobotConfigError
 from robot.gates import ContactAreaGate, Gate, GraspFrames, judge
 from robot.recording import INFO_FILE, RecordingWriter, read_info, software_version
@@ -39,11 +40,14 @@ _TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
 
 @dataclass(frozen=True)
 class CollectSettings:
-    """What is wanted of each object: so many accepted grasps, in at most so many attempts (None: 4 a grasp and 10)."""
+    """What is wanted of each object: so many accepted grasps, in at most so many attempts (None: 4 a grasp and 10).
+
+    attempt: how they are made (None: as the rig has it).
+    """
 
     grasps: int = 44
     most_attempts: int | None = None
-    attempt: AttemptSettings = field(default_factory=AttemptSettings)
+    attempt: AttemptSettings | None = None
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a number below 1."""
@@ -101,9 +105,10 @@ def collect(
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
     _check_names(names)
     with rig:
-        info = _info(rig, seed, settings, gate_name or repr(gate))
+        attempt = settings.attempt or rig.attempt
+        info = _info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))
         _check_goes_on(Path(out), info, strict=rig.can_run_jobs)
-        attempter = Attempter(rig, seed, settings.attempt)
+        attempter = Attempter(rig, seed, attempt)
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
             collection = _Collection(writer, log, names, settings, gate, progress)
             with Jobs(jobs, attempter, make_rig) as workers:
@@ -133,7 +138,7 @@ def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dic
     said = {
         **rig.info,
         "seed": seed,
-        "background": "before each grasp" if "before" in settings.attempt.outputs else "none",
+        "background": "before each grasp" if settings.attempt and "before" in settings.attempt.outputs else "none",
         "devices": rig.settings(),
         "collection": {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit},
     }

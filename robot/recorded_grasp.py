@@ -13,7 +13,7 @@ import numpy as np
 
 from robot.errors import RecordingError
 
-_NUMBERS = ("force_n", "opening_mm", "time_s")
+_NUMBERS = ("force_n", "opening_mm", "touch_skew_s", "time_s")
 OUTCOMES = ("held", "missed", "slipped", "no_plan")
 """What came of an attempt: held or lost (slipped) after the lift, nothing between the jaws, or nothing tried."""
 
@@ -26,6 +26,7 @@ class RecordedGrasp:
     """One grasp. Images are posix paths relative to the recording, touches by finger; None: not recorded.
 
     grasped: what the gate decided; training keeps these. outcome: one of OUTCOMES, what the gripper felt.
+    touch_skew_s: how far apart in time the fingers' images were taken.
     """
 
     grasp_id: str
@@ -38,6 +39,7 @@ class RecordedGrasp:
     force_n: float | None = None
     opening_mm: float | None = None
     pose: tuple[float, ...] | None = None
+    touch_skew_s: float | None = None
     grasped: bool | None = None
     outcome: str | None = None
     sequence_id: str | None = None

@@ -39,6 +39,7 @@ UNITS = {
     "opening_mm": "millimetre between the fingers",
     "pose": "x, y, z in millimetre and yaw in radian of the gripper, in the rig's frame",
     "time_s": "second since the recording began",
+    "touch_skew_s": "second between the fingers' images",
     "depth": "millimetre, uint16, 0 where unknown",
 }
 _MUST_AGREE = ("source", "sensor", "units", "background")
@@ -197,7 +198,7 @@ class RecordingWriter:
         """Add one grasp: first its images, then its line; when it returns, both are on the disk.
 
         `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to ImageSource.
-        `fields`: force_n, opening_mm, pose, grasped, outcome, sequence_id, time_s.
+        `fields`: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
         Raises RecordingError, StorageError.
         """
         if self._file.closed:

@@ -1,19 +1,27 @@
 """A rig: arm, gripper, tactile sensors and camera that connect all or nothing and always close; and rigs by name."""
 
-import inspect
+import sys
 import time
 import tomllib
-import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from robot.attempt_settings import AttemptSettings
+from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
+from robot.settings import build
 
 RIGS = {"sim": "robot.sim.rig:SimRig"}
 """Rigs by name, imported when asked for. A new rig is a file with a subclass of Rig, and a row here."""
+
+
+def ask_on_terminal(sentence: str) -> None:
+    """Show a person what to do, and wait for Enter; stdout stays free for results. Raises EOFError."""
+    print(sentence, end=" ", file=sys.stderr, flush=True)
+    input()
 
 
 class Rig:
@@ -21,6 +29,8 @@ class Rig:
 
     `info` goes into recording.json: source and sensor at least. `clock` and `sleep` keep the rig's time, in which
     frames are stamped; a simulated rig gives its own. `ask` shows a person a sentence and returns when it is done.
+    `attempt`: how attempts are made with this rig unless said otherwise. `given`: where every object stands and how
+    large it is, for a rig whose camera cannot tell.
     """
 
     can_run_jobs: ClassVar[bool] = False
@@ -36,12 +46,17 @@ class Rig:
         info: Mapping[str, Any],
         clock: Clock = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
-        ask: Callable[[str], object] = input,
+        ask: Callable[[str], object] = ask_on_terminal,
+        attempt: AttemptSettings | None = None,
+        given: CylinderFit | None = None,
     ) -> None:
+        if given is None and not camera.has_depth:
+            raise RobotConfigError(f"{camera.name} has no depth: where the object stands and its size must be given")
         self.arm, self.gripper, self.camera = arm, gripper, camera
         self.sensors = dict(sorted(sensors.items()))
         self.info = dict(info)
         self.clock, self.sleep, self.ask = clock, sleep, ask
+        self.attempt, self.given = attempt or AttemptSettings(), given
         self._on_table: str | None = None
 
     @classmethod
@@ -50,15 +65,7 @@ class Rig:
 
         Raises RobotConfigError.
         """
-        parameters = inspect.signature(cls).parameters
-        known = sorted(set(parameters) - {"seed"})
-        if unknown := sorted(set(settings) - set(known)):
-            raise RobotConfigError(f"{cls.__name__} has no setting {unknown[0]!r}; it knows {', '.join(known)}")
-        hints = typing.get_type_hints(cls.__init__)
-        for name, value in settings.items():
-            _check_type(name, hints.get(name), value)
-        arguments: dict[str, Any] = {**settings, "seed": seed} if "seed" in parameters else dict(settings)
-        return cls(**arguments)
+        return build(cls, settings, seed=seed)
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -84,6 +91,11 @@ class Rig:
     def settings(self) -> dict[str, dict[str, Any]]:
         """What each device reports of its settings, by its name. Raises DeviceError."""
         return {device.name: device.settings() for device in self.devices}
+
+    def recover(self) -> None:
+        """Make every device usable again after one has failed. Raises DeviceError where that takes a person."""
+        for device in self.devices:
+            device.recover()
 
     def connect(self) -> None:
         """Connect all devices or none: where one fails, those before it are closed again and its error is raised."""
@@ -128,9 +140,7 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     """Build, without connecting it, the rig that `spec` names: a name of RIGS, or a TOML file.
 
         rig = "sim"
-
-        [sim]                  # settings of that rig; `settings` given here override them
-        fingers = ["a", "b"]
+        fingers = ["a", "b"]   # all else are settings of that rig; `settings` given here override them
 
     The recording's `info` says name and settings, so that the rig can be built again. Raises UnknownName, which
     lists the known ones, and RobotConfigError.
@@ -145,31 +155,6 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     rig = rig_class.from_settings(seed, settings)
     rig.info |= {"rig": name, "rig_settings": settings}
     return rig
-
-
-_PLAIN: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
-    bool: (bool, "true or false"),
-    int: (int, "a whole number"),
-    float: ((int, float), "a number"),
-    str: (str, "a text in quotes"),
-}
-
-
-def _check_type(name: str, hint: Any, value: object) -> None:
-    """Raise RobotConfigError for a plain value, or list of such, that is not of the annotated type; others pass."""
-    if typing.get_origin(hint) is Sequence:
-        kind = typing.get_args(hint)[0]
-        good = isinstance(value, list | tuple) and all(_is_plain(each, kind) for each in value)
-        words = f"a list, each of them {_PLAIN[kind][1]}" if kind in _PLAIN else "a list"
-    else:
-        good, words = _is_plain(value, hint), _PLAIN[hint][1] if hint in _PLAIN else ""
-    if not good:
-        raise RobotConfigError(f"{name} must be {words}, got {value!r}")
-
-
-def _is_plain(value: object, hint: Any) -> bool:
-    """Python counts true and false among the whole numbers; a file of settings does not."""
-    return hint not in _PLAIN or (isinstance(value, _PLAIN[hint][0]) and (hint is bool or not isinstance(value, bool)))
 
 
 def check_seed(seed: int) -> None:
@@ -189,9 +174,4 @@ def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]
     name = document.pop("rig", None)
     if not isinstance(name, str):
         raise RobotConfigError(f'{path} must say which rig it is for, as in rig = "sim"; got {name!r}')
-    settings = document.pop(name, {})
-    if document:
-        raise RobotConfigError(f"{path}: unknown key {sorted(document)[0]!r}; known: rig, and the table [{name}]")
-    if not isinstance(settings, dict):
-        raise RobotConfigError(f"{path}: {name} must be a table, got {settings!r}")
-    return name, {**settings, **over}
+    return name, {**document, **over}

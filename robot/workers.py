@@ -15,7 +15,8 @@ from typing import Self
 
 import cv2
 
-from robot.attempt import Attempt, Attempter, AttemptSettings
+from robot.attempt import Attempt, Attempter
+from robot.attempt_settings import AttemptSettings
 from robot.errors import RobotError
 from robot.rig import Rig
 

@@ -113,7 +113,7 @@ def test_a_rig_is_built_by_its_name_and_says_how(fake):
 
 def test_a_rig_is_built_from_a_toml_file(fake, tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text('rig = "fake"\n[fake]\nfingers = ["b"]\n')
+    path.write_text('rig = "fake"\nfingers = ["b"]\n')
     rig = load_rig(str(path), seed=1)
     assert list(rig.sensors) == ["b"]
     assert list(load_rig(str(path), seed=1, fingers=["a"]).sensors) == ["a"]  # what is said last counts
@@ -134,11 +134,11 @@ def test_an_unknown_setting_lists_the_known_ones(fake):
 BAD_FILES = {
     "rig = ": "is not TOML",
     "[fake]": "must say which rig it is for",
+    'fingers = ["a"]': "must say which rig it is for",
     "rig = 3": "must say which rig it is for",
-    'rig = "fake"\nspeed = 3': "unknown key 'speed'; known: rig, and the table \\[fake\\]",
-    'rig = "fake"\nfake = 3': "fake must be a table",
     'rig = "none"': "no rig is called 'none'",
-    'rig = "fake"\n[fake]\ncolour = 3': "has no setting 'colour'",
+    'rig = "fake"\ncolour = 3': "has no setting 'colour'",
+    'rig = "fake"\n[fake]\nfingers = ["a"]': "has no setting 'fake'",
     "rig = " + "[" * 10**5: "is not TOML",
 }
 
@@ -168,14 +168,14 @@ def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
 )
 def test_a_setting_of_another_type_says_which_is_wanted(tmp_path, setting, said):
     path = tmp_path / "rig.toml"
-    path.write_text(f'rig = "sim"\n[sim]\n{setting}\n')
+    path.write_text(f'rig = "sim"\n{setting}\n')
     with pytest.raises(RobotConfigError, match=f"^{said}"):
         load_rig(str(path), seed=0)
 
 
 def test_a_whole_number_is_a_number(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text('rig = "sim"\n[sim]\nlocalisation_mm = [0, 5]\n')
+    path.write_text('rig = "sim"\nlocalisation_mm = [0, 5]\n')
     load_rig(str(path), seed=0)
 
 
