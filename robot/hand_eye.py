@@ -30,6 +30,7 @@ LEAST_SPREAD = 0.02
 """Points count as on one line (plane) when they stray from it by less than this share of their extent: at 300 mm
 that is 6 mm, below which errors of 5 mm in the points turn the camera at will."""
 _SUSPECT_SHARE, _SUSPECT_MM = 0.6, 1.0
+_FAR_MM = 1e6
 _FUTURE = timedelta(days=1)
 
 
@@ -72,7 +73,8 @@ class HandEye:
     def warning(self) -> str | None:
         """What is suspicious: that stretching space explains left-out points much better than moving the camera."""
         rigid, affine = self.rigid_errors, self.affine_errors
-        if affine is None or affine.loo_mean_mm > min(_SUSPECT_SHARE * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM):
+        enough = min(_SUSPECT_SHARE * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM)
+        if affine is None or affine.loo_mean_mm > enough:
             return None
         return (
             f"left-out points are {affine.loo_mean_mm:.1f} mm off by an affine map and {rigid.loo_mean_mm:.1f} mm by a "
@@ -230,8 +232,10 @@ def _points(name: str, points: npt.ArrayLike) -> Points:
         found = np.array(points, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise RobotConfigError(f"{name} points must be rows of x, y and z in mm: {error}") from error
-    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
-        raise RobotConfigError(f"{name} points must be (N, 3) finite numbers in mm, got {found.shape}: {found.tolist()}")
+    if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _FAR_MM).all():  # also refuses NaN
+        raise RobotConfigError(
+            f"{name} points must be (N, 3) mm within a kilometre, got {found.shape}: {found.tolist()}"
+        )
     return found
 
 

@@ -1,0 +1,254 @@
+"""A client of rosbridge: ROS topics and services as JSON over a websocket (port 9090), without a ROS install.
+
+It stands on `websockets` and not on roslibpy, because a motion command must reach the robot now or never, and a
+failure must be an exception. Seen with roslibpy 2.1: what is published while the link is gone raises nothing and is
+sent seconds later, when it has reconnected by itself; rosbridge's own "status" errors are dropped; after `terminate` no
+second connection can be made in the same process.
+
+Operations (rosbridge protocol 2.1): advertise, publish, subscribe, call_service and service_response (its id echoed),
+status. `decode` and `encode` know no socket; a thread of `RosbridgeLink` reads what comes. Nothing is sent twice and
+nothing is queued: a link that is gone stays gone until it is opened again.
+"""
+
+import itertools
+import json
+import logging
+import socket
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from robot.devices import Clock
+from robot.errors import DeviceError
+
+Message = Mapping[str, Any]
+T = TypeVar("T")
+
+_LOG = logging.getLogger(__name__)
+_KEPT = 200
+"""Messages kept of each topic: two seconds of one at 100 Hz."""
+_LARGEST_BYTES = 2**22
+_PING_S = 5.0
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A message of a topic, and when it came by the link's clock."""
+
+    message: Message
+    time_s: float
+
+
+def encode(operation: Message) -> str:
+    """One operation as JSON. Raises DeviceError for what JSON cannot hold, NaN among it."""
+    try:
+        return json.dumps(operation, allow_nan=False)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise DeviceError(f"rosbridge takes plain finite values only: {error}") from error
+
+
+def decode(text: str | bytes) -> Message | None:
+    """The operation in one websocket message; None for what is none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
+
+
+class RosbridgeLink:
+    """A connection to `ws://host:port`; every wait ends after `timeout_s` at the latest.
+
+    counts: of "noise" (not an operation), "late" (a reply nobody waits for), "status" (complaints of rosbridge).
+    """
+
+    def __init__(self, url: str, *, timeout_s: float = 2.0, clock: Clock = time.monotonic) -> None:
+        self.url, self.timeout_s, self.clock = url, timeout_s, clock
+        self.counts: Counter[str] = Counter()
+        self._news = threading.Condition()
+        self._numbers = itertools.count(1)
+        self._topics: dict[str, deque[Arrival]] = {}
+        self._awaited: dict[str, str] = {}
+        self._replies: dict[str, Message] = {}
+        self._socket: Any = None
+        self._reader: threading.Thread | None = None
+        self._gone = "it was never opened"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages can be sent, as far as is known."""
+        return not self._gone
+
+    def open(self) -> None:
+        """Connect, once: a closed link is replaced by a new one. Raises DeviceError."""
+        connect = _websocket_client()
+        try:
+            self._socket = connect(
+                self.url,
+                sock=_tcp(self.url, self.timeout_s),
+                open_timeout=self.timeout_s,
+                close_timeout=1.0,
+                ping_interval=_PING_S,
+                ping_timeout=_PING_S,
+                compression=None,  # on a cable, time matters and size does not
+                max_size=_LARGEST_BYTES,
+                max_queue=None,
+                proxy=None,
+            )
+        except Exception as error:  # websockets has a tree of its own beside OSError
+            raise DeviceError(
+                f"rosbridge must answer at {self.url}, got {str(error) or type(error).__name__}; start it on the "
+                "robot's ROS machine with: roslaunch rosbridge_server rosbridge_websocket.launch"
+            ) from error
+        self._gone = ""
+        self._reader = threading.Thread(target=self._listen, name=f"rosbridge {self.url}", daemon=True)
+        self._reader.start()
+
+    def close(self) -> None:
+        """Close; does nothing where it is closed."""
+        self._lose("it was closed")
+        if self._socket is not None:
+            self._socket.close()
+        if self._reader is not None:
+            self._reader.join(self.timeout_s)
+
+    def check(self) -> None:
+        """Raise DeviceError unless the connection stands."""
+        if self._gone:
+            raise DeviceError(f"the connection to rosbridge at {self.url} is gone: {self._gone}")
+
+    def subscribe(self, topic: str, kind: str) -> None:
+        """Ask for the messages of a topic of this ROS type, the newest first when the link is slow."""
+        self._topics[topic] = deque(maxlen=_KEPT)
+        self._send({"op": "subscribe", "topic": topic, "type": kind, "throttle_rate": 0, "queue_length": 1})
+
+    def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
+        """Say that messages of this ROS type will be published. latch: ROS shows the last one to who comes later."""
+        self._send({"op": "advertise", "topic": topic, "type": kind, "latch": latch})
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send a message now. Raises DeviceError."""
+        self._send({"op": "publish", "topic": topic, "msg": message})
+
+    def call(self, service: str, arguments: Message, timeout_s: float | None = None) -> Message:
+        """Call a ROS service once and return its values. Raises DeviceError, also when no answer comes in time."""
+        identity = f"{service}#{next(self._numbers)}"
+        with self._news:
+            self._awaited[identity] = service
+        try:
+            self._send({"op": "call_service", "id": identity, "service": service, "args": arguments})
+            reply = self._wait(lambda: self._replies.get(identity), timeout_s, f"answer of {service}")
+        finally:
+            with self._news:
+                del self._awaited[identity]
+                self._replies.pop(identity, None)
+        values = reply.get("values")
+        if reply.get("result", True) is not True or not isinstance(values, dict):
+            raise DeviceError(f"{service} failed: {values}")
+        return values
+
+    def history(self, topic: str) -> list[Arrival]:
+        """The messages kept of a subscribed topic, oldest first."""
+        with self._news:
+            return list(self._topics.get(topic, ()))
+
+    def wait_for(self, topic: str, *, since_s: float = float("-inf"), timeout_s: float | None = None) -> Arrival:
+        """The newest message of a topic once there is one that came after `since_s`. Raises DeviceError."""
+
+        def fresh() -> Arrival | None:
+            kept = self._topics.get(topic)
+            return kept[-1] if kept and kept[-1].time_s > since_s else None
+
+        return self._wait(fresh, timeout_s, f"message on {topic}")
+
+    def _wait(self, found: Callable[[], T | None], timeout_s: float | None, what: str) -> T:
+        limit = self.timeout_s if timeout_s is None else timeout_s
+        with self._news:
+            self._news.wait_for(lambda: self._gone or found() is not None, limit)
+            answer = found()
+        if answer is None:
+            self.check()
+            raise DeviceError(f"rosbridge at {self.url}: no {what} within {limit:g} s; is the robot's node running?")
+        return answer
+
+    def _send(self, operation: Message) -> None:
+        text = encode(operation)
+        self.check()
+        try:
+            self._socket.send(text)
+        except Exception as error:
+            self._lose(str(error) or type(error).__name__)
+            raise DeviceError(f"the connection to rosbridge at {self.url} is gone: {self._gone}") from error
+
+    def _listen(self) -> None:
+        reason = "the other side closed it"
+        try:
+            for text in self._socket:
+                self._take(text)
+        except Exception as error:
+            reason = str(error) or type(error).__name__
+        self._lose(reason)
+
+    def _lose(self, reason: str) -> None:
+        with self._news:
+            self._gone = self._gone or reason
+            self._news.notify_all()
+
+    def _take(self, text: str | bytes) -> None:
+        operation = decode(text) or {"op": "noise"}
+        handlers = {"publish": self._published, "service_response": self._answered, "status": self._complained}
+        with self._news:
+            handler = handlers.get(operation["op"])
+            if handler is None or not handler(operation):
+                self.counts["noise"] += 1
+            self._news.notify_all()
+
+    def _published(self, operation: Message) -> bool:
+        topic, message = operation.get("topic"), operation.get("msg")
+        kept = self._topics.get(topic) if isinstance(topic, str) else None
+        if kept is None or not isinstance(message, dict):
+            return False
+        kept.append(Arrival(message, self.clock()))
+        return True
+
+    def _answered(self, operation: Message) -> bool:
+        identity = operation.get("id")
+        service = self._awaited.get(identity) if isinstance(identity, str) else None
+        if service is None or operation.get("service", service) != service:
+            self.counts["late"] += 1
+        else:
+            self._replies[str(identity)] = operation
+        return True
+
+    def _complained(self, operation: Message) -> bool:
+        """An error that names a call fails it; others can only be logged."""
+        identity, words = operation.get("id"), operation.get("msg")
+        self.counts["status"] += 1
+        if isinstance(identity, str) and identity in self._awaited and operation.get("level") == "error":
+            self._replies[identity] = {"result": False, "values": words}
+        else:
+            _LOG.warning("rosbridge at %s says: %s", self.url, words)
+        return True
+
+
+def _websocket_client() -> Callable[..., Any]:
+    try:
+        from websockets.sync.client import connect
+    except ImportError as error:
+        raise DeviceError(
+            "a robot behind rosbridge needs websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
+        ) from error
+    return connect
+
+
+def _tcp(url: str, timeout_s: float) -> socket.socket:
+    """A connected socket that gives up on a peer that acknowledges nothing for `timeout_s`. Raises OSError."""
+    host, _, port = url.removeprefix("ws://").rpartition(":")
+    found = socket.create_connection((host.strip("[]"), int(port)), timeout_s)
+    found.settimeout(None)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the pings notice it later
+        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, max(1, round(1000 * timeout_s)))
+    return found

@@ -1,0 +1,243 @@
+"""What a Sawyer says and is told, as the plain values of rosbridge messages: no socket, no time.
+
+Topics, services and types are those of the Intera SDK (intera_core_msgs; names as in intera_sdk 5.3). A message that
+lacks something, or holds what is not a finite number, raises DeviceError.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import DeviceError
+from robot.readings import Pose
+
+Joints = npt.NDArray[np.float64]
+"""(7,) rad, from the shoulder to the wrist."""
+
+JOINTS = tuple(f"right_j{number}" for number in range(7))
+_LIMB = "/robot/limb/right/"
+JOINT_STATES = ("/robot/joint_states", "sensor_msgs/JointState")
+ROBOT_STATE = ("/robot/state", "intera_core_msgs/RobotAssemblyState")
+TIP_STATES = (f"{_LIMB}tip_states", "intera_core_msgs/EndpointStates")
+COLLISION = (f"{_LIMB}collision_detection_state", "intera_core_msgs/CollisionDetectionState")
+JOINT_COMMAND = (f"{_LIMB}joint_command", "intera_core_msgs/JointCommand")
+SPEED_RATIO = (f"{_LIMB}set_speed_ratio", "std_msgs/Float64")
+COMMAND_TIMEOUT = (f"{_LIMB}joint_command_timeout", "std_msgs/Float64")
+ENABLE = ("/robot/set_super_enable", "std_msgs/Bool")
+IK_SERVICE = "/ExternalTools/right/PositionKinematicsNode/IKService"
+
+POSITION_MODE = 1
+SEED_AUTO, SEED_USER = 0, 1
+IK_FAILURES = {
+    -1: "no joint angles reach it",
+    -2: "the arm would collide with itself",
+    -3: "the robot has no such tip",
+}
+_BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop still holds"}
+_SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
+_MOST_LEAN_RAD = math.radians(10.0)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where the rig stands to the robot: rig frame in the robot's base frame (mm, rad), and the gripper on its tip.
+
+    tool_mm: from the tip's origin along its z axis to the point between the fingertips. tool_yaw: from the tip's x axis
+    about its z axis to the direction in which finger a closes.
+    """
+
+    base_xyz_mm: tuple[float, float, float]
+    base_yaw_rad: float
+    tool_mm: float
+    tool_yaw_rad: float
+
+    def tip_of(self, pose: Pose) -> dict[str, Any]:
+        """The geometry_msgs/Pose (m, quaternion) of a tip that hangs straight down with its fingertips at `pose`.
+
+        The tip's rotation is half a turn about x, then `angle` about z: the quaternion (cos, sin, 0, 0) of angle / 2.
+        """
+        point = _about_z(np.array([pose.x_mm, pose.y_mm, pose.z_mm]), self.base_yaw_rad) + self.base_xyz_mm
+        x, y, z = (point + np.array([0.0, 0.0, self.tool_mm])).tolist()
+        half = (pose.yaw_rad + self.base_yaw_rad + self.tool_yaw_rad) / 2
+        return {
+            "position": {"x": x / 1000, "y": y / 1000, "z": z / 1000},
+            "orientation": {"x": math.cos(half), "y": math.sin(half), "z": 0.0, "w": 0.0},
+        }
+
+    def pose_of(self, tip: Mapping[str, Any]) -> Pose:
+        """The pose of the fingertips for a tip's geometry_msgs/Pose. Raises DeviceError for one that leans."""
+        place = np.array([_number(tip, "position", axis) for axis in "xyz"]) * 1000
+        turn = _rotation([_number(tip, "orientation", axis) for axis in "xyzw"])
+        lean = math.acos(min(1.0, max(-1.0, -float(turn[2, 2]))))
+        if lean > _MOST_LEAN_RAD:
+            raise DeviceError(
+                f"the hand must hang straight down, it leans by {math.degrees(lean):.0f} deg; bring it upright above "
+                "the workspace by hand (zero-gravity mode)"
+            )
+        point = _about_z(place + self.tool_mm * turn[:, 2] - self.base_xyz_mm, -self.base_yaw_rad)
+        closing = turn @ [math.cos(self.tool_yaw_rad), math.sin(self.tool_yaw_rad), 0.0]
+        yaw = math.remainder(math.atan2(closing[1], closing[0]) - self.base_yaw_rad, math.tau)
+        return Pose(float(point[0]), float(point[1]), float(point[2]), yaw)
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """/robot/state: whether the arm may move, and why not."""
+
+    enabled: bool
+    stopped: bool
+    error: bool
+    estop_button: int
+    estop_source: int
+
+    @property
+    def obstacle(self) -> str | None:
+        """What keeps the arm from moving and what a person must do about it; None where nothing does."""
+        if self.stopped:
+            source = _SOURCE.get(self.estop_source, "an unknown source")
+            button = _BUTTON.get(self.estop_button, "in an unknown state")
+            return (
+                f"the robot is stopped by {source}, its button is {button}: find out why, clear the workspace, turn "
+                "the button to release it and enable the robot by hand; this program never resets an emergency stop"
+            )
+        if self.error:
+            return (
+                "the robot reports an error of one of its parts: look at its screen, then reset and enable it by hand"
+            )
+        if not self.enabled:
+            return "the robot is not enabled: clear the workspace and enable it by hand, or set enable = true"
+        return None
+
+
+def robot_state(message: Mapping[str, Any]) -> RobotState:
+    """Read intera_core_msgs/RobotAssemblyState."""
+    enabled, stopped, error = (_flag(message, name) for name in ("enabled", "stopped", "error"))
+    return RobotState(
+        enabled, stopped, error, int(_number(message, "estop_button")), int(_number(message, "estop_source"))
+    )
+
+
+def collided(message: Mapping[str, Any]) -> bool:
+    """Read intera_core_msgs/CollisionDetectionState."""
+    return _flag(message, "collision_state")
+
+
+def joints_of(message: Mapping[str, Any]) -> Joints | None:
+    """The arm's joints of a sensor_msgs/JointState; None for a message about other joints, as of a gripper."""
+    names, positions = message.get("name"), message.get("position")
+    if not isinstance(names, list) or not isinstance(positions, list) or len(names) != len(positions):
+        raise DeviceError(f"a joint state must have a position for each name, got {_short(message)}")
+    places = {name: place for name, place in zip(names, positions, strict=True) if isinstance(name, str)}
+    if not set(places) >= set(JOINTS):
+        return None
+    return np.array([_finite(places[name], name) for name in JOINTS])
+
+
+def stamp_of(message: Mapping[str, Any]) -> Any:
+    """The time stamp of a message, to compare and nothing else; None where it has none."""
+    header = message.get("header")
+    return header.get("stamp") if isinstance(header, dict) else None
+
+
+def tip_of(message: Mapping[str, Any], tip: str) -> Mapping[str, Any]:
+    """The geometry_msgs/Pose of the tip of this name in an intera_core_msgs/EndpointStates."""
+    names, states = message.get("names"), message.get("states")
+    if not isinstance(names, list) or not isinstance(states, list) or tip not in names:
+        raise DeviceError(f"the robot must report its tip {tip!r}, it reports {names}; set tip to one of these")
+    place = names.index(tip)
+    state = states[place] if place < len(states) else None
+    pose = state.get("pose") if isinstance(state, dict) else None
+    if not isinstance(pose, dict):
+        raise DeviceError(f"a tip state must hold a pose, got {_short(message)}")
+    return pose
+
+
+def number_of(message: Mapping[str, Any]) -> float:
+    """Read std_msgs/Float64."""
+    return _number(message, "data")
+
+
+def joint_command(positions: Joints) -> dict[str, Any]:
+    """intera_core_msgs/JointCommand in position mode (rad)."""
+    return {
+        "mode": POSITION_MODE,
+        "names": list(JOINTS),
+        "position": positions.tolist(),
+        "velocity": [],
+        "acceleration": [],
+        "effort": [],
+    }
+
+
+def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> dict[str, Any]:
+    """Arguments of intera_core_msgs/SolvePositionIK for one pose; without a seed the robot chooses one."""
+    seeds = [] if seed is None else [{"name": list(JOINTS), "position": seed.tolist(), "velocity": [], "effort": []}]
+    return {
+        "pose_stamp": [{"header": {"frame_id": "base"}, "pose": dict(tip_pose)}],
+        "seed_angles": seeds,
+        "seed_mode": SEED_AUTO if seed is None else SEED_USER,
+        "use_nullspace_goal": [],
+        "nullspace_goal": [],
+        "nullspace_gain": [],
+        "tip_names": [tip],
+    }
+
+
+def ik_answer(values: Mapping[str, Any]) -> Joints:
+    """The joints in the answer to `ik_request`. Raises DeviceError where there are none."""
+    kinds, solutions = values.get("result_type"), values.get("joints")
+    if not isinstance(kinds, list) or not isinstance(solutions, list) or len(kinds) != 1 or len(solutions) != 1:
+        raise DeviceError(f"IKService must answer the one pose it was asked, got {_short(values)}")
+    kind = int(_finite(kinds[0], "result_type"))
+    found = joints_of(solutions[0]) if kind > 0 and isinstance(solutions[0], dict) else None
+    if found is None:
+        raise DeviceError(f"IKService: {IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
+    return found
+
+
+def _number(message: Mapping[str, Any], *path: str) -> float:
+    found: Any = message
+    for name in path:
+        found = found.get(name) if isinstance(found, dict) else None
+    return _finite(found, ".".join(path))
+
+
+def _finite(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also refuses NaN
+        raise DeviceError(f"the robot's {name} must be a finite number, got {_short(value)}")
+    return float(value)
+
+
+def _flag(message: Mapping[str, Any], name: str) -> bool:
+    if not isinstance(found := message.get(name), bool):
+        raise DeviceError(f"the robot's {name} must be true or false, got {_short(found)}")
+    return found
+
+
+def _rotation(quaternion: Sequence[float]) -> npt.NDArray[np.float64]:
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1.0) > 0.01:
+        raise DeviceError(f"the robot's orientation must be a quaternion of length 1, got {list(quaternion)}")
+    x, y, z, w = (part / norm for part in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _about_z(point: npt.NDArray[np.float64], angle: float) -> npt.NDArray[np.float64]:
+    x, y, z = point
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return np.array([cosine * x - sine * y, sine * x + cosine * y, z])
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}..."
