@@ -1,0 +1,153 @@
+"""What is connected to this computer, found with what is installed, each with the lines that name it in a rig's file.
+
+Cameras: /dev/v4l/by-id holds a link for each, named by maker, model and serial number, which stays the same wherever it
+is plugged in; "-video-index0" gives the pictures, higher numbers only data about them. /sys/class/video4linux/*/name is
+what a camera calls itself. Serial ports: /dev/serial/by-id, and what pyserial lists. RealSense and Kinect 2 are asked
+through their packages where these are installed.
+"""
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+log = logging.getLogger(__name__)
+DEV, SYS = Path("/dev"), Path("/sys")
+_GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
+"""Words in a camera's name, and the driver for it; the first that fits."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """kind: camera, serial port, realsense or kinect2. device: its stable name. label: what it calls itself.
+    toml: lines for the rig's file, under the table of that device."""
+
+    kind: str
+    device: str
+    label: str
+    toml: str
+
+
+def discover(dev: Path = DEV, sys: Path = SYS) -> list[Found]:
+    """Everything found, cameras first. `dev`, `sys`: where the system keeps its devices."""
+    return [*find_cameras(dev, sys), *find_serial_ports(dev), *find_realsenses(), *find_kinects()]
+
+
+def camera_names(dev: Path = DEV) -> list[str]:
+    """Stable names of the cameras, as paths; by-path (which socket) where two cameras share a name by-id."""
+    return _pictures(dev / "v4l" / "by-id") or _pictures(dev / "v4l" / "by-path")
+
+
+def _pictures(folder: Path) -> list[str]:
+    return [str(path) for path in _entries(folder) if path.name.endswith("-video-index0")]
+
+
+def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[Found]:
+    """Cameras by stable name; by number where the system makes no stable names."""
+    found = []
+    for name in camera_names(dev):
+        label = _label(sys, Path(name).resolve().name) or Path(name).name
+        found.append(Found("camera", name, label, _camera_toml(name, f"{label} {Path(name).name}")))
+    return found or _numbered_cameras(dev, sys)
+
+
+def _numbered_cameras(dev: Path, sys: Path) -> list[Found]:
+    found = []
+    for entry in _entries(sys / "class" / "video4linux"):
+        if entry.name.startswith("video") and _index_of(entry) == "0":
+            device, label = str(dev / entry.name), _label(sys, entry.name)
+            found.append(Found("camera", device, label, _camera_toml(device, label) + "\nallow_index = true"))
+    return found
+
+
+def _index_of(entry: Path) -> str:
+    """Several numbers belong to one camera; its `index` 0 gives the pictures."""
+    return _text(entry / "index") or "0"
+
+
+def _label(sys: Path, name: str) -> str:
+    return _text(sys / "class" / "video4linux" / name / "name")
+
+
+def _camera_toml(device: str, words: str) -> str:
+    plain = words.lower().replace("_", " ")
+    driver = next((driver for word, driver in _GEL_SENSORS.items() if word in plain), "uvc")
+    return f'driver = "{driver}"\ndevice = "{device}"'
+
+
+def find_serial_ports(dev: Path = DEV) -> list[Found]:
+    """Serial ports by stable name, then those that only pyserial knows. Which of them is the gripper, nobody says."""
+    stable = _entries(dev / "serial" / "by-id")
+    found = [_port(str(path), path.name) for path in stable]
+    known = {path.resolve() for path in stable}
+    return found + [_port(device, label) for device, label in _listed_ports() if Path(device).resolve() not in known]
+
+
+def _port(device: str, label: str) -> Found:
+    return Found("serial port", device, label, f'driver = "wsg50"\nport = "{device}"')
+
+
+def _listed_ports() -> list[tuple[str, str]]:
+    """USB and built-in ports that answer to something; a bare ttyS0 without hardware behind it is left out."""
+    try:
+        from serial.tools import list_ports
+    except ImportError:
+        return []
+    return [(port.device, port.description) for port in list_ports.comports() if port.hwid != "n/a"]
+
+
+def find_realsenses() -> list[Found]:
+    """RealSense cameras, where pyrealsense2 is installed."""
+    try:
+        import pyrealsense2 as rs
+
+        devices: Iterable[Any] = rs.context().query_devices()
+        return [
+            _by_serial("realsense", each.get_info(rs.camera_info.serial_number), each.get_info(rs.camera_info.name))
+            for each in devices
+        ]
+    except ImportError:
+        return []
+    except Exception as error:  # a vendor's package that fails must not hide the other devices
+        log.warning("RealSense cameras could not be listed: %s", error)
+        return []
+
+
+def find_kinects() -> list[Found]:
+    """Kinect 2 cameras, where pylibfreenect2 is installed."""
+    try:
+        from pylibfreenect2 import Freenect2
+
+        freenect = Freenect2()
+        count = freenect.enumerateDevices()
+        serials = [as_text(freenect.getDeviceSerialNumber(number)) for number in range(count)]
+        return [_by_serial("kinect2", serial, "Kinect 2") for serial in serials]
+    except ImportError:
+        return []
+    except Exception as error:  # as above
+        log.warning("Kinect 2 cameras could not be listed: %s", error)
+        return []
+
+
+def as_text(serial: str | bytes) -> str:
+    """pylibfreenect2 gives serial numbers as bytes or text, by its version."""
+    return serial.decode("ascii", "replace") if isinstance(serial, bytes) else serial
+
+
+def _by_serial(driver: str, serial: str, label: str) -> Found:
+    return Found(driver, serial, label, f'driver = "{driver}"\nserial = "{serial}"')
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8", "replace").strip()
+    except OSError:
+        return ""

@@ -1,0 +1,189 @@
+"""Pictures of a camera that never waits: a thread takes every one, notes when, and keeps the newest few.
+
+What is kept is as the camera gives it (BGR); turning, cropping and colour order cost time and wait for a reader. The
+thread owns the stream. When the stream fails, ends or shows one and the same picture for too long, it is closed and
+opened again, waiting a little longer each time; until a new picture has come, whoever asks waits and is then told why.
+"""
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from robot.devices import Clock
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import Frame
+
+log = logging.getLogger(__name__)
+_CLOSING_S = 5.0
+"""A thread that waits inside a camera's driver gets so long to come back before `close` says that it has not."""
+
+_SAMPLE = 16
+"""Every 16th row and column tells nearly any two pictures apart; only where they agree is the rest compared."""
+
+
+class Stream(Protocol):
+    """An opened camera. Both methods are called by one thread at a time."""
+
+    def next(self) -> Frame:
+        """Wait for the next picture: (H, W, 3) uint8 BGR. Raises DeviceError or OSError where none comes."""
+
+    def close(self) -> None:
+        """Let go of the camera."""
+
+
+@dataclass(frozen=True)
+class ReaderSettings:
+    """keep: pictures kept. warmup_s: pictures so soon after opening are dropped (automatic exposure, first black ones).
+    timeout_s: how long somebody who asks waits for a picture. frozen_s: the same pixels for longer are a frozen stream;
+    a sensor without noise is none. backoff_s: first and longest wait before a stream is opened again.
+    """
+
+    keep: int = 4
+    warmup_s: float = 1.0
+    timeout_s: float = 3.0
+    frozen_s: float = 2.0
+    backoff_s: tuple[float, float] = (0.1, 5.0)
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        if not 1 <= self.keep <= 1000:
+            raise RobotConfigError(f"keep must be from 1 to 1000 pictures, got {self.keep}")
+        for name, least in (("warmup_s", 0.0), ("timeout_s", 1e-3), ("frozen_s", 1e-3)):
+            if not getattr(self, name) >= least:  # also refuses NaN
+                raise RobotConfigError(f"{name} must be at least {least:g} s, got {getattr(self, name)}")
+
+
+class FrameReader:
+    """Reads the streams that `open_stream` opens, in a thread of its own, from `start` to `close`.
+
+    frames_seen: pictures taken, the dropped ones included. lost: how often a stream was given up.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_stream: Callable[[], Stream],
+        settings: ReaderSettings,
+        *,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self.name, self.settings, self.clock = name, settings, clock
+        self.frames_seen = self.lost = 0
+        self._open_stream = open_stream
+        self._kept: deque[Frame] = deque(maxlen=settings.keep)
+        self._news = threading.Condition()
+        self._ended, self._hurry = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._last: Frame | None = None
+        self._changed_s = self._warm_s = 0.0
+        self._trouble = "nothing came"
+
+    def start(self) -> None:
+        """Open the stream and wait for its first picture. Raises DeviceError or OSError; then `close` is due."""
+        stream = self._open()
+        self._thread = threading.Thread(target=self._run, args=(stream,), name=f"frames of {self.name}", daemon=True)
+        self._thread.start()
+        self._wait(self.settings.timeout_s + self.settings.warmup_s)
+
+    def newest(self) -> Frame:
+        """The newest picture; waits for one where there is none yet, or none since the stream was lost.
+
+        Raises DeviceError after `timeout_s`.
+        """
+        return self._wait(self.settings.timeout_s)[-1]
+
+    def after(self, time_s: float) -> Frame:
+        """Wait for a picture newer than `time_s`. Raises DeviceError after `timeout_s`."""
+        return self._wait(self.settings.timeout_s, time_s)[-1]
+
+    def near(self, time_s: float) -> Frame:
+        """Of the kept pictures the one taken nearest to `time_s`, the newer one of two. Raises DeviceError."""
+        return min(self._wait(self.settings.timeout_s), key=lambda frame: (abs(frame.time_s - time_s), -frame.time_s))
+
+    def hurry(self) -> None:
+        """Open a lost stream again now."""
+        self._hurry.set()
+
+    def close(self) -> None:
+        """End the thread, which lets go of the stream. Raises DeviceError where the camera's driver holds it up."""
+        self._ended.set()
+        self._hurry.set()
+        if self._thread is None:
+            return
+        self._thread.join(_CLOSING_S)
+        if self._thread.is_alive():
+            raise DeviceError(
+                f"{self.name} must end within {_CLOSING_S:g} s, but its driver still waits for a picture; "
+                "it is let go as soon as that returns. Unplug it if that does not help"
+            )
+
+    def _open(self) -> Stream:
+        stream = self._open_stream()
+        self._warm_s = self.clock() + self.settings.warmup_s
+        return stream
+
+    def _wait(self, timeout_s: float, since_s: float = -math.inf) -> list[Frame]:
+        with self._news:
+            if not self._news.wait_for(lambda: bool(self._kept) and self._kept[-1].time_s > since_s, timeout_s):
+                raise DeviceError(
+                    f"{self.name} must give a picture within {timeout_s:g} s: {self._trouble}; it was lost {self.lost} "
+                    "time(s). Is it plugged in, and used by no other program?"
+                )
+            return list(self._kept)
+
+    def _run(self, stream: Stream | None) -> None:
+        shortest, longest = self.settings.backoff_s
+        delay = shortest
+        while not self._ended.is_set():
+            try:
+                stream = stream or self._open()
+                self._take(stream.next())
+                delay = shortest
+            except Exception as error:  # whatever it is, the thread must live, and whoever asks must hear of it
+                self._lose(stream, error, delay)
+                stream = None
+                self._hurry.wait(delay)
+                self._hurry.clear()
+                delay = min(2 * delay, longest)
+        if stream is not None:
+            _let_go(stream)
+
+    def _take(self, frame: Frame) -> None:
+        with self._news:
+            self.frames_seen += 1
+            if self._last is None or not _same(self._last.pixels, frame.pixels):
+                self._changed_s = frame.time_s
+            self._last = frame
+            still = frame.time_s - self._changed_s
+            if still > self.settings.frozen_s:
+                raise DeviceError(f"its stream is frozen: the same picture for {still:.1f} s")
+            if frame.time_s >= self._warm_s:
+                self._kept.append(frame)
+                self._news.notify_all()
+
+    def _lose(self, stream: Stream | None, error: Exception, delay: float) -> None:
+        with self._news:
+            self._kept.clear()
+            self._trouble = str(error) or type(error).__name__
+            self.lost += 1
+        log.warning("%s: %s; opened again in %.2g s (time %d)", self.name, self._trouble, delay, self.lost)
+        if stream is not None:
+            _let_go(stream)
+
+
+def _let_go(stream: Stream) -> None:
+    with contextlib.suppress(Exception):
+        stream.close()
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    sample = np.s_[::_SAMPLE, ::_SAMPLE]
+    return np.array_equal(one[sample], other[sample]) and np.array_equal(one, other)

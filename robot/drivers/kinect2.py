@@ -1,0 +1,184 @@
+"""Kinect 2 through pylibfreenect2: depth, and the colour that belongs to each of its 512 x 424 pixels.
+
+Facts used (libfreenect2, pylibfreenect2): depth is float in mm, 0 or infinite where unknown; `Registration.apply` gives
+depth without lens distortion and the colour of each of its pixels (BGRX, black where there is none); the parameters of
+the infrared camera are then the intrinsics, and are known after start(); every set of frames must be released, and none
+newer comes before that; opening a serial number that is not there crashes the process, so it is looked for first.
+"""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Camera, Clock
+from robot.drivers.discover import as_text
+from robot.drivers.vendor import start_again, vendor_errors
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import RGBD, Intrinsics
+
+WIDTH, HEIGHT = 512, 424
+PIPELINES = {
+    "opengl": "OpenGLPacketPipeline",
+    "opencl": "OpenCLPacketPipeline",
+    "cuda": "CudaPacketPipeline",
+    "cpu": "CpuPacketPipeline",
+}
+"""Who computes the depth, the usual choice first; a build of libfreenect2 may lack any but the last."""
+
+_POLL_S = 0.002
+
+
+class Kinect2(Camera):
+    """A Kinect 2. serial: which one, where several are connected. pipeline: one of PIPELINES, or "auto", the first that
+    this build has. upside_down: it hangs from above; picture and intrinsics are turned by half a turn."""
+
+    def __init__(
+        self,
+        *,
+        extrinsics: npt.ArrayLike,
+        serial: str = "",
+        pipeline: str = "auto",
+        upside_down: bool = False,
+        warmup_frames: int = 5,
+        timeout_s: float = 3.0,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for a setting out of range; touches no device."""
+        super().__init__("kinect2", extrinsics, clock=clock)
+        if pipeline not in ("auto", *PIPELINES):
+            raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {pipeline!r}")
+        if warmup_frames < 0 or not 0 < timeout_s < 1e6:
+            raise RobotConfigError("warmup_frames must be 0 or more, and timeout_s above 0")
+        self.serial, self.pipeline, self.upside_down = serial, pipeline, upside_down
+        self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
+        self._package: Any = None
+        self._freenect: Any = None
+        self._device: Any = None
+        self._listener: Any = None
+        self._registration: Any = None
+        self._intrinsics: Intrinsics | None = None
+        self._has: dict[str, Any] = {}
+
+    def _connect(self) -> None:
+        package = self._package = _package()
+        with vendor_errors("kinect2 cannot be started"):
+            self._freenect = package.Freenect2()
+            serial = self._choose()
+            name, pipeline = self._make_pipeline()
+            self._device = self._freenect.openDevice(serial, pipeline=pipeline)
+            self._listener = package.SyncMultiFrameListener(package.FrameType.Color | package.FrameType.Depth)
+            self._device.setColorFrameListener(self._listener)
+            self._device.setIrAndDepthFrameListener(self._listener)
+            self._device.start()
+            self._learn(as_text(serial), name)
+            for _ in range(self.warmup_frames):
+                self._discard()
+
+    def _choose(self) -> str | bytes:
+        """The serial number as the package gives it."""
+        count = self._freenect.enumerateDevices()
+        found = {as_text(each): each for each in map(self._freenect.getDeviceSerialNumber, range(count))}
+        if self.serial in found or (not self.serial and len(found) == 1):
+            chosen: str | bytes = found[self.serial or next(iter(found))]
+            return chosen
+        wanted = f"kinect2 {self.serial} must be" if self.serial else "one kinect2, or its serial number given, must be"
+        raise DeviceError(f"{wanted} connected; connected: {', '.join(found) or 'none'}")
+
+    def _make_pipeline(self) -> tuple[str, Any]:
+        """The first of the wanted pipelines that this build has and this computer can run."""
+        failures = []
+        for name in PIPELINES if self.pipeline == "auto" else (self.pipeline,):
+            try:
+                return name, getattr(self._package, PIPELINES[name])()
+            except Exception as error:
+                failures.append(f"{name}: {error}")
+        raise DeviceError(f"kinect2 must compute its depth with {self.pipeline}, but {'; '.join(failures)}")
+
+    def _learn(self, serial: str, pipeline: str) -> None:
+        infrared = self._device.getIrCameraParams()
+        self._registration = self._package.Registration(infrared, self._device.getColorCameraParams())
+        cx, cy = float(infrared.cx), float(infrared.cy)
+        if self.upside_down:
+            cx, cy = WIDTH - 1 - cx, HEIGHT - 1 - cy
+        self._intrinsics = Intrinsics(float(infrared.fx), float(infrared.fy), cx, cy)
+        self._has = {"serial": serial, "pipeline": pipeline, "width": WIDTH, "height": HEIGHT}
+
+    def _close(self) -> None:
+        device, self._device = self._device, None
+        self._listener = self._registration = self._freenect = None
+        if device is not None:
+            with vendor_errors("kinect2 cannot be stopped"):
+                try:
+                    device.stop()
+                finally:
+                    device.close()
+
+    def _settings(self) -> dict[str, Any]:
+        return dict(self._has)
+
+    def _recover(self) -> None:
+        start_again(self._close, self._connect)
+
+    @contextlib.contextmanager
+    def _frames(self) -> Iterator[Any]:
+        """A set of frames, released whatever happens. Waiting is ours: not every version of the package can give up."""
+        if self._device is None:
+            raise DeviceError("kinect2 was stopped by a failed recovery; call recover() again")
+        deadline = time.monotonic() + self.timeout_s
+        while not self._listener.hasNewFrame():
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"kinect2 must give a picture within {self.timeout_s:g} s, but did not; "
+                    "it needs USB 3 and its own power"
+                )
+            time.sleep(_POLL_S)
+        frames = self._listener.waitForNewFrame()
+        try:
+            yield frames
+        finally:
+            self._listener.release(frames)
+
+    def _discard(self) -> None:
+        with self._frames():
+            pass
+
+    def _read(self, depth: bool) -> RGBD:
+        with vendor_errors("kinect2 gives no picture"):
+            if self._device is not None and self._listener.hasNewFrame():
+                self._discard()  # it may have waited there since the last time
+            with self._frames() as frames:
+                time_s = self.clock()
+                colour, depth_mm = self._register(frames)
+        depth_m = self._in_metre(depth_mm) if depth else None
+        return RGBD(self._upright(colour), depth_m, self._intrinsics, time_s)
+
+    def _register(self, frames: Any) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+        """Colour (RGB) of the pixels of the depth, and the depth in mm, both as copies: their memory goes back."""
+        make = self._package.Frame
+        undistorted, registered = make(WIDTH, HEIGHT, 4), make(WIDTH, HEIGHT, 4)
+        self._registration.apply(frames["color"], frames["depth"], undistorted, registered)
+        colour = np.array(registered.asarray(np.uint8)[:, :, 2::-1])
+        return colour, np.array(undistorted.asarray(np.float32))
+
+    def _in_metre(self, depth_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        known = np.isfinite(depth_mm) & (depth_mm > 0)
+        depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
+        return np.ascontiguousarray(depth_m[::-1, ::-1] if self.upside_down else depth_m)
+
+    def _upright(self, colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        return np.ascontiguousarray(colour[::-1, ::-1] if self.upside_down else colour)
+
+
+def _package() -> Any:
+    try:
+        import pylibfreenect2
+    except ImportError as error:
+        raise DeviceError(
+            "a Kinect 2 needs pylibfreenect2, which is missing; build libfreenect2 with shared libraries first "
+            "(github.com/OpenKinect/libfreenect2), then run pip install pylibfreenect2"
+        ) from error
+    return pylibfreenect2

@@ -1,0 +1,165 @@
+"""Intel RealSense through pyrealsense2: colour, and depth as the colour camera would see it.
+
+Facts used (librealsense): depth counts in the sensor's depth scale (m), 0 where unknown; `align` maps it to the colour
+stream's pixels; pixel coordinates count from the centre of the first pixel; where the colour stream has distortion
+coefficients, rs2_project_point_to_pixel knows the model. The first 30 or so pictures are of a camera that still finds
+its exposure.
+"""
+
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Camera, Clock
+from robot.drivers.vendor import start_again, vendor_errors
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import RGBD, Intrinsics
+
+
+class RealSense(Camera):
+    """A RealSense depth camera. serial: which one, where several are connected. warmup_frames: dropped at first.
+
+    A picture with lens distortion is undistorted by the maker's own model (depth by the nearest pixel, so that none is
+    made up at edges), and `settings` says so.
+    """
+
+    def __init__(
+        self,
+        *,
+        extrinsics: npt.ArrayLike,
+        serial: str = "",
+        width: int = 640,
+        height: int = 480,
+        fps: int = 30,
+        warmup_frames: int = 30,
+        timeout_s: float = 3.0,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for a setting out of range; touches no device."""
+        super().__init__("realsense", extrinsics, clock=clock)
+        if min(width, height, fps) < 1 or warmup_frames < 0 or not 0 < timeout_s < 1e6:
+            raise RobotConfigError("width, height, fps and timeout_s must be above 0, and warmup_frames 0 or more")
+        self.serial, self.width, self.height, self.fps = serial, width, height, fps
+        self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
+        self._pipeline: Any = None
+        self._align: Any = None
+        self._intrinsics: Intrinsics | None = None
+        self._scale_m = 0.0
+        self._undistortion: npt.NDArray[np.float32] | None = None
+        self._has: dict[str, Any] = {}
+
+    def _connect(self) -> None:
+        rs = _package()
+        with vendor_errors("realsense cannot be started"):
+            serial = self._choose(rs)
+            pipeline = rs.pipeline()
+            profile = pipeline.start(self._config(rs, serial))
+            self._pipeline = pipeline  # from here on `_close` stops it
+            self._align = rs.align(rs.stream.color)
+            self._learn(rs, profile, serial)
+            for _ in range(self.warmup_frames):
+                self._wait()
+
+    def _choose(self, rs: Any) -> str:
+        found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
+        if self.serial in found or (not self.serial and len(found) == 1):
+            return self.serial or found[0]
+        connected = ", ".join(found) or "none"
+        if self.serial:
+            raise DeviceError(f"realsense {self.serial} must be connected; connected: {connected}")
+        raise DeviceError(f"one realsense must be connected, or its serial number given; connected: {connected}")
+
+    def _config(self, rs: Any, serial: str) -> Any:
+        config = rs.config()
+        config.enable_device(serial)
+        config.enable_stream(rs.stream.depth, self.width, self.height, rs.format.z16, self.fps)
+        config.enable_stream(rs.stream.color, self.width, self.height, rs.format.rgb8, self.fps)
+        return config
+
+    def _learn(self, rs: Any, profile: Any, serial: str) -> None:
+        """Scale of depth, intrinsics, and how to undo distortion."""
+        video = profile.get_stream(rs.stream.color).as_video_stream_profile()
+        lens = video.get_intrinsics()
+        self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
+        coefficients = [float(each) for each in lens.coeffs]
+        self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
+        self._has = {
+            "serial": serial,
+            "width": int(lens.width),
+            "height": int(lens.height),
+            "fps": int(video.fps()),
+            "depth_scale_m": self._scale_m,
+            "distortion": coefficients,
+            "undistorted": self._undistortion is not None,
+        }
+
+    def _close(self) -> None:
+        pipeline, self._pipeline = self._pipeline, None
+        if pipeline is not None:
+            with vendor_errors("realsense cannot be stopped"):
+                pipeline.stop()
+
+    def _settings(self) -> dict[str, Any]:
+        return dict(self._has)
+
+    def _recover(self) -> None:
+        start_again(self._close, self._connect)
+
+    def _wait(self) -> Any:
+        return self._pipeline.wait_for_frames(round(1000 * self.timeout_s))
+
+    def _read(self, depth: bool) -> RGBD:
+        with vendor_errors("realsense gives no picture; is it plugged into USB 3?"):
+            self._running().poll_for_frames()  # what waits there was taken before it was asked for
+            frames = self._wait()
+            time_s = self.clock()
+            if depth:
+                frames = self._align.process(frames)
+            colour = _copied(frames.get_color_frame(), "colour")
+            raw = _copied(frames.get_depth_frame(), "depth") if depth else None
+        depth_m = None if raw is None else self._in_metre(raw)
+        if self._undistortion is not None:
+            colour = np.asarray(cv2.remap(colour, self._undistortion, None, cv2.INTER_LINEAR), np.uint8)
+        return RGBD(colour, depth_m, self._intrinsics, time_s)
+
+    def _running(self) -> Any:
+        if self._pipeline is None:
+            raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
+        return self._pipeline
+
+    def _in_metre(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        """Known depth times the scale, NaN where unknown."""
+        if self._undistortion is not None:
+            raw = cv2.remap(raw, self._undistortion, None, cv2.INTER_NEAREST, borderValue=0)
+        return np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan)).astype(np.float32)
+
+
+def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
+    """(H, W, 2): where the camera shows what a camera without distortion would show at each pixel."""
+    found = np.empty((lens.height, lens.width, 2), np.float32)
+    for row in range(lens.height):
+        y = (row - lens.ppy) / lens.fy
+        for column in range(lens.width):
+            found[row, column] = rs.rs2_project_point_to_pixel(lens, [(column - lens.ppx) / lens.fx, y, 1.0])
+    return found
+
+
+def _copied(frame: Any, what: str) -> npt.NDArray[Any]:
+    """The picture's own memory goes back to the camera."""
+    if not frame:
+        raise DeviceError(f"realsense must give {what} with each picture, but did not")
+    return np.array(frame.get_data())
+
+
+def _package() -> Any:
+    try:
+        import pyrealsense2
+    except ImportError as error:
+        raise DeviceError(
+            "a RealSense camera needs pyrealsense2, which is missing; run pip install 'touch-retrieval[realsense]'"
+        ) from error
+    return pyrealsense2

@@ -1,0 +1,296 @@
+"""Films and folders of pictures as gel sensors, and pictures with depth as a camera: to repeat, rehearse and test.
+
+A sensor counts its pictures by the clock, from when it was connected: picture n is the newest from n / fps on. Nothing
+runs between two reads. A camera goes one picture further each time it is read, however long that takes.
+"""
+
+import contextlib
+import math
+import time
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Camera, Clock, TactileSensor
+from robot.drivers.rectify import Rectifier, make_rectifier
+from robot.errors import DeviceError, RecordingError, RobotConfigError
+from robot.readings import RGBD, Frame, Intrinsics
+from robot.recording import INFO_FILE, parse_object, read_recording
+
+_KEPT = 8
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
+
+
+class _PacedSensor(TactileSensor):
+    """Shows picture n of `_count` from n / fps seconds after connecting, again from the start where it loops."""
+
+    def __init__(
+        self,
+        *,
+        finger: str,
+        path: str,
+        fps: float,
+        loop: bool,
+        crop: Sequence[float],
+        calibration: str,
+        output_px: Sequence[int],
+        clock: Clock,
+    ) -> None:
+        super().__init__(f"gel {finger}", finger, clock=clock)
+        if not 0 <= fps <= 1000:
+            raise RobotConfigError(f"fps must be from 0 (as in the file) to 1000, got {fps}")
+        self.path, self.fps, self.loop = Path(path), fps, loop
+        self._asked_fps = fps
+        self._cutting = (calibration, tuple(crop), tuple(output_px))
+        if not calibration:
+            make_rectifier(*self._cutting)
+        self._rectifier = Rectifier()
+        self._count, self._start_s = 0, 0.0
+        self._decoded: OrderedDict[int, npt.NDArray[np.uint8]] = OrderedDict()
+
+    @abstractmethod
+    def _open(self) -> tuple[int, float]:
+        """Return the number of pictures and their rate, 0 where unknown. Raises DeviceError or OSError."""
+
+    @abstractmethod
+    def _decode(self, number: int) -> npt.NDArray[np.uint8]:
+        """Picture `number`, BGR. Raises DeviceError."""
+
+    def _connect(self) -> None:
+        self._rectifier = make_rectifier(*self._cutting)
+        self._count, rate = self._open()
+        self.fps = self._asked_fps or rate
+        if self._count < 1 or not 0 < self.fps < math.inf:
+            raise DeviceError(f"{self.path} must hold pictures and say how many a second, got {self._count}, {rate:g}")
+        self._picture(0)
+        self._start_s = self.clock()
+
+    def _close(self) -> None:
+        self._decoded.clear()
+
+    def _settings(self) -> dict[str, Any]:
+        return {"path": str(self.path), "pictures": self._count, "fps": self.fps, "loop": self.loop}
+
+    def _read(self) -> Frame:
+        return self._frame(self._now())
+
+    def _read_near(self, time_s: float) -> Frame:
+        return self._frame(min(self._now(), max(0, round((time_s - self._start_s) * self.fps))))
+
+    def _now(self) -> int:
+        number = math.floor((self.clock() - self._start_s) * self.fps)
+        if number >= self._count and not self.loop:
+            raise DeviceError(
+                f"{self.path} ended: its {self._count} pictures lasted {self._count / self.fps:.3g} s; "
+                "set loop = true to see it again and again"
+            )
+        return number
+
+    def _frame(self, number: int) -> Frame:
+        return Frame(self._picture(number % self._count), self._start_s + number / self.fps)
+
+    def _picture(self, number: int) -> npt.NDArray[np.uint8]:
+        if number not in self._decoded:
+            self._decoded[number] = self._rectifier.apply(np.ascontiguousarray(self._decode(number)[..., ::-1]))
+            while len(self._decoded) > _KEPT:
+                self._decoded.popitem(last=False)
+        return self._decoded[number]
+
+
+class VideoSensor(_PacedSensor):
+    """A film file as a sensor. fps: 0 for the file's own."""
+
+    def __init__(
+        self,
+        *,
+        finger: str,
+        path: str,
+        fps: float = 0.0,
+        loop: bool = True,
+        crop: Sequence[float] = (),
+        calibration: str = "",
+        output_px: Sequence[int] = (),
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for a setting out of range; opens nothing."""
+        cutting: dict[str, Any] = {"crop": crop, "calibration": calibration, "output_px": output_px}
+        super().__init__(finger=finger, path=path, fps=fps, loop=loop, clock=clock, **cutting)
+        self._film: Any = None
+        self._next = 0
+
+    def _open(self) -> tuple[int, float]:
+        self._rewind()
+        return int(self._film.get(cv2.CAP_PROP_FRAME_COUNT)), float(self._film.get(cv2.CAP_PROP_FPS))
+
+    def _close(self) -> None:
+        super()._close()
+        if self._film is not None:
+            self._film.release()
+            self._film = None
+
+    def _rewind(self) -> None:
+        """Open it again: looking for a picture by number lands beside it in many kinds of film."""
+        if self._film is not None:
+            self._film.release()
+        if not self.path.is_file():
+            raise DeviceError(f"film {self.path} must be there, but is not")
+        self._film, self._next = cv2.VideoCapture(str(self.path)), 0
+        if not self._film.isOpened():
+            raise DeviceError(f"film {self.path} cannot be opened; OpenCV must know its format")
+
+    def _decode(self, number: int) -> npt.NDArray[np.uint8]:
+        if number < self._next:
+            self._rewind()
+        while self._next < number and self._film.grab():
+            self._next += 1
+        whole, pixels = self._film.read()
+        if not whole or self._next != number:
+            raise DeviceError(f"film {self.path} must have {self._count} pictures, it ends after {self._next}")
+        self._next += 1
+        return np.asarray(pixels, dtype=np.uint8)
+
+
+class ImagesSensor(_PacedSensor):
+    """The pictures of a folder as a sensor, in the order of their names."""
+
+    def __init__(
+        self,
+        *,
+        finger: str,
+        path: str,
+        fps: float = 30.0,
+        loop: bool = True,
+        crop: Sequence[float] = (),
+        calibration: str = "",
+        output_px: Sequence[int] = (),
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for a setting out of range; opens nothing."""
+        cutting: dict[str, Any] = {"crop": crop, "calibration": calibration, "output_px": output_px}
+        super().__init__(finger=finger, path=path, fps=fps, loop=loop, clock=clock, **cutting)
+        self._files: list[Path] = []
+
+    def _open(self) -> tuple[int, float]:
+        self._files = [each for each in sorted(self.path.iterdir()) if each.suffix.lower() in _SUFFIXES]
+        return len(self._files), 0.0
+
+    def _decode(self, number: int) -> npt.NDArray[np.uint8]:
+        return _pixels(self._files[number], cv2.IMREAD_COLOR)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Files of one picture of a camera."""
+
+    colour: Path
+    depth: Path | None
+
+
+class ReplayCamera(Camera):
+    """Pictures with depth from a folder, the next one at each read, from the first again after the last.
+
+    The folder is a recording of this project, or holds NAME.jpg (or .png) with NAME_depth.png, 16-bit in mm with 0
+    where unknown, and intrinsics.json: {"fx": ..., "fy": ..., "cx": ..., "cy": ...} in pixels. A recording does not say
+    them: give fx, fy, cx and cy here, which also count before the file's.
+    """
+
+    def __init__(
+        self,
+        *,
+        path: str,
+        extrinsics: npt.ArrayLike,
+        fx: float = 0.0,
+        fy: float = 0.0,
+        cx: float = math.nan,
+        cy: float = math.nan,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for some, but not all, of fx, fy, cx and cy; opens nothing."""
+        super().__init__("replay camera", extrinsics, clock=clock)
+        given = [fx > 0, fy > 0, math.isfinite(cx), math.isfinite(cy)]
+        if any(given) and not all(given):
+            raise RobotConfigError(f"fx, fy, cx and cy must be given together, got {fx}, {fy}, {cx}, {cy}")
+        self.path = Path(path)
+        self._given = Intrinsics(fx, fy, cx, cy) if all(given) else None
+        self._intrinsics: Intrinsics | None = None
+        self._pairs: list[_Pair] = []
+        self._next = 0
+
+    def show(self, number: int) -> None:
+        """Have the next read give picture `number`, counted from 0; beyond the last they begin again."""
+        self._next = number
+
+    def _connect(self) -> None:
+        is_recording = (self.path / INFO_FILE).is_file()
+        self._pairs = _recorded_pairs(self.path) if is_recording else _named_pairs(self.path)
+        if not self._pairs:
+            raise DeviceError(f"{self.path} must hold pictures, NAME.jpg with NAME{DEPTH_SUFFIX}, or a recording's")
+        self._intrinsics = self._given or _intrinsics(self.path / INTRINSICS_FILE)
+        self.has_depth = self._intrinsics is not None and all(pair.depth is not None for pair in self._pairs)
+        self._next = 0
+
+    def _close(self) -> None:
+        self._pairs = []
+
+    def _settings(self) -> dict[str, Any]:
+        return {"path": str(self.path), "pictures": len(self._pairs), "has_depth": self.has_depth}
+
+    def _read(self, depth: bool) -> RGBD:
+        pair = self._pairs[self._next % len(self._pairs)]
+        colour = np.ascontiguousarray(_pixels(pair.colour, cv2.IMREAD_COLOR)[..., ::-1])
+        depth_m = _depth_m(pair.depth) if depth and pair.depth is not None else None
+        self._next += 1
+        return RGBD(colour, depth_m, self._intrinsics, self.clock())
+
+
+def _recorded_pairs(folder: Path) -> list[_Pair]:
+    try:
+        grasps = read_recording(folder).grasps
+    except RecordingError as error:
+        raise DeviceError(f"replay camera: {error}") from error
+    return [_Pair(folder / grasp.photo, folder / grasp.depth if grasp.depth else None) for grasp in grasps]
+
+
+def _named_pairs(folder: Path) -> list[_Pair]:
+    files = sorted(folder.iterdir())
+    colours = [each for each in files if each.suffix.lower() in _SUFFIXES and not each.name.endswith(DEPTH_SUFFIX)]
+    depths = [each.with_name(each.stem + DEPTH_SUFFIX) for each in colours]
+    return [_Pair(colour, depth if depth in files else None) for colour, depth in zip(colours, depths, strict=True)]
+
+
+def _intrinsics(path: Path) -> Intrinsics | None:
+    if not path.is_file():
+        return None
+    try:
+        found: Mapping[str, Any] = parse_object(path.read_bytes())
+    except RecordingError as error:
+        raise DeviceError(f"{path} {error}") from error
+    names = {"fx", "fy", "cx", "cy"}
+    numbers = {name: float(value) for name, value in found.items() if type(value) in (int, float)}
+    if set(found) != names or set(numbers) != names:
+        raise DeviceError(f"{path} must hold numbers fx, fy, cx and cy in pixels and nothing else, got {found}")
+    return Intrinsics(**numbers)
+
+
+def _depth_m(path: Path) -> npt.NDArray[np.float32]:
+    depth_mm = _pixels(path, cv2.IMREAD_UNCHANGED)
+    if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
+        raise DeviceError(f"{path} must be 16-bit grey, in mm, got {depth_mm.shape} {depth_mm.dtype}")
+    return np.where(depth_mm > 0, depth_mm * np.float32(1e-3), np.float32(np.nan)).astype(np.float32)
+
+
+def _pixels(path: Path, way: int) -> npt.NDArray[Any]:
+    pixels = None
+    with contextlib.suppress(cv2.error):
+        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), way)
+    if pixels is None:
+        raise DeviceError(f"{path} must be a picture, but cannot be decoded")
+    return np.asarray(pixels)

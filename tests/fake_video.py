@@ -1,0 +1,240 @@
+"""Cameras without hardware, as OpenCV, pyrealsense2 and pylibfreenect2 would show them, with faults to switch on."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+
+from tests import views
+
+MISSING = -1.0
+
+
+class FakeCamera:
+    """A USB camera. It counts its pictures; `captures` are opened of it by `open`, which stands for cv2.VideoCapture.
+
+    fps: pictures a second, from `phase_s` on a common clock on. lacks: settings that it does not have. stubborn:
+    settings that stay as they are. Faults: busy, dead, frozen, damaged (pictures that do not decode), hangs (an event
+    that the driver waits for). stamps: its pictures carry their time.
+    """
+
+    def __init__(self, fps=200.0, size=(8, 6), lacks=(), stubborn=(), phase_s=0.0, stamps=False):
+        self.fps, self.size, self.phase_s, self.stamps = fps, size, phase_s, stamps
+        self.lacks, self.stubborn = set(lacks), set(stubborn)
+        self.values = {cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")), cv2.CAP_PROP_FPS: 15.0}
+        self.busy = self.dead = self.frozen = False
+        self.damaged = self.pictures = 0
+        self.hangs = None
+        self.captures, self.written = [], []
+
+    def open(self, path, backend=None):
+        self.captures.append(FakeCapture(self, path, backend))
+        return self.captures[-1]
+
+    @property
+    def open_captures(self):
+        return [each for each in self.captures if not each.released]
+
+    def picture(self, number):
+        """BGR; the number is in the blue of all pixels, red is 200 in the first row and 100 elsewhere."""
+        width, height = self.size
+        pixels = np.full((height, width, 3), (number % 256, 50, 100), np.uint8)
+        pixels[0, :, 2] = 200
+        return pixels
+
+
+class FakeCapture:
+    def __init__(self, camera, path, backend):
+        self.camera, self.path, self.backend = camera, path, backend
+        self.released = False
+        self.taken_s = 0.0
+
+    def isOpened(self):
+        return not (self.camera.busy or self.camera.dead or self.released)
+
+    def set(self, number, value):
+        camera = self.camera
+        camera.written.append((number, value))
+        if number in camera.lacks or number in camera.stubborn:
+            return False
+        camera.values[number] = value
+        return True
+
+    def get(self, number):
+        if number == cv2.CAP_PROP_POS_MSEC:
+            return 1000 * self.taken_s if self.camera.stamps else 0.0
+        return MISSING if number in self.camera.lacks else self.camera.values.get(number, 0.0)
+
+    def grab(self):
+        camera = self.camera
+        if camera.hangs is not None:
+            camera.hangs.wait()
+        if camera.dead or self.released:
+            return False
+        now = time.monotonic()
+        tick = np.floor((now - camera.phase_s) * camera.fps) + 1
+        time.sleep(max(0.0, camera.phase_s + tick / camera.fps - now))
+        self.taken_s = time.monotonic()
+        return True
+
+    def retrieve(self):
+        camera = self.camera
+        if camera.damaged > 0:
+            camera.damaged -= 1
+            return False, None
+        camera.pictures += not camera.frozen
+        return True, camera.picture(camera.pictures)
+
+    def release(self):
+        self.released = True
+
+
+class FakeRealSense:
+    """The module pyrealsense2 with one camera or several: 4 x 3 pixels, depth scale 0.5 mm.
+
+    distortion: coefficients of the colour lens, which shows at pixel x + first coefficient what belongs at x.
+    """
+
+    def __init__(self, serials=("123",), distortion=(0.0,) * 5):
+        self.serials, self.distortion = serials, distortion
+        self.waiting, self.pictures, self.aligned = 0, 0, 0
+        self.started, self.stopped, self.streams = [], 0, []
+        self.silent = self.no_depth = False
+        self.raw = np.array([[0, 1000, 1000, 2000]] * 3, np.uint16)
+        self.camera_info = SimpleNamespace(serial_number="serial", name="name")
+        self.stream = SimpleNamespace(depth="depth", color="colour")
+        self.format = SimpleNamespace(z16="z16", rgb8="rgb8")
+
+    def context(self):
+        found = [SimpleNamespace(get_info={"serial": each, "name": "D435"}.get) for each in self.serials]
+        return SimpleNamespace(query_devices=lambda: found)
+
+    def config(self):
+        return SimpleNamespace(enable_device=self.started.append, enable_stream=lambda *args: self.streams.append(args))
+
+    def pipeline(self):
+        return SimpleNamespace(
+            start=lambda config: self._profile(),
+            stop=self._stop,
+            wait_for_frames=self._wait,
+            poll_for_frames=self._poll,
+        )
+
+    def align(self, stream):
+        assert stream == "colour"
+        return SimpleNamespace(process=self._align)
+
+    def rs2_project_point_to_pixel(self, lens, point):
+        x, y, z = point
+        return [x / z * lens.fx + lens.ppx + lens.coeffs[0], y / z * lens.fy + lens.ppy]
+
+    def _profile(self):
+        if self.silent:
+            raise RuntimeError("Couldn't resolve requests")
+        lens = SimpleNamespace(width=4, height=3, fx=10.0, fy=11.0, ppx=1.5, ppy=1.0, coeffs=list(self.distortion))
+        video = SimpleNamespace(get_intrinsics=lambda: lens, fps=lambda: 30)
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
+        return SimpleNamespace(
+            get_stream=lambda stream: SimpleNamespace(as_video_stream_profile=lambda: video),
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+        )
+
+    def _stop(self):
+        self.stopped += 1
+
+    def _poll(self):
+        self.waiting = 0
+
+    def _wait(self, timeout_ms):
+        if self.silent:
+            raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
+        self.pictures += 1
+        colour = np.zeros((3, 4, 3), np.uint8)
+        colour[..., 0] = 10 * np.arange(4)  # red grows to the right
+        colour[..., 2] = self.waiting  # blue: how old it is
+        colour[..., 1] = 1
+        return self._frames(colour)
+
+    def _frames(self, colour):
+        frame = SimpleNamespace(get_data=lambda: colour)
+        depth = None if self.no_depth else SimpleNamespace(get_data=lambda: self.raw)
+        return SimpleNamespace(get_color_frame=lambda: frame, get_depth_frame=lambda: depth)
+
+    def _align(self, frames):
+        self.aligned += 1
+        return frames
+
+
+class FakeFreenect2:
+    """The module pylibfreenect2 with one camera or several, and pipelines that this build has and can run."""
+
+    def __init__(self, serials=(b"k1",), pipelines=("OpenGLPacketPipeline", "CpuPacketPipeline"), broken=()):
+        self.serials, self.events = serials, []
+        self.taken = self.released = 0
+        self.silent = self.fails = False
+        self.FrameType = SimpleNamespace(Color=1, Ir=2, Depth=4)
+        self.depth = np.full((424, 512), 900.0, np.float32)
+        self.depth[0, :3] = 0, np.inf, np.nan
+        for name in pipelines:
+            setattr(self, name, lambda name=name: self._pipeline(name, broken))
+
+    def _pipeline(self, name, broken):
+        if name in broken:
+            raise RuntimeError("no display")
+        return name
+
+    def Freenect2(self):
+        return SimpleNamespace(
+            enumerateDevices=lambda: len(self.serials),
+            getDeviceSerialNumber=self.serials.__getitem__,
+            openDevice=self._open,
+        )
+
+    def _open(self, serial, pipeline):
+        assert serial in self.serials
+        self.events.append(("open", serial, pipeline))
+        note = {name: lambda *args, name=name: self.events.append((name, *args)) for name in ("start", "stop", "close")}
+        return SimpleNamespace(
+            setColorFrameListener=lambda listener: None,
+            setIrAndDepthFrameListener=lambda listener: None,
+            getIrCameraParams=lambda: SimpleNamespace(fx=364.5, fy=364.6, cx=259.0, cy=202.4),
+            getColorCameraParams=lambda: SimpleNamespace(fx=1081.0, fy=1081.0, cx=959.5, cy=539.5),
+            **note,
+        )
+
+    def SyncMultiFrameListener(self, types):
+        assert types == 5
+        return SimpleNamespace(hasNewFrame=lambda: not self.silent, waitForNewFrame=self._wait, release=self._release)
+
+    def _wait(self):
+        assert self.taken == self.released, "none newer comes before the last set is released"
+        self.taken += 1
+        return {"color": np.zeros((1080, 1920, 4), np.uint8), "depth": self.depth}
+
+    def _release(self, frames):
+        self.released += 1
+
+    def Registration(self, infrared, colour):
+        return SimpleNamespace(apply=self._apply)
+
+    def _apply(self, colour, depth, undistorted, registered):
+        if self.fails:
+            raise ValueError("a mistake of the package")
+        undistorted.array[:] = depth.view(np.uint8).reshape(424, 512, 4)
+        registered.array[:] = (10, 20, 30, 0)
+        registered.array[0, 0] = (1, 2, 3, 0)
+
+    def Frame(self, width, height, bytes_per_pixel):
+        array = np.zeros((height, width, bytes_per_pixel), np.uint8)
+        as_type = {np.uint8: array, np.float32: array.view(np.float32)[..., 0]}
+        return SimpleNamespace(array=array, asarray=as_type.__getitem__)
+
+
+def own_threads():
+    """Threads that read cameras."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("frames of")]
+
+
+EXTRINSICS = views.camera_pose()
