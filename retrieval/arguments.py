@@ -18,6 +18,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_collect(commands)
+    _add_rig(commands)
     _add_import(commands)
     _add_check(commands)
     _add_train(commands)
@@ -53,6 +54,23 @@ def _add_collect(commands: Any) -> None:
     parser.add_argument("--jobs", type=int, default=1, help="simulated rigs that work at once (default: 1)")
     parser.add_argument("--gate", type=Path, help="grasp-success checkpoint (default: a rule on the area of contact)")
     parser.add_argument("--preview", action="store_true", help="write a contact sheet, OUT-preview.png")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print the motions of one attempt at each object; nothing moves"
+    )
+
+
+def _add_rig(commands: Any) -> None:
+    parser = _command(commands, "rig", "See what a rig of real devices is made of, and calibrate its camera.")
+    tasks = parser.add_subparsers(dest="task", required=True, metavar="TASK")
+    check = _command(tasks, "check", "List what is connected, or exercise each device of a rig gently.")
+    check.add_argument("--rig", help="rig by name or TOML file (default: list what is connected)")
+    check.add_argument("--no-motion", action="store_true", help="leave arm and jaws where they are")
+    check.add_argument("--json", action="store_true", help="print one JSON document")
+    calibrate = _command(tasks, "calibrate", "Where the camera stands, from points known in its frame and the rig's.")
+    calibrate.add_argument(
+        "points", type=Path, help="CSV: camera_x_mm, camera_y_mm, camera_z_mm, rig_x_mm, rig_y_mm, rig_z_mm"
+    )
+    calibrate.add_argument("--out", type=Path, default=Path("hand_eye.json"), help="file to write (hand_eye.json)")
 
 
 def _add_import(commands: Any) -> None:

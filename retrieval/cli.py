@@ -8,20 +8,21 @@ import dataclasses
 import json
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from retrieval.arguments import build_parser
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.interruption import noticed_interrupts
-from retrieval.progress import Bar
+from retrieval.output import print_json, say
+from retrieval.rig_commands import run_collect, run_import, run_rig
 
 if TYPE_CHECKING:
     from retrieval.config import Config
     from retrieval.dataset import Split
-    from robot.collect import Progress
 
 DEFAULT_PRESET = "small"
 
@@ -40,20 +41,25 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         except KeyboardInterrupt:
-            return _fail(arguments, "stopped by Ctrl-C", 1)
+            return _stopped(arguments, interrupts)
         except Exception as error:
             if arguments.debug:
                 raise
-            return _explain(arguments, error, interrupted=bool(interrupts))
+            return _explain(arguments, error, interrupts)
 
 
-def _explain(arguments: argparse.Namespace, error: Exception, interrupted: bool) -> int:
+def _stopped(arguments: argparse.Namespace, interrupts: list[int]) -> int:
+    by = "SIGTERM" if signal.SIGTERM in interrupts else "Ctrl-C"
+    return _fail(arguments, f"stopped by {by}", 1)
+
+
+def _explain(arguments: argparse.Namespace, error: Exception, interrupts: list[int]) -> int:
     """Say what went wrong in one line; returns the exit code."""
     code = getattr(error, "exit_code", None)  # every error tree of the project carries one
     if code is not None:
         return _fail(arguments, str(error), code)
-    if interrupted:
-        return _fail(arguments, "stopped by Ctrl-C", 1)
+    if interrupts:
+        return _stopped(arguments, interrupts)
     if isinstance(error, OSError):
         named = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
         return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 2 if named else 1)
@@ -78,87 +84,6 @@ def run_demo(arguments: argparse.Namespace) -> None:
     demo.run_demo(arguments.out, arguments.objects, arguments.jobs)
 
 
-def run_collect(arguments: argparse.Namespace) -> None:
-    """`retrieve collect`."""
-    from functools import partial
-
-    from robot.attempt_log import acceptance_table
-    from robot.collect import CollectSettings, collect
-    from robot.rig import load_rig
-
-    gate, gate_name = _load_gate(arguments.gate)
-    settings = CollectSettings(grasps=arguments.grasps)
-    try:
-        with _CollectBar() as bar:
-            tallies = collect(
-                partial(load_rig, arguments.rig, seed=arguments.seed),
-                arguments.out,
-                objects=arguments.objects,
-                seed=arguments.seed,
-                settings=settings,
-                gate=gate,
-                gate_name=gate_name,
-                jobs=arguments.jobs,
-                progress=bar,
-            )
-    except KeyboardInterrupt:
-        _say(f"what was collected is whole in {arguments.out}; the same command goes on with it")
-        raise
-    _say(acceptance_table(tallies, wanted=settings.grasps))
-    accepted = sum(each.accepted for each in tallies)
-    if accepted == 0:
-        raise RetrievalError(f"no grasp was accepted; {arguments.out}/attempts.jsonl says why")
-    _say(f"{arguments.out}: {accepted} accepted grasps of {len(tallies)} objects")
-    if arguments.preview:
-        from robot.sim.preview import write_preview
-
-        folder = arguments.out if arguments.out.name not in ("", "..") else arguments.out.resolve()
-        beside = folder.with_name(f"{folder.name}-preview.png")  # every image inside belongs to a grasp
-        _say(f"preview: {write_preview(arguments.out, beside)}")
-
-
-def _load_gate(path: Path | None) -> tuple[Any, str | None]:
-    """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
-    if path is None:
-        return None, None
-    from retrieval.grasp_success import load_gate
-    from retrieval.stored import file_digest
-
-    gate = load_gate(path)
-    return gate, f"learned, sha256 {file_digest(path)}"
-
-
-class _CollectBar:
-    """Shows robot.collect's progress on a bar, which is made when the first is told."""
-
-    def __init__(self) -> None:
-        self._bar: Bar | None = None
-
-    def __call__(self, now: "Progress") -> None:
-        if self._bar is None:
-            self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
-        note = f"{now.objects_done} of {now.objects} objects, {now.accept_rate:.0%} of {now.attempts} attempts accepted"
-        self._bar.advance(now.settled - self._bar.done, note)
-
-    def __enter__(self) -> "_CollectBar":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self._bar is not None:
-            self._bar.__exit__(*error)
-
-
-def run_import(arguments: argparse.Namespace) -> None:
-    """`retrieve import`."""
-    from robot.importers import load_importer
-
-    recording = load_importer(arguments.name)(arguments.source, arguments.out)
-    for note in recording.notes:
-        _say(note)
-    objects = len({grasp.object_id for grasp in recording.grasps})
-    _say(f"{arguments.out}: {len(recording.grasps)} grasps of {objects} objects")
-
-
 def run_check(arguments: argparse.Namespace) -> None:
     """`retrieve check`."""
     from retrieval.check import check_recording
@@ -172,11 +97,11 @@ def run_check(arguments: argparse.Namespace) -> None:
         split = load_checkpoint(arguments.model).split
     findings = check_recording(arguments.recording, split)
     if arguments.json:
-        _print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
+        print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
     for finding in findings:
-        _say(f"{finding.severity}: {finding.message}")
+        say(f"{finding.severity}: {finding.message}")
     errors = sum(finding.severity == "error" for finding in findings)
-    _say(f"{arguments.recording}: {errors} error(s), {len(findings) - errors} warning(s)")
+    say(f"{arguments.recording}: {errors} error(s), {len(findings) - errors} warning(s)")
     if errors:
         raise RetrievalError(f"{arguments.recording} is not fit for training; see the errors above")
 
@@ -208,7 +133,7 @@ def _train_matcher(arguments: argparse.Namespace) -> None:
     defaults.remember("model", arguments.out)
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
-    _say(f"{arguments.out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
+    say(f"{arguments.out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
 
 
 def _train_gate(arguments: argparse.Namespace) -> None:
@@ -224,7 +149,7 @@ def _train_gate(arguments: argparse.Namespace) -> None:
         arguments.recording, arguments.out, **{name: value for name, value in given.items() if value is not None}
     )
     for line in report.lines():
-        _say(line)
+        say(line)
 
 
 def _training_config(arguments: argparse.Namespace) -> "Config":
@@ -255,7 +180,7 @@ def run_build_index(arguments: argparse.Namespace) -> None:
     from retrieval.checkpoint import load_checkpoint
 
     path, why = defaults.find_model(arguments.model)
-    _say(f"model: {path} ({why})")
+    say(f"model: {path} ({why})")
     report = build_index(
         arguments.catalogue,
         load_checkpoint(path),
@@ -266,9 +191,9 @@ def run_build_index(arguments: argparse.Namespace) -> None:
     )
     defaults.remember("index", arguments.out)
     for line in report.lines():
-        _say(line)
+        say(line)
     if arguments.json:
-        _print_json(report.to_dict())
+        print_json(report.to_dict())
 
 
 def run_query(arguments: argparse.Namespace) -> None:
@@ -277,7 +202,7 @@ def run_query(arguments: argparse.Namespace) -> None:
 
     path, why = defaults.find_index(arguments.index)
     if arguments.index is None:
-        _say(f"index: {path} ({why})")
+        say(f"index: {path} ({why})")
     from retrieval.search import Searcher
 
     searcher = Searcher.open(path, model=arguments.model, verify=not arguments.no_verify)
@@ -292,16 +217,16 @@ def run_query(arguments: argparse.Namespace) -> None:
 
         arguments.html.parent.mkdir(parents=True, exist_ok=True)
         arguments.html.write_text(query_html(result, searcher.catalogue), "utf-8")
-        _say(f"page: {arguments.html}")
-    _say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
+        say(f"page: {arguments.html}")
+    say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
     if arguments.json:
-        _print_json(result.to_dict())
+        print_json(result.to_dict())
         return
     from retrieval.report.terminal import print_table
 
     print_table(result)
     if result.verdict == "no match":
-        _say("no photo is above the reject threshold: the object may not be in the catalogue")
+        say("no photo is above the reject threshold: the object may not be in the catalogue")
 
 
 def run_export(arguments: argparse.Namespace) -> None:
@@ -311,11 +236,11 @@ def run_export(arguments: argparse.Namespace) -> None:
     from retrieval.export import export
 
     path, why = defaults.find_model(arguments.model)
-    _say(f"model: {path} ({why})")
+    say(f"model: {path} ({why})")
     result = export(load_checkpoint(path), arguments.out)
-    _say(str(result))
+    say(str(result))
     if arguments.json:
-        _print_json(dataclasses.asdict(result))
+        print_json(dataclasses.asdict(result))
 
 
 def run_evaluate(arguments: argparse.Namespace) -> None:
@@ -339,12 +264,12 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
             cache=arguments.cache,
         )
     except KeyboardInterrupt:
-        _say(f"what was made is kept in {arguments.out}; the same command goes on with it")
+        say(f"what was made is kept in {arguments.out}; the same command goes on with it")
         raise
     text, page, *_ = write_report(arguments.out, arguments.recording)
-    _say(f"report: {text}, {page}")
+    say(f"report: {text}, {page}")
     if arguments.json:
-        _print_json(results)
+        print_json(results)
 
 
 def run_frontier(arguments: argparse.Namespace) -> None:
@@ -368,7 +293,7 @@ def run_frontier(arguments: argparse.Namespace) -> None:
             quick=arguments.quick,
         )
     if arguments.json:
-        _print_json(document)
+        print_json(document)
     if document.get("failed"):
         raise RetrievalError(f"{document['failed']} of {len(document['cases'])} hard cases do not hold; see the page")
 
@@ -377,6 +302,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "demo": run_demo,
     "collect": run_collect,
     "import": run_import,
+    "rig": run_rig,
     "check": run_check,
     "train": run_train,
     "build-index": run_build_index,
@@ -385,14 +311,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "evaluate": run_evaluate,
     "frontier": run_frontier,
 }
-
-
-def _print_json(document: Any) -> None:
-    print(json.dumps(document, allow_nan=False))
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ def interruption() -> Iterator[threading.Event]:
 
 @contextmanager
 def noticed_interrupts() -> Iterator[list[int]]:
-    """The Ctrl-C signals so far; each raises KeyboardInterrupt as usual. One that breaks off an import may come out as
+    """The Ctrl-C and SIGTERM signals so far; each raises KeyboardInterrupt, so that a rig is closed with its jaws open
+    and a recording is whole. One that breaks off an import may come out as
     another error: numpy.linalg half loaded raises RecursionError."""
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -38,8 +39,9 @@ def noticed_interrupts() -> Iterator[list[int]]:
         seen.append(number)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGINT, on_interrupt)
+    before = {number: signal.signal(number, on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield seen
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

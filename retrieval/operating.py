@@ -50,7 +50,7 @@ FEWER = (250, 100, 50, 25, 10)
 WIDER = 4
 """How many times more candidates an approximate kind may take than exact search needs."""
 
-EXACT, APPROXIMATE = ("flat", "exact"), ("ivf_flat", "hnsw")
+EXACT, APPROXIMATE = ("flat", "exact"), ("ivf_sq8", "hnsw")
 """Kinds that find the best embeddings always; kinds to try where these take too long, the quickest to build first."""
 
 TIMED = 15

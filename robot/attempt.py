@@ -56,7 +56,6 @@ class Attempter:
         settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
         lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper
-        self._home = Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)  # behind the table, out of the picture
         self._sight = Box(
             (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
         )
@@ -97,7 +96,7 @@ class Attempter:
         rig = self.rig
         rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
         rig.gripper.open(rig.gripper.stroke_mm)
-        rig.arm.move_to(self._home, self.settings.travel_mm_s)
+        rig.arm.move_to(rig.home, self.settings.travel_mm_s)
         rig.prepare(object_id, number)
         start = rig.clock()
         image = rig.camera.read(depth=self._needs_depth)

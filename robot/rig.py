@@ -12,9 +12,10 @@ from robot.attempt_settings import AttemptSettings
 from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
+from robot.readings import Pose
 from robot.settings import build
 
-RIGS = {"sim": "robot.sim.rig:SimRig"}
+RIGS = {"sim": "robot.sim.rig:SimRig", "real": "robot.real_rig:RealRig"}
 """Rigs by name, imported when asked for. A new rig is a file with a subclass of Rig, and a row here."""
 
 
@@ -71,6 +72,12 @@ class Rig:
     def devices(self) -> tuple[Device, ...]:
         """All devices in the order in which they are connected."""
         return self.arm, self.gripper, *self.sensors.values(), self.camera
+
+    @property
+    def home(self) -> Pose:
+        """Behind the table, out of the camera's picture."""
+        lower, upper = self.arm.workspace.lower, self.arm.workspace.upper
+        return Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)
 
     def object_ids(self, count: int) -> list[str]:
         """Names for `count` objects to collect; a simulated rig says which objects it has."""

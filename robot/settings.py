@@ -38,13 +38,15 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
 def check_type(name: str, hint: Any, value: object) -> None:
     """Raise RobotConfigError for a plain value, table or list of plain values that is not of the annotated type."""
     kind, inner = typing.get_origin(hint), typing.get_args(hint)
-    if kind is Sequence:
+    if kind in (Sequence, tuple):
         good = isinstance(value, list | tuple) and all(_is_plain(each, inner[0]) for each in value)
         words = f"a list, each of them {_PLAIN[inner[0]][1]}" if inner[0] in _PLAIN else "a list"
     elif kind is Mapping:
         good, words = isinstance(value, Mapping), "a table"
     else:
         options = [each for each in inner if each is not type(None)] or [hint]
+        if value is None and type(None) in inner:
+            return
         good = any(_is_plain(value, option) for option in options)
         words = " or ".join(_PLAIN[option][1] for option in options if option in _PLAIN)
     if not good:

@@ -81,7 +81,7 @@ WRONG_USE = {
     "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
     "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
     "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
-    "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: sim"),
+    "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: real, sim"),
     "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
     "too many objects": (["collect", "--objects", str(10**20), "--out", "rec"], "at most 100000 objects"),

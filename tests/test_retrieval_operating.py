@@ -131,23 +131,23 @@ def flat_ladders(monkeypatch):
 
 
 EXACT = {("flat", 250): (97, 2.0, 1.0), ("flat", 500): (99, 2.0, 2.5), ("flat", 100): (90, 2.0, 0.5)}
-QUICK = {**EXACT, ("ivf_flat", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.5)}
+QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.5)}
 
 
 @pytest.mark.parametrize(
     ("asked", "points", "kind", "k", "said"),
     [
         (Asked(), QUICK, "flat", 500, ""),
-        (Asked(min_recall=0.95), EXACT | {("ivf_flat", 500): (99, 0.1, 2.0)}, "ivf_flat", 500, ""),
+        (Asked(min_recall=0.95), EXACT | {("ivf_sq8", 500): (99, 0.1, 2.0)}, "ivf_sq8", 500, ""),
         (Asked(min_recall=0.99), QUICK, "flat", 500, ""),  # the search takes less than the judging
         (Asked(max_ms=5), QUICK, "flat", 500, ""),
-        (Asked(max_ms=4), QUICK, "ivf_flat", 500, ""),
+        (Asked(max_ms=4), QUICK, "ivf_sq8", 500, ""),
         (Asked(max_ms=2.8), QUICK, "hnsw", 500, ""),
         (Asked(max_ms=2.6), QUICK, "flat", 100, "reaches a winner recall of 0.99; this is the nearest"),
         (Asked(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the nearest"),
         (Asked(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the nearest"),
-        (Asked("ivf_flat"), QUICK, "ivf_flat", 500, ""),
-        (Asked("ivf_flat"), EXACT, "ivf_flat", 1000, ""),  # all are judged before a winner is lost
+        (Asked("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
+        (Asked("ivf_sq8"), EXACT, "ivf_sq8", 1000, ""),  # all are judged before a winner is lost
         (Asked("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
     ],
 )
@@ -159,7 +159,7 @@ def test_what_was_asked_for_decides(asked, points, kind, k, said, flat_ladders):
 
 
 def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do(flat_ladders):
-    for asked, built in ((Asked(), {"flat"}), (Asked(max_ms=5), {"flat"}), (Asked(max_ms=4), {"flat", "ivf_flat"})):
+    for asked, built in ((Asked(), {"flat"}), (Asked(max_ms=5), {"flat"}), (Asked(max_ms=4), {"flat", "ivf_sq8"})):
         bench = Scripted(QUICK)
         settle(bench, asked)
         assert set(bench.built_kinds) == built

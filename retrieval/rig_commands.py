@@ -1,0 +1,160 @@
+"""What the commands around a rig do: collect, rig and import. As in retrieval.cli, results go to stdout."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from retrieval.errors import RetrievalError
+from retrieval.output import print_json, say
+from retrieval.progress import Bar
+
+if TYPE_CHECKING:
+    from robot.collect import Progress
+    from robot.hand_eye import Errors
+
+
+def run_collect(arguments: argparse.Namespace) -> None:
+    """`retrieve collect`."""
+    if arguments.dry_run:
+        _rehearse(arguments)
+        return
+    from functools import partial
+
+    from robot.attempt_log import acceptance_table
+    from robot.collect import CollectSettings, collect
+    from robot.rig import load_rig
+
+    gate, gate_name = _load_gate(arguments.gate)
+    settings = CollectSettings(grasps=arguments.grasps)
+    try:
+        with _CollectBar() as bar:
+            tallies = collect(
+                partial(load_rig, arguments.rig, seed=arguments.seed),
+                arguments.out,
+                objects=arguments.objects,
+                seed=arguments.seed,
+                settings=settings,
+                gate=gate,
+                gate_name=gate_name,
+                jobs=arguments.jobs,
+                progress=bar,
+            )
+    except KeyboardInterrupt:
+        say(f"what was collected is whole in {arguments.out}; the same command goes on with it")
+        raise
+    say(acceptance_table(tallies, wanted=settings.grasps))
+    accepted = sum(each.accepted for each in tallies)
+    if accepted == 0:
+        raise RetrievalError(f"no grasp was accepted; {arguments.out}/attempts.jsonl says why")
+    say(f"{arguments.out}: {accepted} accepted grasps of {len(tallies)} objects")
+    if arguments.preview:
+        from robot.sim.preview import write_preview
+
+        folder = arguments.out if arguments.out.name not in ("", "..") else arguments.out.resolve()
+        beside = folder.with_name(f"{folder.name}-preview.png")  # every image inside belongs to a grasp
+        say(f"preview: {write_preview(arguments.out, beside)}")
+
+
+def _rehearse(arguments: argparse.Namespace) -> None:
+    """`--dry-run`: the motions of one attempt at each object, on stdout; nothing moves, nothing is recorded."""
+    from robot.attempt import Attempter
+    from robot.dry_run import without_motion
+    from robot.rig import load_rig
+
+    rig = without_motion(load_rig(arguments.rig, seed=arguments.seed), print)
+    with rig:
+        attempter = Attempter(rig, arguments.seed, rig.attempt)
+        for object_id in rig.object_ids(arguments.objects):
+            attempt = attempter.run(object_id, 0)
+            say(f"{object_id}: {attempt.reason or 'nothing was moved, nothing was recorded'}")
+
+
+def run_rig(arguments: argparse.Namespace) -> None:
+    """`retrieve rig`."""
+    {"check": _check_rig, "calibrate": _calibrate}[arguments.task](arguments)
+
+
+def _check_rig(arguments: argparse.Namespace) -> None:
+    """What is connected; with a rig, each device exercised gently."""
+    from robot.drivers.discover import discover
+    from robot.rig import load_rig
+    from robot.rig_check import check_rig
+
+    if arguments.rig is None:
+        found = discover()
+        for device in found:
+            print(f"# {device.kind}: {device.label}\n{device.toml}\n")
+        say(f"{len(found)} device(s) found; the lines above go into a rig's file" if found else "no device was found")
+        return
+    rows = []
+    for row in check_rig(load_rig(arguments.rig, seed=0), motion=not arguments.no_motion):
+        rows.append(row)
+        if not arguments.json:
+            print(row.line(), flush=True)
+    if arguments.json:
+        print_json({"devices": [dataclasses.asdict(row) for row in rows]})
+    if failed := sum(row.failure is not None for row in rows):
+        raise RetrievalError(f"{failed} of {len(rows)} checks failed; see above")
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    """Where the camera stands, from points known in its frame and in the rig's."""
+    from robot.hand_eye import fit_hand_eye, read_pairs
+
+    found = fit_hand_eye(*read_pairs(arguments.points))
+    found.save(arguments.out)
+    for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
+        say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")
+    if found.warning:
+        say(f"warning: {found.warning}")
+    say(f"{arguments.out}: written from {len(found.rig_mm)} points; name it as hand_eye under [camera]")
+
+
+def _off_by(errors: "Errors") -> str:
+    return (
+        f"points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "
+        f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
+    )
+
+
+def _load_gate(path: Path | None) -> tuple[Any, str | None]:
+    """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
+    if path is None:
+        return None, None
+    from retrieval.grasp_success import load_gate
+    from retrieval.stored import file_digest
+
+    gate = load_gate(path)
+    return gate, f"learned, sha256 {file_digest(path)}"
+
+
+class _CollectBar:
+    """Shows robot.collect's progress on a bar, which is made when the first is told."""
+
+    def __init__(self) -> None:
+        self._bar: Bar | None = None
+
+    def __call__(self, now: "Progress") -> None:
+        if self._bar is None:
+            self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
+        note = f"{now.objects_done} of {now.objects} objects, {now.accept_rate:.0%} of {now.attempts} attempts accepted"
+        self._bar.advance(now.settled - self._bar.done, note)
+
+    def __enter__(self) -> "_CollectBar":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(*error)
+
+
+def run_import(arguments: argparse.Namespace) -> None:
+    """`retrieve import`."""
+    from robot.importers import load_importer
+
+    recording = load_importer(arguments.name)(arguments.source, arguments.out)
+    for note in recording.notes:
+        say(note)
+    objects = len({grasp.object_id for grasp in recording.grasps})
+    say(f"{arguments.out}: {len(recording.grasps)} grasps of {objects} objects")

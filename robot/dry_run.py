@@ -1,0 +1,81 @@
+"""A rehearsal without motion: the rig's own sensors and camera, with an arm and jaws that say what they would do."""
+
+from collections.abc import Callable
+
+from robot.devices import Arm, Gripper
+from robot.readings import GripperState, Pose
+from robot.rig import Rig
+
+Say = Callable[[str], object]
+
+
+def without_motion(rig: Rig, say: Say) -> Rig:
+    """`rig`, unconnected, with its arm and gripper replaced: nothing of these two is connected or moved.
+
+    `say` takes a sentence for each motion. The limits are those of the rig, so that what they refuse is refused here.
+    """
+    rig.arm = DryArm(rig.arm, say)
+    rig.gripper = DryGripper(rig.gripper, say)
+    return rig
+
+
+class DryArm(Arm):
+    """Says where it would go, and is there."""
+
+    def __init__(self, arm: Arm, say: Say) -> None:
+        super().__init__(f"{arm.name} (dry run)", arm.workspace, max_speed_mm_s=arm.max_speed_mm_s, clock=arm.clock)
+        self._say = say
+        lower, upper = arm.workspace.lower, arm.workspace.upper
+        self._at = Pose((lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, upper[2], 0.0)
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _stop(self) -> None: ...
+
+    def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
+        self._say(
+            f"arm: to x {pose.x_mm:.1f}, y {pose.y_mm:.1f}, z {pose.z_mm:.1f} mm, yaw {pose.yaw_rad:.3f} rad, "
+            f"at {speed_mm_s:g} mm/s"
+        )
+        self._at = pose
+        return pose
+
+    def _pose(self) -> Pose:
+        return self._at
+
+
+class DryGripper(Gripper):
+    """Says how it would move its jaws; whatever it closes on, it holds."""
+
+    def __init__(self, gripper: Gripper, say: Say) -> None:
+        super().__init__(
+            f"{gripper.name} (dry run)",
+            stroke_mm=gripper.stroke_mm,
+            min_force_n=gripper.min_force_n,
+            max_force_n=gripper.max_force_n,
+            max_speed_mm_s=gripper.max_speed_mm_s,
+            clock=gripper.clock,
+        )
+        self._say = say
+        self._now = GripperState(gripper.stroke_mm, 0.0, "idle")
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _stop(self) -> None: ...
+
+    def _state(self) -> GripperState:
+        return self._now
+
+    def _open(self, opening_mm: float) -> GripperState:
+        self._say(f"jaws: open to {opening_mm:.1f} mm")
+        self._now = GripperState(opening_mm, 0.0, "idle")
+        return self._now
+
+    def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
+        self._say(f"jaws: close with {force_n:.1f} N at {speed_mm_s:g} mm/s")
+        self._now = GripperState(self._now.opening_mm, force_n, "holding")
+        return self._now

@@ -1,0 +1,241 @@
+"""A rig of real devices, put together from the tables of a file; a device is a row of DRIVERS and a table.
+
+    rig = "real"
+    source = "bench 3"                        # said in recording.json
+    sensor = "gelsight mini"
+
+    [limits]                                  # ceilings that no call exceeds, whatever asks
+    workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
+    workspace_upper_mm = [150, 150, 400]
+    arm_speed_mm_s = 200
+    force_n = 20                              # on each finger
+    jaw_speed_mm_s = 60
+    state_age_s = 0.5                         # what moves is stopped when its state is older
+
+    [arm]
+    driver = "manual"                         # a person moves the hand
+    [gripper]
+    driver = "wsg50"
+    port = "socket://192.168.1.20:1000"
+    [sensors.a]
+    driver = "gelsight_mini"
+    device = "/dev/v4l/by-id/usb-..."         # `retrieve rig check` lists them
+    [sensors.b]
+    ...
+    [camera]
+    driver = "realsense"
+    hand_eye = "hand_eye.json"                # made by `retrieve rig calibrate`
+
+    [grasp]                                   # how grasps are drawn (robot.grasp.GraspSettings)
+    force_n = [5, 15]
+    [attempt]                                 # how they are made (robot.attempt_settings.AttemptSettings)
+    settle_s = 1.0
+    [object]                                  # instead of depth: every object stands here and is so large
+    x_mm = 0
+    ...
+
+Paths are those of the process that reads the file. Unknown keys are refused everywhere.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robot.attempt_settings import AttemptSettings
+from robot.cylinder import CylinderFit
+from robot.devices import Arm, Camera, Device, Gripper, TactileSensor
+from robot.errors import RobotConfigError, UnknownName
+from robot.grasp import GraspSettings
+from robot import hand_eye
+from robot.readings import Box
+from robot.rig import Rig, ask_on_terminal
+from robot.settings import build, check_type
+
+DRIVERS: Mapping[str, Mapping[str, str]] = {
+    "arm": {
+        "manual": "robot.drivers.manual_arm:ManualArm",
+        "sawyer": "robot.drivers.sawyer:Sawyer",
+    },
+    "gripper": {
+        "wsg50": "robot.drivers.wsg50:WSG50",
+    },
+    "sensors": {
+        "gelsight": "robot.drivers.opencv_tactile:GelSight",
+        "gelsight_mini": "robot.drivers.opencv_tactile:GelSightMini",
+        "digit": "robot.drivers.opencv_tactile:Digit",
+        "uvc": "robot.drivers.opencv_tactile:OpencvTactile",
+        "video": "robot.drivers.replay:VideoSensor",
+        "images": "robot.drivers.replay:ImagesSensor",
+    },
+    "camera": {
+        "kinect2": "robot.drivers.kinect2:Kinect2",
+        "realsense": "robot.drivers.realsense:RealSense",
+        "uvc": "robot.drivers.uvc_camera:UvcCamera",
+        "replay": "robot.drivers.replay:ReplayCamera",
+    },
+}
+"""Drivers by role and name, imported when asked for. A new device is a file with a subclass of its role's base class
+(robot.devices), whose keywords are the keys of its table, and a row here."""
+
+HAND_EYE_DAYS = 30.0
+"""A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Ceilings: workspace (mm), speeds (mm/s), force on each finger (N), age of the state of what moves (s)."""
+
+    workspace_lower_mm: Sequence[float]
+    workspace_upper_mm: Sequence[float]
+    arm_speed_mm_s: float = 200.0
+    force_n: float = 25.0
+    jaw_speed_mm_s: float = 80.0
+    state_age_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a limit that is not above 0."""
+        for name in ("arm_speed_mm_s", "force_n", "jaw_speed_mm_s", "state_age_s"):
+            value = getattr(self, name)
+            if not 0 < value < float("inf"):
+                raise RobotConfigError(f"[limits]: {name} must be above 0, got {value}")
+
+    @property
+    def workspace(self) -> Box:
+        """Raises RobotConfigError unless lower < upper in x, y and z."""
+        lower, upper = map(tuple, (self.workspace_lower_mm, self.workspace_upper_mm))
+        if len(lower) != 3 or len(upper) != 3:
+            raise RobotConfigError(f"[limits]: the workspace must be x, y and z in mm, got {lower} and {upper}")
+        return Box(lower, upper)
+
+
+@dataclass(frozen=True)
+class GivenObject:
+    """Where every object is put and how large it is (mm), for a rig that cannot see it; error_mm: of the place."""
+
+    x_mm: float
+    y_mm: float
+    height_mm: float
+    radius_mm: float
+    error_mm: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for sizes that are not above 0."""
+        if not (self.height_mm > 0 and self.radius_mm > 0):
+            raise RobotConfigError(f"[object]: height_mm and radius_mm must be above 0, got {self}")
+
+    def fit(self) -> CylinderFit:
+        """As what a camera would have found."""
+        around = (self.radius_mm, self.radius_mm)
+        return CylinderFit(
+            self.x_mm, self.y_mm, self.height_mm, self.radius_mm, self.error_mm, method="given", half_mm=around
+        )
+
+
+class RealRig(Rig):
+    """Arm, gripper, gels and camera of the given tables, under the ceilings of [limits]."""
+
+    def __init__(
+        self,
+        *,
+        arm: Mapping[str, Any],
+        gripper: Mapping[str, Any],
+        sensors: Mapping[str, Any],
+        camera: Mapping[str, Any],
+        limits: Mapping[str, Any],
+        attempt: Mapping[str, Any] = {},
+        grasp: Mapping[str, Any] = {},
+        object: Mapping[str, Any] = {},
+        source: str = "real rig",
+        sensor: str = "gelsight",
+    ) -> None:
+        """Raises RobotConfigError, UnknownName for a driver; connects nothing."""
+        ceilings = build(Limits, limits, where="[limits]")
+        super().__init__(
+            _arm(arm, ceilings, ask_on_terminal),
+            _gripper(gripper, ceilings),
+            _sensors(sensors),
+            _camera(camera),
+            info={"source": source, "sensor": sensor},
+            attempt=_attempt(attempt, grasp, ceilings),
+            given=build(GivenObject, object, where="[object]").fit() if object else None,
+        )
+
+
+def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -> Any:
+    """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
+    known = DRIVERS[role]
+    settings = dict(table)
+    name = settings.pop("driver", None)
+    if name not in known:
+        raise UnknownName(f"{where}: driver must be one of {', '.join(sorted(known))}; got {name!r}")
+    module, class_name = known[name].split(":")
+    driver: type[Device] = getattr(import_module(module), class_name)
+    return build(driver, settings, where=where, clock=time.monotonic, **given)
+
+
+def _arm(table: Mapping[str, Any], limits: Limits, ask: Callable[[str], object]) -> Arm:
+    given = {"workspace": limits.workspace, "max_speed_mm_s": limits.arm_speed_mm_s, "ask": ask}
+    arm: Arm = load_driver("arm", table, "[arm]", max_state_age_s=limits.state_age_s, **given)
+    return arm
+
+
+def _gripper(table: Mapping[str, Any], limits: Limits) -> Gripper:
+    given = {"max_force_n": limits.force_n, "max_speed_mm_s": limits.jaw_speed_mm_s}
+    gripper: Gripper = load_driver("gripper", table, "[gripper]", max_state_age_s=limits.state_age_s, **given)
+    return gripper
+
+
+def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
+    for finger, table in tables.items():
+        if finger not in ("a", "b") or not isinstance(table, Mapping):
+            raise RobotConfigError(f"sensors must be the tables [sensors.a] and [sensors.b], or one; got {finger!r}")
+    if not tables:
+        raise RobotConfigError("a rig must have a gel: [sensors.a], [sensors.b] or both")
+    return {
+        finger: load_driver("sensors", table, f"[sensors.{finger}]", finger=finger) for finger, table in tables.items()
+    }
+
+
+def _camera(table: Mapping[str, Any]) -> Camera:
+    settings = dict(table)
+    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", HAND_EYE_DAYS)
+    check_type("[camera]: hand_eye", str | None, file)
+    check_type("[camera]: hand_eye_days", float, days)
+    extrinsics = np.eye(4) if file is None else hand_eye.load(Path(file), max_age_days=days).rigid
+    camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
+    if camera.has_depth and file is None:
+        raise RobotConfigError(
+            "[camera]: a camera with depth must say where it stands: hand_eye = FILE, made by `retrieve rig calibrate`"
+        )
+    return camera
+
+
+def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limits) -> AttemptSettings:
+    """How attempts are made: as said, else as by default but within the ceilings. Raises RobotConfigError."""
+    low, high = GraspSettings.force_n
+    drawn = GraspSettings.from_dict({"force_n": (min(low, limits.force_n), min(high, limits.force_n)), **grasp})
+    capped = {
+        "travel_mm_s": min(AttemptSettings.travel_mm_s, limits.arm_speed_mm_s),
+        "approach_mm_s": min(AttemptSettings.approach_mm_s, limits.arm_speed_mm_s),
+        "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
+    }
+    settings = build(AttemptSettings, {**capped, **attempt}, where="[attempt]", grasp=drawn)
+    _check_ceilings(settings, limits)
+    return settings
+
+
+def _check_ceilings(settings: AttemptSettings, limits: Limits) -> None:
+    asked = {
+        "[grasp]: force_n": (settings.grasp.force_n[1], limits.force_n, "force_n"),
+        "[attempt]: travel_mm_s": (settings.travel_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
+        "[attempt]: approach_mm_s": (settings.approach_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
+        "[attempt]: closing_mm_s": (settings.closing_mm_s, limits.jaw_speed_mm_s, "jaw_speed_mm_s"),
+    }
+    for name, (value, ceiling, limit) in asked.items():
+        if value > ceiling:
+            raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")

@@ -1,0 +1,174 @@
+"""`retrieve rig check`: connect each device of a rig on its own, exercise it gently, and say what was measured.
+
+A device that fails does not keep the others from being checked. Nothing is grasped: the jaws move by `JAW_MM`, the arm
+rises by `ARM_MM`, and both come back.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from statistics import median
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Device, TactileSensor, read_together
+from robot.errors import DeviceError
+from robot.readings import RGBD, Frame
+from robot.rig import Rig
+
+JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
+WATCHED_S = 2.0
+"""How long frames are counted."""
+
+_POLL_S = 0.002
+_ASKED = 20
+"""How often a state is asked for, and both gels are read, to measure how long that takes and how far apart they are."""
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What came of one device: measured figures with their units in words, settings it refused, or the failure."""
+
+    device: str
+    role: str
+    measured: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+    failure: str | None = None
+
+    def line(self) -> str:
+        """The row of the table."""
+        said = self.failure or ", ".join(f"{name} {value}" for name, value in self.measured.items())
+        refused = "".join(f"; refused {name}: {value}" for name, value in self.refused.items())
+        return f"{'ok  ' if self.failure is None else 'FAIL'}  {self.role:9} {self.device}: {said}{refused}"
+
+
+def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
+    """Check every device, each as soon as it is asked for, then how far apart in time the fingers are seen.
+
+    `motion`: whether arm and jaws may move a little. Raises nothing of a device: its failure is a row.
+    """
+    if rig.can_run_jobs:  # simulated: an object can be had for nothing, and without one its gels see nothing
+        rig.prepare(rig.object_ids(1)[0], 0)
+    yield _checked(rig.arm, "arm", lambda: _check_arm(rig, motion))
+    yield _checked(rig.gripper, "gripper", lambda: _check_gripper(rig, motion))
+    for sensor in rig.sensors.values():
+        yield _checked(sensor, "gel", partial(_check_sensor, rig, sensor))
+    yield _checked(rig.camera, "camera", lambda: _check_camera(rig))
+    if len(rig.sensors) > 1:
+        yield _check_skew(rig)
+
+
+def _checked(device: Device, role: str, check: Callable[[], dict[str, str]]) -> Checked:
+    row = Checked(device.name, role)
+    try:
+        with device:
+            row = replace(row, measured=check(), refused=dict(device.refused))
+    except DeviceError as error:
+        return replace(row, failure=str(error))
+    return row
+
+
+def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
+    """Up a little and back; a person's arm has no pose before it was asked to go somewhere, so there it goes first."""
+    arm = rig.arm
+    if not motion:
+        return {"motion": "not tried"}
+    try:
+        start = arm.pose()
+    except DeviceError:
+        start = arm.move_to(rig.home, ARM_MM_S)
+    top = arm.workspace.upper[2]
+    up = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
+    speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
+    reached = arm.move_to(up, speed)
+    seconds = rig.clock() - began
+    arm.move_to(start, speed)
+    away = np.linalg.norm(np.subtract(reached.as_tuple()[:3], up.as_tuple()[:3]))
+    return {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{away:.2f} mm"} | _round_trip(rig, arm.pose)
+
+
+def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
+    gripper = rig.gripper
+    state = gripper.state()
+    said = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"} | _round_trip(rig, gripper.state)
+    said["force"] = f"{gripper.min_force_n:g} to {gripper.max_force_n:g} N on each finger"
+    if motion and state.status == "idle":
+        there = state.opening_mm - JAW_MM if state.opening_mm >= JAW_MM else state.opening_mm + JAW_MM
+        reached = gripper.open(there)
+        gripper.open(min(state.opening_mm, gripper.stroke_mm))
+        said["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - there):.2f} mm"
+    elif motion:
+        said["moved"] = f"not: it is {state.status}"
+    return said
+
+
+def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
+    times = []
+    for _ in range(_ASKED):
+        began = rig.clock()
+        ask()
+        times.append(rig.clock() - began)
+    return {"state in": f"{1000 * median(times):.2f} ms (slowest {1000 * max(times):.2f})"}
+
+
+def _check_sensor(rig: Rig, sensor: TactileSensor) -> dict[str, str]:
+    frame, said = _watched(rig, sensor.read)
+    return said | _size(frame.pixels)
+
+
+def _check_camera(rig: Rig) -> dict[str, str]:
+    camera = rig.camera
+    image, said = _watched(rig, lambda: camera.read(depth=camera.has_depth))
+    said |= _size(image.colour)
+    if image.depth_m is not None:
+        known = np.isfinite(image.depth_m)
+        middle = f", median {np.nanmedian(image.depth_m):.3f} m" if known.any() else ""
+        said["depth known"] = f"{known.mean():.0%} of the pixels{middle}"
+    return said
+
+
+def _size(pixels: npt.NDArray[np.uint8]) -> dict[str, str]:
+    return {"size": f"{pixels.shape[1]} x {pixels.shape[0]}", "mean grey level": f"{pixels.mean():.0f}"}
+
+
+_Seen = TypeVar("_Seen", Frame, RGBD)
+
+
+def _watched(rig: Rig, read: Callable[[], _Seen]) -> tuple[_Seen, dict[str, str]]:
+    """The last frame of `WATCHED_S`, how many different ones there were, and how old they were when they were read."""
+    times, ages, began = set(), [], rig.clock()
+    while True:
+        frame = read()
+        times.add(frame.time_s)
+        ages.append(rig.clock() - frame.time_s)
+        if rig.clock() - began >= WATCHED_S:
+            return frame, {"rate": _rate(sorted(times)), "age": f"{1000 * median(ages):.0f} ms"}
+        rig.sleep(_POLL_S)
+
+
+def _rate(times: list[float]) -> str:
+    """From the first frame to the last, so that where the watch began and ended does not count."""
+    if len(times) < 2:
+        return f"{len(times)} frame(s) in {WATCHED_S:g} s"
+    return f"{(len(times) - 1) / (times[-1] - times[0]):.1f} frames/s"
+
+
+def _check_skew(rig: Rig) -> Checked:
+    """Both gels at once, as the collector reads them."""
+    row, connected = Checked(" and ".join(sensor.name for sensor in rig.sensors.values()), "skew"), []
+    try:
+        for sensor in rig.sensors.values():
+            sensor.connect()
+            connected.append(sensor)
+        skews = []
+        for _ in range(_ASKED):
+            skews.append(read_together(rig.sensors)[1])
+            rig.sleep(0.05)
+    except DeviceError as error:
+        return replace(row, failure=str(error))
+    finally:
+        for sensor in connected:
+            sensor.close()
+    return replace(row, measured={"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"})

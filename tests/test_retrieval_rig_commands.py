@@ -1,0 +1,115 @@
+"""`retrieve rig` and the dry run, as a user meets them."""
+
+import json
+import signal
+
+import pytest
+
+from retrieval.cli import main
+from robot.drivers.discover import Found
+from robot.rig import RIGS
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(RIGS, "fake", "tests.fake_rig:FakeRig")
+    return tmp_path
+
+
+def test_a_check_prints_a_line_for_each_device(capsys):
+    assert main(["rig", "check", "--rig", "fake"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines] == [
+        ["ok", "arm"],
+        ["ok", "gripper"],
+        ["ok", "gel"],
+        ["ok", "gel"],
+        ["ok", "camera"],
+        ["ok", "skew"],
+    ]
+
+
+def test_a_check_with_a_device_that_fails_leaves_with_1_and_names_it(capsys, monkeypatch):
+    def missing(self):
+        raise OSError(2, "No such file or directory")
+
+    monkeypatch.setattr("tests.fake_rig.FakeCamera._connect", missing)
+    assert main(["rig", "check", "--rig", "fake", "--json"]) == 1
+    said = capsys.readouterr()
+    rows = json.loads(said.out)["devices"]
+    assert rows[4]["failure"] == "fake camera cannot be connected: No such file or directory"
+    assert [row["failure"] for row in rows].count(None) == 5
+    assert "1 of 6 checks failed" in said.err
+
+
+def test_without_a_rig_what_is_connected_is_listed_as_lines_for_its_file(capsys, monkeypatch):
+    found = [Found("camera", "/dev/v4l/by-id/x", "GelSight Mini R0B", '[sensors.a]\ndriver = "gelsight_mini"')]
+    monkeypatch.setattr("robot.drivers.discover.discover", lambda: found)
+    assert main(["rig", "check"]) == 0
+    said = capsys.readouterr()
+    assert said.out == '# camera: GelSight Mini R0B\n[sensors.a]\ndriver = "gelsight_mini"\n\n'
+    assert "1 device(s) found" in said.err
+    monkeypatch.setattr("robot.drivers.discover.discover", list)
+    assert main(["rig", "check"]) == 0
+    assert capsys.readouterr().err == "no device was found\n"
+
+
+POINTS = """camera_x_mm,camera_y_mm,camera_z_mm,rig_x_mm,rig_y_mm,rig_z_mm
+0,0,800,0,0,0
+100,0,800,100,0,0
+0,100,800,0,-100,0
+0,0,700,0,0,100
+90,80,650,90,-80,150
+20,90,600,20,-90,200
+"""
+
+
+def test_a_calibration_is_fitted_told_and_written(here, capsys):
+    (here / "points.csv").write_text(POINTS)
+    assert main(["rig", "calibrate", "points.csv"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("rigid: ")
+    assert said[1].startswith("affine: ")
+    assert said[-1] == "hand_eye.json: written from 6 points; name it as hand_eye under [camera]"
+    rigid = json.loads((here / "hand_eye.json").read_text())["rigid"]
+    assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
+
+
+def test_a_file_without_points_is_wrong_use(here, capsys):
+    (here / "points.csv").write_text("a,b\n1,2\n")
+    assert main(["rig", "calibrate", "points.csv"]) == 2
+    assert "camera_x_mm" in capsys.readouterr().err
+    assert not (here / "hand_eye.json").exists()
+
+
+def test_a_dry_run_prints_motions_and_writes_nothing(here, capsys):
+    assert main(["collect", "--rig", "fake", "--objects", "2", "--out", "rec", "--dry-run"]) == 0
+    said = capsys.readouterr()
+    assert said.out.count("jaws: close with") == 2
+    assert "round-1: nothing was moved, nothing was recorded" in said.err
+    assert not (here / "rec").exists()
+
+
+def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leaves_a_whole_recording(
+    here, capsys, monkeypatch
+):
+    from tests.fake_rig import FakeGripper, FakeRig
+
+    rigs, real_init, real_grasp = [], FakeRig.__init__, FakeGripper._grasp
+
+    def ended(self, force_n, speed_mm_s):
+        state = real_grasp(self, force_n, speed_mm_s)
+        if self.world.calls.count("grasp") == 3:
+            signal.raise_signal(signal.SIGTERM)
+        return state
+
+    monkeypatch.setattr(FakeGripper, "_grasp", ended)
+    monkeypatch.setattr(FakeRig, "__init__", lambda self, *a, **k: (rigs.append(self), real_init(self, *a, **k))[1])
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 1
+    assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert rigs[0].world.force is None
+    assert not any(device.is_connected for device in rigs[0].devices)
+    assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 0

@@ -1,0 +1,39 @@
+"""A dry run: the motions of an attempt are said, and nothing moves."""
+
+from robot.attempt import Attempter
+from robot.attempt_settings import AttemptSettings
+from robot.dry_run import without_motion
+from tests.fake_rig import FakeRig
+
+
+def test_the_motions_of_an_attempt_are_said_in_order_and_nothing_is_moved():
+    said = []
+    rig = FakeRig(5)
+    world = rig.world
+    with without_motion(rig, said.append) as dry:
+        attempt = Attempter(dry, 5, AttemptSettings()).run("round-0", 0)
+    assert attempt.outcome == "held"
+    assert {"arm", "grasp", "open", "arm.connect", "gripper.connect"}.isdisjoint(world.calls)
+    assert "depth" in world.calls  # it looks, and feels
+    assert "gel a" in world.calls
+    starts = [" ".join(line.split()[:2]) for line in said]
+    assert starts == [
+        "jaws: open",  # wide
+        "arm: to",  # out of the picture
+        "arm: to",  # above the object
+        "jaws: open",  # as wide as the object asks
+        "arm: to",  # down
+        "jaws: close",
+        "arm: to",  # up
+        "arm: to",  # over the place to put it
+        "arm: to",  # down
+        "jaws: open",
+    ]
+    assert said[1] == "arm: to x 0.0, y 150.0, z 500.0 mm, yaw 0.000 rad, at 200 mm/s"
+
+
+def test_what_the_rig_may_not_do_is_refused_in_a_dry_run_too():
+    rig = FakeRig(5)
+    limits = rig.arm.workspace, rig.gripper.max_force_n
+    dry = without_motion(rig, print)
+    assert (dry.arm.workspace, dry.gripper.max_force_n) == limits

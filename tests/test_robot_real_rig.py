@@ -1,0 +1,136 @@
+"""A rig of real devices from a file: what is built, what is refused, and that nothing is connected by reading it."""
+
+import datetime
+
+import numpy as np
+import pytest
+
+from robot import hand_eye
+from robot.drivers.manual_arm import ManualArm
+from robot.drivers.replay import ImagesSensor
+from robot.drivers.uvc_camera import UvcCamera
+from robot.drivers.wsg50 import WSG50
+from robot.errors import RobotConfigError, UnknownName
+from robot.real_rig import DRIVERS, load_driver
+from robot.rig import load_rig
+
+TABLES = {
+    "": 'rig = "real"\nsource = "bench 3"\nsensor = "gelsight mini"',
+    "limits": "workspace_lower_mm = [-100, -100, 10]\nworkspace_upper_mm = [100, 100, 300]\nforce_n = 15\n"
+    "jaw_speed_mm_s = 40\narm_speed_mm_s = 90",
+    "arm": 'driver = "manual"',
+    "gripper": 'driver = "wsg50"\nport = "socket://127.0.0.1:1"',
+    "sensors.a": 'driver = "images"\npath = "frames"\nfps = 30',
+    "camera": 'driver = "uvc"\ndevice = "/dev/v4l/by-id/usb-cam-video-index0"',
+    "object": "x_mm = 0\ny_mm = 5\nheight_mm = 100\nradius_mm = 30",
+}
+
+
+def written(tmp_path, **changed):
+    """A rig file with some tables replaced (None: left out)."""
+    tables = {**TABLES, **changed}
+    path = tmp_path / "rig.toml"
+    heads = {name: f"[{name}]\n" if name else "" for name in tables}
+    path.write_text("\n".join(heads[name] + text for name, text in tables.items() if text is not None))
+    return str(path)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "frames").mkdir()
+
+
+def points(tmp_path, days=0):
+    """A calibration file `days` old: a camera 800 mm above the table, upside down."""
+    camera = np.array([[0, 0, 800], [100, 0, 800], [0, 100, 800], [0, 0, 700], [90, 80, 650]], float)
+    rig = camera * [1, -1, -1] + [0, 0, 800]
+    when = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=days)
+    hand_eye.fit_hand_eye(camera, rig, written=when).save(tmp_path / "hand_eye.json")
+
+
+def test_a_file_becomes_a_rig_with_its_devices_under_its_ceilings(tmp_path):
+    rig = load_rig(written(tmp_path), seed=0)
+    assert isinstance(rig.arm, ManualArm)
+    assert isinstance(rig.gripper, WSG50)
+    assert isinstance(rig.sensors["a"], ImagesSensor)
+    assert isinstance(rig.camera, UvcCamera)
+    assert rig.arm.workspace.upper == (100, 100, 300)
+    assert rig.arm.max_speed_mm_s == 90
+    assert rig.gripper.max_force_n <= 15
+    assert rig.gripper.max_speed_mm_s == 40
+    assert rig.info["source"] == "bench 3"
+    assert rig.info["rig_settings"]["gripper"]["driver"] == "wsg50"
+    assert not any(device.is_connected for device in rig.devices)
+
+
+def test_what_is_not_said_of_attempts_stays_under_the_ceilings(tmp_path):
+    attempt = load_rig(written(tmp_path), seed=0).attempt
+    assert attempt.grasp.force_n == (5.0, 15)
+    assert (attempt.travel_mm_s, attempt.approach_mm_s, attempt.closing_mm_s) == (90, 50, 40)
+
+
+def test_a_given_object_stands_for_what_a_camera_without_depth_cannot_see(tmp_path):
+    given = load_rig(written(tmp_path), seed=0).given
+    assert (given.x_mm, given.y_mm, given.height_mm, given.radius_mm, given.method) == (0, 5, 100, 30, "given")
+    assert given.width_mm(1.0, 25.0) == 60
+    with pytest.raises(RobotConfigError, match="has no depth: where the object stands and its size must be given"):
+        load_rig(written(tmp_path, object=None), seed=0)
+
+
+def test_a_camera_with_depth_must_be_calibrated_and_not_long_ago(tmp_path):
+    replay = 'driver = "replay"\npath = "recording"\nfx = 300\nfy = 300\ncx = 127.5\ncy = 127.5\n'
+    with pytest.raises(RobotConfigError, match="must say where it stands: hand_eye = FILE"):
+        load_rig(written(tmp_path, camera=replay), seed=0)
+    points(tmp_path)
+    found = load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"', object=None), seed=0)
+    assert found.camera.extrinsics[:3, 3] == pytest.approx([0, 0, 800], abs=1e-6)
+    assert found.given is None
+    points(tmp_path, days=40)
+    with pytest.raises(RobotConfigError, match="must be at most 30 days old, it is 40"):
+        load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"'), seed=0)
+    longer = replay + 'hand_eye = "hand_eye.json"\nhand_eye_days = 60'
+    assert load_rig(written(tmp_path, camera=longer), seed=0).camera.has_depth
+
+
+BAD = {
+    "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of manual, sawyer; got 'kuka'"),
+    "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of wsg50; got None"),
+    "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
+    "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] must say 'port'"),
+    "an unknown table": ({"feet": "count = 2"}, "RealRig has no setting 'feet'"),
+    "a table too few": ({"arm": None}, "RealRig must say 'arm'"),
+    "an unknown finger": ({"sensors.c": 'driver = "images"\npath = "frames"'}, r"\[sensors.a\] and .*; got 'c'"),
+    "an unknown limit": ({"limits": "force = 3"}, r"\[limits\] has no setting 'force'"),
+    "a limit too few": ({"limits": "force_n = 3"}, r"\[limits\] must say 'workspace_lower_mm'"),
+    "a workspace inside out": (
+        {"limits": "workspace_lower_mm = [0, 0, 9]\nworkspace_upper_mm = [1, 1, 1]"},
+        "a box must have lower < upper",
+    ),
+    "a flat workspace": (
+        {"limits": "workspace_lower_mm = [0, 0]\nworkspace_upper_mm = [1, 1]"},
+        r"\[limits\]: the workspace must be x, y and z",
+    ),
+    "a limit of nothing": ({"limits": TABLES["limits"] + "\nstate_age_s = 0"}, "state_age_s must be above 0"),
+    "a force above the ceiling": ({"grasp": "force_n = [5, 16]"}, r"\[grasp\]: force_n must be at most force_n = 15"),
+    "a speed above the ceiling": (
+        {"attempt": "travel_mm_s = 91"},
+        r"\[attempt\]: travel_mm_s must be at most arm_speed_mm_s = 90 of \[limits\], got 91",
+    ),
+    "an unknown habit": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
+    "a grasp through the back door": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
+    "an object of no size": ({"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"}, "must be above 0"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(BAD))
+def test_a_wrong_file_is_refused_with_the_place_and_the_remedy(case, tmp_path):
+    changed, said = BAD[case]
+    with pytest.raises((RobotConfigError, UnknownName), match=said):
+        load_rig(written(tmp_path, **changed), seed=0)
+
+
+@pytest.mark.parametrize(("role", "name"), [(role, name) for role, known in DRIVERS.items() for name in known])
+def test_every_driver_of_the_table_exists_and_refuses_an_unknown_key(role, name):
+    with pytest.raises(RobotConfigError, match="no setting 'bort'"):
+        load_driver(role, {"driver": name, "bort": 1}, "[x]")

@@ -1,0 +1,89 @@
+"""The check of a rig: every device on its own, gently, each failure a row."""
+
+import pytest
+
+from robot import rig_check
+from robot.errors import DeviceError
+from robot.readings import GripperState, Pose
+from robot.rig_check import check_rig
+from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
+
+
+@pytest.fixture
+def rig():
+    return FakeRig(5)
+
+
+def test_every_device_is_exercised_and_closed_and_comes_back(rig):
+    rows = list(check_rig(rig))
+    assert [(row.role, row.failure) for row in rows] == [
+        ("arm", None),
+        ("gripper", None),
+        ("gel", None),
+        ("gel", None),
+        ("camera", None),
+        ("skew", None),
+    ]
+    assert rows[0].measured["moved"] == "10 mm in 0.50 s"
+    assert rows[1].measured["moved"] == "5 mm, off by 0.00 mm"
+    assert rows[2].measured["size"] == "32 x 24"
+    assert rows[4].measured["depth known"].endswith(" m")
+    assert rows[5].measured["apart"] == "0.0 ms (most 0.0)"
+    assert not any(device.is_connected for device in rig.devices)
+    assert rig.world.pose == Pose(0, 0, 300, 0)
+    assert rig.world.opening == 110.0
+    assert "grasp" not in rig.world.calls
+
+
+def test_without_motion_arm_and_jaws_stay_where_they_are(rig):
+    rows = list(check_rig(rig, motion=False))
+    assert rows[0].measured == {"motion": "not tried"}
+    assert {"arm", "open", "grasp"}.isdisjoint(rig.world.calls)
+
+
+def test_a_device_that_fails_is_a_row_and_the_others_are_still_checked(rig):
+    rig.world.faults = {"gripper.connect": {1}, "gel b": {1}}
+    rows = {row.device: row for row in check_rig(rig)}
+    assert rows["fake gripper"].failure == "the fake gripper.connect was told to fail"
+    assert rows["fake gel b"].failure == "the fake gel b was told to fail"
+    assert rows["fake camera"].failure is None
+    assert rows["fake gripper"].line() == "FAIL  gripper   fake gripper: the fake gripper.connect was told to fail"
+    assert not any(device.is_connected for device in rig.devices)
+
+
+def test_what_is_held_is_not_let_go(rig, monkeypatch):
+    monkeypatch.setattr(FakeGripper, "_state", lambda self: GripperState(40.0, 10.0, "holding"))
+    monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it let go"))
+    (row,) = [row for row in check_rig(rig) if row.role == "gripper"]
+    assert row.measured["moved"] == "not: it is holding"
+
+
+def test_settings_that_a_device_refused_are_told(rig, monkeypatch):
+    rig.sensors["a"].refused = {"exposure": "asked 5, has 8"}
+    row = next(row for row in check_rig(rig) if row.device == "fake gel a")
+    assert row.line().endswith("; refused exposure: asked 5, has 8")
+
+
+def test_an_arm_that_knows_no_pose_before_it_was_moved_goes_home_first(rig, monkeypatch):
+    real, moved = type(rig.arm)._pose, []
+
+    def pose(self):
+        if not moved:
+            raise DeviceError("the fake arm must be moved before it knows its pose")
+        return real(self)
+
+    move = type(rig.arm)._move_to
+    monkeypatch.setattr(type(rig.arm), "_pose", pose)
+    monkeypatch.setattr(type(rig.arm), "_move_to", lambda *given: moved.append(given[1]) or move(*given))
+    row = next(check_rig(rig))
+    assert row.failure is None
+    assert moved[0] == rig.home
+
+
+def test_a_stream_that_stands_is_one_frame(rig, monkeypatch):
+    monkeypatch.setattr(rig_check, "WATCHED_S", 0.1)
+    kept = {}
+    real = FakeSensor._read
+    monkeypatch.setattr(FakeSensor, "_read", lambda self: kept.setdefault(self.finger, real(self)))
+    row = next(row for row in check_rig(rig) if row.role == "gel")
+    assert row.measured["rate"] == "1 frame(s) in 0.1 s"

@@ -1,0 +1,56 @@
+"""Plain settings to the keywords of a class."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+from robot.errors import RobotConfigError
+from robot.settings import build
+
+
+class Thing:
+    def __init__(
+        self,
+        *,
+        port: str,
+        rate: float = 1.0,
+        tries: int = 2,
+        loud: bool = False,
+        box: Sequence[float] = (),
+        names: tuple[str, ...] = (),
+        exposure: int | None = None,
+        table: Mapping[str, Any] = {},
+        clock: object = None,
+    ):
+        self.made = {name: value for name, value in locals().items() if name != "self"}
+
+
+def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken():
+    made = build(Thing, {"port": "a", "rate": 3, "box": [1, 2.5], "exposure": 4}, clock="tick", unknown="left out").made
+    assert made["port"], made["rate"] == ("a", 3)
+    assert made["box"] == [1, 2.5]
+    assert made["exposure"] == 4
+    assert made["clock"] == "tick"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({}, r"\[thing\] must say 'port'; it knows box, exposure"),
+        ({"port": "a", "bort": 1}, r"\[thing\] has no setting 'bort'; it knows box, exposure, loud, names, port"),
+        ({"port": "a", "clock": 1}, r"\[thing\] has no setting 'clock'"),  # what the program gives, no file may
+        ({"port": 3}, r"\[thing\]: port must be a text in quotes, got 3"),
+        ({"port": "a", "rate": "fast"}, r"\[thing\]: rate must be a number, got 'fast'"),
+        ({"port": "a", "rate": True}, r"\[thing\]: rate must be a number, got True"),
+        ({"port": "a", "tries": 2.5}, r"\[thing\]: tries must be a whole number, got 2.5"),
+        ({"port": "a", "loud": 1}, r"\[thing\]: loud must be true or false, got 1"),
+        ({"port": "a", "box": 3}, r"\[thing\]: box must be a list, each of them a number, got 3"),
+        ({"port": "a", "names": ["b", 3]}, r"\[thing\]: names must be a list, each of them a text in quotes"),
+        ({"port": "a", "exposure": "long"}, r"\[thing\]: exposure must be a whole number, got 'long'"),
+        ({"port": "a", "table": 3}, r"\[thing\]: table must be a table, got 3"),
+    ],
+)
+def test_a_wrong_setting_is_refused_with_its_place_and_what_is_wanted(settings, said):
+    with pytest.raises(RobotConfigError, match=f"^{said}"):
+        build(Thing, settings, where="[thing]", clock="tick")
