@@ -234,7 +234,7 @@ def _points(name: str, points: npt.ArrayLike) -> Points:
         raise RobotConfigError(f"{name} points must be rows of x, y and z in mm: {error}") from error
     if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _FAR_MM).all():  # also refuses NaN
         raise RobotConfigError(
-            f"{name} points must be (N, 3) mm within a kilometre, got {found.shape}: {found.tolist()}"
+            f"{name} points must be (N, 3) finite mm within a kilometre, got {found.shape}: {found.tolist()}"
         )
     return found
 

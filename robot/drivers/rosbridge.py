@@ -10,6 +10,7 @@ status. `decode` and `encode` know no socket; a thread of `RosbridgeLink` reads 
 nothing is queued: a link that is gone stays gone until it is opened again.
 """
 
+import contextlib
 import itertools
 import json
 import logging
@@ -73,6 +74,7 @@ class RosbridgeLink:
         self._topics: dict[str, deque[Arrival]] = {}
         self._awaited: dict[str, str] = {}
         self._replies: dict[str, Message] = {}
+        self._held = contextlib.ExitStack()
         self._socket: Any = None
         self._reader: threading.Thread | None = None
         self._gone = "it was never opened"
@@ -86,7 +88,7 @@ class RosbridgeLink:
         """Connect, once: a closed link is replaced by a new one. Raises DeviceError."""
         connect = _websocket_client()
         try:
-            self._socket = connect(
+            connection = connect(
                 self.url,
                 sock=_tcp(self.url, self.timeout_s),
                 open_timeout=self.timeout_s,
@@ -98,6 +100,7 @@ class RosbridgeLink:
                 max_queue=None,
                 proxy=None,
             )
+            self._socket = self._held.enter_context(connection)  # websockets 17 wants a context, 15 allows one
         except Exception as error:  # websockets has a tree of its own beside OSError
             raise DeviceError(
                 f"rosbridge must answer at {self.url}, got {str(error) or type(error).__name__}; start it on the "
@@ -110,8 +113,7 @@ class RosbridgeLink:
     def close(self) -> None:
         """Close; does nothing where it is closed."""
         self._lose("it was closed")
-        if self._socket is not None:
-            self._socket.close()
+        self._held.close()
         if self._reader is not None:
             self._reader.join(self.timeout_s)
 

@@ -229,7 +229,7 @@ class Emulator:
             self.model.enabled = bool(message["data"]) and not self.model.stopped
         self._latched[topic] = message
         for other in self._clients:
-            if topic in other.subscribed:
+            if topic in other.subscribed and topic not in self.silent:
                 other.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
 
     def _commanded(self, message: Mapping[str, Any]) -> None:
