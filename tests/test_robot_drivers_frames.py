@@ -11,7 +11,7 @@ from robot.drivers import frames
 from robot.drivers.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
-from tests.fake_video import own_threads
+from tests.fake_video import own_threads, until
 
 SETTINGS = ReaderSettings(warmup_s=0.0, timeout_s=5.0, frozen_s=2.0, backoff_s=(1e-3, 4e-3))
 ENOUGH_S = 10.0
@@ -67,16 +67,6 @@ def make(script):
         own.items.put(RuntimeError("the test is over"))
         each.close()
     assert not own_threads()
-
-
-def until(holds):
-    """Wait until something that a thread does has happened."""
-    event = threading.Event()
-    for _ in range(int(ENOUGH_S / 0.002)):
-        if holds():
-            return
-        event.wait(0.002)
-    raise AssertionError("it did not happen")
 
 
 def seen(reader, count):
@@ -148,7 +138,7 @@ def test_what_is_wrong_with_a_lost_stream_is_said_to_whoever_asks(script, make):
         reader.near(1.0)
 
 
-def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_short_again_after_a_pict(script, make, monkeypatch):
+def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_a_picture_makes_it_short(script, make, monkeypatch):
     script.show(1.0)
     reader = make()
     waits = []

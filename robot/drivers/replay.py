@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, TactileSensor
-from robot.drivers.rectify import Rectifier, make_rectifier
+from robot.drivers.rectify import Rectifier, in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording import INFO_FILE, parse_object, read_recording
@@ -99,7 +99,7 @@ class _PacedSensor(TactileSensor):
 
     def _picture(self, number: int) -> npt.NDArray[np.uint8]:
         if number not in self._decoded:
-            self._decoded[number] = self._rectifier.apply(np.ascontiguousarray(self._decode(number)[..., ::-1]))
+            self._decoded[number] = in_rgb(self._rectifier.apply(self._decode(number)))
             while len(self._decoded) > _KEPT:
                 self._decoded.popitem(last=False)
         return self._decoded[number]
@@ -234,7 +234,9 @@ class ReplayCamera(Camera):
         if not self._pairs:
             raise DeviceError(f"{self.path} must hold pictures, NAME.jpg with NAME{DEPTH_SUFFIX}, or a recording's")
         self._intrinsics = self._given or _intrinsics(self.path / INTRINSICS_FILE)
-        self.has_depth = self._intrinsics is not None and all(pair.depth is not None for pair in self._pairs)
+        self.has_depth = all(pair.depth is not None for pair in self._pairs)
+        if self.has_depth and self._intrinsics is None:
+            raise DeviceError(f"{self.path} holds depth: give fx, fy, cx and cy, or write {INTRINSICS_FILE} there")
         self._next = 0
 
     def _close(self) -> None:
@@ -245,7 +247,7 @@ class ReplayCamera(Camera):
 
     def _read(self, depth: bool) -> RGBD:
         pair = self._pairs[self._next % len(self._pairs)]
-        colour = np.ascontiguousarray(_pixels(pair.colour, cv2.IMREAD_COLOR)[..., ::-1])
+        colour = in_rgb(_pixels(pair.colour, cv2.IMREAD_COLOR))
         depth_m = _depth_m(pair.depth) if depth and pair.depth is not None else None
         self._next += 1
         return RGBD(colour, depth_m, self._intrinsics, self.clock())
@@ -272,7 +274,7 @@ def _intrinsics(path: Path) -> Intrinsics | None:
     try:
         found: Mapping[str, Any] = parse_object(path.read_bytes())
     except RecordingError as error:
-        raise DeviceError(f"{path} {error}") from error
+        raise DeviceError(f"{path}: {error}") from error
     names = {"fx", "fy", "cx", "cy"}
     numbers = {name: float(value) for name, value in found.items() if type(value) in (int, float)}
     if set(found) != names or set(numbers) != names:

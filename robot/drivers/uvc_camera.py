@@ -9,6 +9,7 @@ import numpy.typing as npt
 from robot.devices import Camera, Clock
 from robot.drivers.frames import ReaderSettings
 from robot.drivers.opencv_stream import LEAVE, CaptureReader, CaptureSettings
+from robot.drivers.rectify import in_rgb
 from robot.readings import RGBD
 
 
@@ -73,5 +74,5 @@ class UvcCamera(Camera):
 
     def _read(self, depth: bool) -> RGBD:
         frame = self._reader.newest()
-        colour = frame.pixels[::-1, ::-1, ::-1] if self.upside_down else frame.pixels[..., ::-1]
-        return RGBD(np.ascontiguousarray(colour), None, None, frame.time_s)
+        colour = in_rgb(frame.pixels)
+        return RGBD(np.ascontiguousarray(colour[::-1, ::-1]) if self.upside_down else colour, None, None, frame.time_s)

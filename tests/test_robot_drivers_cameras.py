@@ -1,0 +1,310 @@
+"""Cameras over the table: RealSense and Kinect 2 over stand-ins for their packages, and a plain USB camera."""
+
+import math
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.drivers import discover
+from robot.drivers.kinect2 import Kinect2
+from robot.drivers.realsense import RealSense
+from robot.drivers.uvc_camera import UvcCamera
+from robot.errors import DeviceError, RobotConfigError
+from tests.fake_video import EXTRINSICS, FakeCamera, FakeFreenect2, FakeRealSense, own_threads
+
+
+@pytest.fixture
+def install(monkeypatch):
+    """Have a stand-in, or None for no package, where a package is imported from."""
+
+    def installed(fake):
+        name = "pyrealsense2" if isinstance(fake, FakeRealSense) else "pylibfreenect2"
+        monkeypatch.setitem(sys.modules, name, fake)
+        return fake
+
+    return installed
+
+
+def realsense(**more):
+    return RealSense(extrinsics=EXTRINSICS, **{"warmup_frames": 3, **more})
+
+
+def kinect(**more):
+    return Kinect2(extrinsics=EXTRINSICS, **{"timeout_s": 0.05, **more})
+
+
+# RealSense --------------------------------------------------------------------------------------------------
+
+
+def test_a_realsense_gives_colour_and_depth_in_metres_with_its_intrinsics(install):
+    rs = install(FakeRealSense())
+    with realsense() as eye:
+        image = eye.read()
+        np.testing.assert_allclose(image.depth_m, [[np.nan, 0.5, 0.5, 1.0]] * 3, rtol=1e-6)
+        assert image.depth_m.dtype == np.float32
+        assert image.colour[0].tolist() == [[0, 1, 0], [10, 1, 0], [20, 1, 0], [30, 1, 0]]
+        lens = image.intrinsics
+        assert (lens.fx, lens.fy, lens.cx, lens.cy) == (10.0, 11.0, 1.5, 1.0)
+        assert eye.settings()["depth_scale_m"] == 0.0005
+        assert eye.settings()["undistorted"] is False
+    assert rs.started == ["123"]
+    assert rs.streams == [("depth", 640, 480, "z16", 30), ("colour", 640, 480, "rgb8", 30)]
+    assert rs.stopped == 1
+
+
+def test_the_first_pictures_of_a_realsense_are_dropped(install):
+    rs = install(FakeRealSense())
+    with RealSense(extrinsics=EXTRINSICS):
+        assert rs.pictures == 30
+
+
+def test_a_picture_that_waited_since_before_it_was_asked_for_is_passed_over(install):
+    rs = install(FakeRealSense())
+    with realsense() as eye:
+        rs.waiting = 9
+        assert eye.read().colour[0, 0, 2] == 0
+
+
+def test_depth_is_aligned_only_when_it_is_asked_for(install):
+    rs = install(FakeRealSense())
+    with realsense() as eye:
+        assert eye.read(depth=False).depth_m is None
+        assert rs.aligned == 0
+        eye.read()
+        assert rs.aligned == 1
+
+
+def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_makers_own_model(install):
+    """The lens shows one pixel further right what belongs at a pixel: all moves left, the last column is unknown."""
+    install(FakeRealSense(distortion=(1.0, 0.0, 0.0, 0.0, 0.0)))
+    with realsense() as eye:
+        image = eye.read()
+        assert eye.settings()["undistorted"] is True
+        assert eye.settings()["distortion"][0] == 1.0
+    assert image.colour[0, :3, 0].tolist() == [10, 20, 30]
+    np.testing.assert_allclose(image.depth_m[0], [0.5, 0.5, 1.0, np.nan], rtol=1e-6)
+
+
+def test_undistorted_depth_is_never_a_mean_of_two_surfaces(install):
+    """Half a pixel off, means would put a surface at 0.75 m, where there is none."""
+    install(FakeRealSense(distortion=(0.5, 0.0, 0.0, 0.0, 0.0)))
+    with realsense() as eye:
+        depth = eye.read().depth_m
+    assert set(depth[np.isfinite(depth)].tolist()) <= {0.5, 1.0}
+    naive = cv2.remap(np.float32([[0.5, 1.0]]), np.float32([[[0.5, 0.0]]]), None, cv2.INTER_LINEAR)
+    assert naive[0, 0] == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("serials", "wanted", "words"),
+    [
+        ((), "", "one realsense must be connected.*connected: none"),
+        (("1", "2"), "", "or its serial number given; connected: 1, 2"),
+        (("1", "2"), "3", "realsense 3 must be connected; connected: 1, 2"),
+    ],
+)
+def test_which_realsense_is_meant_must_be_plain(install, serials, wanted, words):
+    rs = install(FakeRealSense(serials=serials))
+    with pytest.raises(DeviceError, match=words):
+        realsense(serial=wanted).connect()
+    assert (rs.started, rs.stopped) == ([], 0)
+
+
+def test_the_realsense_of_a_serial_number_is_chosen_among_several(install):
+    rs = install(FakeRealSense(serials=("1", "2")))
+    with realsense(serial="2") as eye:
+        assert eye.settings()["serial"] == "2"
+    assert rs.started == ["2"]
+
+
+def test_a_realsense_that_falls_silent_is_an_error_and_can_be_started_again(install):
+    rs = install(FakeRealSense())
+    with realsense() as eye:
+        rs.silent = True
+        with pytest.raises(DeviceError, match=r"realsense gives no picture.*Frame didn't arrive within 3000"):
+            eye.read()
+        with pytest.raises(DeviceError, match="cannot be started"):
+            eye.recover()
+        with pytest.raises(DeviceError, match=r"call recover\(\) again"):
+            eye.read()
+        rs.silent = False
+        eye.recover()
+        eye.read()
+    assert rs.stopped == 2
+
+
+def test_a_realsense_without_depth_in_its_picture_is_an_error(install):
+    rs = install(FakeRealSense())
+    with realsense() as eye:
+        rs.no_depth = True
+        with pytest.raises(DeviceError, match="must give depth with each picture"):
+            eye.read()
+        eye.read(depth=False)
+
+
+@pytest.mark.parametrize("setting", [{"width": 0}, {"fps": 0}, {"warmup_frames": -1}, {"timeout_s": math.nan}])
+def test_settings_of_a_realsense_out_of_range_are_refused(setting):
+    with pytest.raises(RobotConfigError):
+        realsense(**setting)
+
+
+# Kinect 2 ---------------------------------------------------------------------------------------------------
+
+
+def test_a_kinect_gives_depth_in_metres_and_the_colour_of_each_of_its_pixels(install):
+    install(FakeFreenect2())
+    with kinect() as eye:
+        image = eye.read()
+        lens = image.intrinsics
+    assert image.colour.shape == (424, 512, 3)
+    assert image.colour[0, 0].tolist() == [3, 2, 1]
+    assert image.colour[9, 9].tolist() == [30, 20, 10]
+    assert np.isnan(image.depth_m[0, :3]).all()
+    assert image.depth_m[9, 9] == pytest.approx(0.9)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (364.5, 364.6, 259.0, 202.4)
+
+
+def test_a_kinect_upside_down_is_turned_with_its_intrinsics(install):
+    install(FakeFreenect2())
+    with kinect(upside_down=True) as eye:
+        image = eye.read()
+    assert image.colour[-1, -1].tolist() == [3, 2, 1]
+    assert np.isnan(image.depth_m[-1, -3:]).all()
+    assert (image.intrinsics.cx, image.intrinsics.cy) == pytest.approx((511 - 259.0, 423 - 202.4))
+
+
+def test_every_set_of_frames_is_released_whatever_happens(install):
+    freenect = install(FakeFreenect2())
+    with kinect() as eye:
+        eye.read()
+        eye.read(depth=False)
+        freenect.fails = True
+        with pytest.raises(DeviceError, match="kinect2 gives no picture: a mistake of the package"):
+            eye.read()
+        freenect.fails = False
+        eye.read()
+    assert freenect.taken == freenect.released == 5 + 2 * 4  # five to warm up; each read passes over what waited
+
+
+def test_a_kinect_is_started_stopped_and_closed_in_order(install):
+    freenect = install(FakeFreenect2())
+    with kinect():
+        pass
+    assert freenect.events == [("open", b"k1", "OpenGLPacketPipeline"), ("start",), ("stop",), ("close",)]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "has", "broken", "expected"),
+    [
+        ("auto", ("CudaPacketPipeline", "CpuPacketPipeline"), (), "CudaPacketPipeline"),
+        ("auto", ("OpenGLPacketPipeline", "CpuPacketPipeline"), ("OpenGLPacketPipeline",), "CpuPacketPipeline"),
+        ("cpu", ("OpenGLPacketPipeline", "CpuPacketPipeline"), (), "CpuPacketPipeline"),
+    ],
+)
+def test_the_first_pipeline_that_works_computes_the_depth(install, wanted, has, broken, expected):
+    freenect = install(FakeFreenect2(pipelines=has, broken=broken))
+    with kinect(pipeline=wanted):
+        assert freenect.events[0] == ("open", b"k1", expected)
+
+
+def test_a_pipeline_that_the_build_lacks_cannot_be_had(install):
+    install(FakeFreenect2(pipelines=("CpuPacketPipeline",)))
+    with pytest.raises(DeviceError, match="compute its depth with cuda, but cuda"):
+        kinect(pipeline="cuda").connect()
+    with pytest.raises(RobotConfigError, match="pipeline must be auto or one of"):
+        kinect(pipeline="vulkan")
+
+
+@pytest.mark.parametrize("serials", [(b"k1", b"k2"), ("k1", "k2")])
+def test_a_kinect_is_chosen_by_its_serial_number_as_the_package_spells_it(install, serials):
+    freenect = install(FakeFreenect2(serials=serials))
+    with kinect(serial="k2") as eye:
+        assert eye.settings()["serial"] == "k2"
+    assert freenect.events[0][1] == serials[1]
+
+
+@pytest.mark.parametrize("serial", ["", "k3"])
+def test_a_kinect_that_is_not_there_is_never_opened(install, serial):
+    freenect = install(FakeFreenect2(serials=(b"k1", b"k2")))
+    with pytest.raises(DeviceError, match="connected: k1, k2"):
+        kinect(serial=serial).connect()
+    assert freenect.events == []
+
+
+def test_a_kinect_that_falls_silent_is_an_error_and_can_be_started_again(install):
+    freenect = install(FakeFreenect2())
+    with kinect() as eye:
+        freenect.silent = True
+        with pytest.raises(DeviceError, match=r"a picture within 0\.05 s.*USB 3"):
+            eye.read()
+        with pytest.raises(DeviceError, match="a picture within"):
+            eye.recover()
+        with pytest.raises(DeviceError, match=r"call recover\(\) again"):
+            eye.read()
+        freenect.silent = False
+        eye.recover()
+        eye.read()
+    names = [event[0] for event in freenect.events]
+    assert names == ["open", "start", "stop", "close"] * 3
+
+
+# Packages that are missing ----------------------------------------------------------------------------------
+
+
+def test_a_missing_package_is_a_sentence_with_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    monkeypatch.setitem(sys.modules, "pylibfreenect2", None)
+    with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[realsense\]'"):
+        realsense().connect()
+    with pytest.raises(DeviceError, match="build libfreenect2 with shared libraries first"):
+        kinect().connect()
+
+
+# Plain USB camera -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def usb(tmp_path, monkeypatch):
+    """A connected camera's stand-in and its name."""
+    camera = FakeCamera()
+    monkeypatch.setattr(cv2, "VideoCapture", camera.open)
+    monkeypatch.setattr(discover, "DEV", tmp_path)
+    name = tmp_path / "usb-Webcam-video-index0"
+    name.touch()
+    return camera, str(name)
+
+
+def test_a_plain_camera_gives_colour_and_says_that_it_has_no_depth(usb):
+    camera, name = usb
+    with UvcCamera(device=name, extrinsics=EXTRINSICS, width=640, height=480, warmup_s=0.0) as eye:
+        image = eye.read(depth=False, max_age_s=10)
+        assert (image.depth_m, image.intrinsics) == (None, None)
+        assert (image.colour[0, :, 0] == 200).all()
+        with pytest.raises(DeviceError, match="sees colour only"):
+            eye.read()
+        assert eye.settings()["width"] == 640
+        assert (cv2.CAP_PROP_AUTO_EXPOSURE, 3) in camera.written  # automatic
+        assert eye.refused == {}
+    assert not eye.has_depth
+    assert not camera.open_captures
+    assert not own_threads()
+
+
+def test_a_plain_camera_upside_down_is_turned(usb):
+    with UvcCamera(device=usb[1], extrinsics=EXTRINSICS, upside_down=True, warmup_s=0.0) as eye:
+        colour = eye.read(depth=False, max_age_s=10).colour
+    assert (colour[-1, :, 0] == 200).all()
+    assert (colour[:-1, :, 0] == 100).all()
+
+
+def test_a_plain_camera_comes_back(usb):
+    camera, name = usb
+    with UvcCamera(device=name, extrinsics=EXTRINSICS, warmup_s=0.0, timeout_s=0.2) as eye:
+        camera.dead = True
+        with pytest.raises(DeviceError, match="usb camera must give a picture within"):
+            eye.recover()
+        camera.dead = False
+        eye.recover()
+        eye.read(depth=False, max_age_s=10)

@@ -1,0 +1,112 @@
+"""What is connected, from a made-up /dev and /sys."""
+
+import sys
+import tomllib
+
+import pytest
+
+from robot.drivers import discover
+from robot.drivers.discover import Found
+from tests.fake_video import FakeFreenect2, FakeRealSense
+
+GONE = ("pyrealsense2", "pylibfreenect2", "serial", "serial.tools")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_installed(monkeypatch):
+    for name in GONE:
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.fixture
+def roots(tmp_path):
+    """/dev and /sys with nothing in them."""
+    for name in ("dev/v4l/by-id", "dev/serial/by-id", "sys/class/video4linux"):
+        (tmp_path / name).mkdir(parents=True)
+    return tmp_path / "dev", tmp_path / "sys"
+
+
+def plug_camera(roots, name, number, label, index="0"):
+    dev, sys_root = roots
+    (dev / f"video{number}").touch()
+    entry = sys_root / "class" / "video4linux" / f"video{number}"
+    entry.mkdir()
+    (entry / "name").write_text(label + "\n")
+    (entry / "index").write_text(index + "\n")
+    if name:
+        (dev / "v4l" / "by-id" / name).symlink_to(dev / f"video{number}")
+
+
+def test_with_nothing_connected_and_nothing_installed_nothing_is_found(tmp_path):
+    assert discover.discover(tmp_path / "none", tmp_path / "none") == []
+
+
+def test_cameras_are_found_by_their_stable_names_with_what_they_call_themselves(roots):
+    plug_camera(roots, "usb-Maker_Webcam_12-video-index0", 0, "Webcam 12: Webcam")
+    plug_camera(roots, "usb-Maker_Webcam_12-video-index1", 1, "Webcam 12: Webcam", index="1")
+    name = str(roots[0] / "v4l" / "by-id" / "usb-Maker_Webcam_12-video-index0")
+    toml = f'driver = "uvc"\ndevice = "{name}"'
+    assert discover.discover(*roots) == [Found("camera", name, "Webcam 12: Webcam", toml)]
+
+
+@pytest.mark.parametrize(
+    ("name", "label", "driver"),
+    [
+        ("usb-Facebook_DIGIT_D20001-video-index0", "DIGIT: DIGIT", "digit"),
+        ("usb-Arducam_x-video-index0", "GelSight Mini R0B 28J4-KK2Q", "gelsight_mini"),
+        ("usb-GelSight_A-video-index0", "USB Camera", "gelsight"),
+        ("usb-046d_HD_Pro-video-index0", "HD Pro Webcam", "uvc"),
+    ],
+)
+def test_gel_sensors_are_known_by_their_names(roots, name, label, driver):
+    plug_camera(roots, name, 0, label)
+    assert tomllib.loads(discover.discover(*roots)[0].toml)["driver"] == driver
+
+
+def test_where_the_system_makes_no_stable_names_cameras_are_found_by_number(roots):
+    plug_camera(roots, None, 2, "Webcam")
+    plug_camera(roots, None, 3, "Webcam", index="1")
+    (found,) = discover.discover(*roots)
+    assert tomllib.loads(found.toml) == {"driver": "uvc", "device": str(roots[0] / "video2"), "allow_index": True}
+
+
+def test_serial_ports_are_found_by_their_stable_names(roots):
+    (roots[0] / "serial" / "by-id" / "usb-FTDI_7-if00-port0").touch()
+    (found,) = discover.discover(*roots)
+    assert (found.kind, found.label) == ("serial port", "usb-FTDI_7-if00-port0")
+    assert tomllib.loads(found.toml)["port"] == found.device
+
+
+class Port:
+    def __init__(self, device, hwid="USB VID:PID=1:2"):
+        self.device, self.hwid, self.description = device, hwid, "a port"
+
+
+def test_pyserial_adds_the_ports_that_it_alone_knows(roots, monkeypatch):
+    link = roots[0] / "serial" / "by-id" / "usb-FTDI_7"
+    link.symlink_to(roots[0] / "ttyUSB0")
+    ports = [Port(str(roots[0] / "ttyUSB0")), Port("/dev/ttyACM7"), Port("/dev/ttyS0", hwid="n/a")]
+    lister = type(sys)("serial.tools.list_ports")
+    lister.comports = lambda: ports
+    tools = type(sys)("serial.tools")
+    tools.list_ports = lister
+    monkeypatch.setitem(sys.modules, "serial", type(sys)("serial"))
+    monkeypatch.setitem(sys.modules, "serial.tools", tools)
+    assert [each.device for each in discover.find_serial_ports(roots[0])] == [str(link), "/dev/ttyACM7"]
+
+
+def test_depth_cameras_are_asked_through_their_packages_where_these_are_installed(roots, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealSense(serials=("8", "9")))
+    monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2(serials=(b"k1",)))
+    found = discover.discover(*roots)
+    assert [(each.kind, each.device) for each in found] == [("realsense", "8"), ("realsense", "9"), ("kinect2", "k1")]
+    assert tomllib.loads(found[1].toml) == {"driver": "realsense", "serial": "9"}
+
+
+def test_a_package_that_fails_is_told_of_and_hides_nothing_else(roots, monkeypatch, caplog):
+    broken = FakeRealSense()
+    broken.context = lambda: (_ for _ in ()).throw(RuntimeError("no udev rules"))
+    monkeypatch.setitem(sys.modules, "pyrealsense2", broken)
+    monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2())
+    assert [each.kind for each in discover.discover(*roots)] == ["kinect2"]
+    assert "RealSense cameras could not be listed: no udev rules" in caplog.text

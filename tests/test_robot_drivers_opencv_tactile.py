@@ -1,0 +1,364 @@
+"""Gel sensors over OpenCV: which camera, its settings written and read back, its picture, and its coming back."""
+
+import json
+import math
+import os
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.drivers import discover, opencv_stream
+from robot.drivers.opencv_stream import CaptureSettings, CaptureStream, stable_path
+from robot.drivers.opencv_tactile import PRESETS, Digit, GelSight, GelSightMini, OpencvTactile
+from robot.errors import DeviceError, RobotConfigError
+from tests.fake_video import FakeCamera, own_threads, until
+
+QUICK = {"warmup_s": 0.0, "timeout_s": 10.0}
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left():
+    yield
+    assert not own_threads()
+
+
+@pytest.fixture
+def dev(tmp_path, monkeypatch):
+    """/dev with nothing in it."""
+    (tmp_path / "v4l" / "by-id").mkdir(parents=True)
+    monkeypatch.setattr(discover, "DEV", tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def plug(dev, monkeypatch):
+    """Plug a camera in under a stable name, at a number; returns the name."""
+    cameras = {}
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path, backend: cameras[path].open(path, backend))
+
+    def plugged(camera, name="usb-Fake_Gel_7-video-index0", number=0):
+        node, link = dev / f"video{number}", dev / "v4l" / "by-id" / name
+        node.touch()
+        link.unlink(missing_ok=True)
+        link.symlink_to(node)
+        cameras[str(node)] = camera
+        return str(link)
+
+    return plugged
+
+
+def written(camera):
+    return [number for number, _ in camera.written]
+
+
+# Which camera -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("device", ["0", "/dev/video2"])
+def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
+    name = plug(FakeCamera())
+    with pytest.raises(RobotConfigError, match=f"another camera may have tomorrow. Connected: {name}"):
+        OpencvTactile(finger="a", device=device).connect()
+
+
+def test_where_the_system_makes_no_stable_names_the_way_out_is_said(dev):
+    with pytest.raises(RobotConfigError, match="set allow_index = true"):
+        OpencvTactile(finger="a", device="0").connect()
+    assert stable_path("3", allow_index=True) == "/dev/video3"
+    assert stable_path("/dev/video3", allow_index=True) == "/dev/video3"
+
+
+def test_a_camera_that_is_not_plugged_in_is_named(plug, dev):
+    name = plug(FakeCamera())
+    with pytest.raises(DeviceError, match=f"usb-Other must be there, but is not.*Connected: {name}"):
+        OpencvTactile(finger="a", device=str(dev / "v4l" / "by-id" / "usb-Other")).connect()
+
+
+def test_the_stable_name_is_looked_up_and_opened_through_video4linux(plug, dev):
+    camera = FakeCamera()
+    with OpencvTactile(finger="a", device=plug(camera, number=4), **QUICK):
+        assert camera.captures[0].path == str(dev / "video4")
+        assert camera.captures[0].backend == cv2.CAP_V4L2
+    assert not camera.open_captures
+
+
+def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug):
+    camera = FakeCamera()
+    gel = OpencvTactile(finger="a", device=plug(camera), **QUICK)
+    camera.busy = True
+    with pytest.raises(DeviceError, match="cannot be opened; is it used by another program"):
+        gel.connect()
+    assert not gel.is_connected
+    assert not camera.open_captures
+    camera.busy = False
+    for _ in range(2):
+        gel.connect()
+        gel.read(10)
+        gel.close()
+        gel.close()
+    assert not camera.open_captures
+
+
+def test_what_is_no_camera_cannot_be_opened_by_the_real_opencv_either(dev):
+    path = dev / "v4l" / "by-id" / "usb-Printer"
+    path.write_text("no camera")
+    with pytest.raises(DeviceError, match="usb-Printer cannot be opened"):
+        OpencvTactile(finger="a", device=str(path)).connect()
+
+
+def test_nothing_is_touched_before_connecting(monkeypatch):
+    monkeypatch.setattr(opencv_stream, "open_capture", lambda device: pytest.fail("opened"))
+    gel = OpencvTactile(finger="b", device="7")
+    assert (gel.name, gel.finger, gel.frames_seen, gel.lost) == ("gel b", "b", 0, 0)
+    with pytest.raises(DeviceError, match="must be connected before it is used"):
+        gel.read()
+
+
+def test_opencv_waits_a_second_for_a_picture_unless_it_is_told_otherwise(plug, monkeypatch):
+    monkeypatch.delenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", raising=False)
+    name = plug(FakeCamera())
+    opencv_stream.open_capture(name)
+    assert os.environ["OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"] == "1"
+    monkeypatch.setenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "5")
+    opencv_stream.open_capture(name)
+    assert os.environ["OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"] == "5"
+
+
+# Settings ---------------------------------------------------------------------------------------------------
+
+
+def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
+    camera = FakeCamera()
+    asked = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0, "buffer": 2}
+    with GelSight(finger="a", device=plug(camera), **asked, **QUICK) as gel:
+        assert camera.written == [
+            (cv2.CAP_PROP_FOURCC, 0x47504A4D),  # "MJPG", first letter lowest
+            (cv2.CAP_PROP_FRAME_WIDTH, 1280),
+            (cv2.CAP_PROP_FRAME_HEIGHT, 960),
+            (cv2.CAP_PROP_FPS, 30),
+            (cv2.CAP_PROP_BUFFERSIZE, 2),
+            (cv2.CAP_PROP_AUTO_EXPOSURE, 1),  # manual
+            (cv2.CAP_PROP_EXPOSURE, 50),  # 0.1 ms each
+            (cv2.CAP_PROP_AUTO_WB, 0),
+            (cv2.CAP_PROP_WB_TEMPERATURE, 4600),
+            (cv2.CAP_PROP_GAIN, 0),
+        ]
+        assert gel.refused == {}
+
+
+def test_what_the_camera_says_of_its_settings_is_what_is_recorded(plug):
+    with GelSight(finger="a", device=plug(FakeCamera()), exposure_ms=5.0, **QUICK) as gel:
+        found = gel.settings()
+    assert found["fourcc"] == "MJPG"
+    assert (found["width"], found["height"], found["fps"]) == (1280, 960, 30.0)
+    assert (found["auto_exposure"], found["exposure_ms"], found["auto_white_balance"]) == (False, 5.0, False)
+    assert found["picture_px"] == [8, 6]  # whatever it says, this is what comes
+    assert found["device"].endswith("video-index0")
+    json.dumps(found)
+
+
+def test_settings_that_the_camera_does_not_take_are_told_with_what_it_has_instead(plug):
+    camera = FakeCamera(stubborn=[cv2.CAP_PROP_FPS, cv2.CAP_PROP_FOURCC], lacks=[cv2.CAP_PROP_EXPOSURE])
+    with GelSight(finger="a", device=plug(camera), exposure_ms=5.0, **QUICK) as gel:
+        assert gel.refused == {
+            "fourcc": "asked MJPG, has YUYV",
+            "fps": "asked 30, has 15",
+            "exposure_ms": "asked 5, has no such setting",
+        }
+        assert gel.settings()["fps"] == 15.0
+
+
+def test_a_rate_that_the_camera_states_a_little_differently_is_taken(plug):
+    camera = FakeCamera(stubborn=[cv2.CAP_PROP_FPS])
+    camera.values[cv2.CAP_PROP_FPS] = 29.97
+    with GelSight(finger="a", device=plug(camera), **QUICK) as gel:
+        assert gel.refused == {}
+
+
+def test_only_the_automatics_are_written_to_a_camera_of_which_nothing_is_asked(plug):
+    camera = FakeCamera()
+    with OpencvTactile(finger="a", device=plug(camera), **QUICK):
+        assert camera.written == [(cv2.CAP_PROP_AUTO_EXPOSURE, 1), (cv2.CAP_PROP_AUTO_WB, 0)]
+
+
+def test_the_brightness_of_a_digit_goes_through_its_zoom(plug):
+    camera = FakeCamera()
+    with Digit(finger="a", device=plug(camera), led=[15, 2, 1], **QUICK) as gel:
+        assert (cv2.CAP_PROP_ZOOM, 0xF21) in camera.written
+        assert gel.settings()["led"] == [15, 2, 1]
+        assert gel.refused == {}
+
+
+def test_a_files_settings_count_before_the_presets(plug):
+    camera = FakeCamera()
+    with Digit(finger="a", device=plug(camera), width=640, height=480, fps=30.0, **QUICK) as gel:
+        found = gel.settings()
+    assert (found["width"], found["height"], found["fps"], found["led"]) == (640, 480, 30.0, [15, 15, 15])
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"width": 640}, "width and height"),
+        ({"width": -1, "height": -1}, "width and height"),
+        ({"fps": -1.0}, "fps"),
+        ({"fps": math.nan}, "fps"),
+        ({"fourcc": "MJPEG"}, "fourcc"),
+        ({"exposure_ms": -1.0}, "exposure_ms"),
+        ({"exposure_ms": 5.0, "auto_exposure": True}, "exposure_ms must be left out"),
+        ({"white_balance_k": 5000.0, "auto_white_balance": True}, "white_balance_k must be left out"),
+        ({"gain": math.inf}, "gain"),
+        ({"buffer": 11}, "buffer"),
+        ({"led": [1, 2]}, "led"),
+        ({"led": [1, 2, 16]}, "led"),
+        ({"crop": [0.5, 0.0, 0.5, 0.0]}, "crop"),
+        ({"crop": [0.1]}, "crop"),
+        ({"output_px": [0, 4]}, "output_px"),
+        ({"keep": 0}, "keep"),
+        ({"frozen_s": 0.0}, "frozen_s"),
+    ],
+)
+def test_settings_out_of_range_are_refused_before_anything_is_connected(setting, words):
+    with pytest.raises(RobotConfigError, match=words):
+        OpencvTactile(finger="a", device="usb", **setting)
+
+
+def test_every_preset_is_one_that_can_be_asked_for():
+    for preset in PRESETS.values():
+        CaptureSettings(preset.width, preset.height, preset.fps, preset.fourcc, led=preset.led)
+    assert {each.PRESET for each in (OpencvTactile, GelSight, GelSightMini, Digit)} == set(PRESETS)
+
+
+# Pictures ---------------------------------------------------------------------------------------------------
+
+
+def test_pictures_come_in_rgb_with_row_0_on_top(plug):
+    with OpencvTactile(finger="a", device=plug(FakeCamera()), **QUICK) as gel:
+        pixels = gel.read(10).pixels
+    assert pixels.shape == (6, 8, 3)
+    assert (pixels[0, :, 0] == 200).all()
+    assert (pixels[1:, :, 0] == 100).all()
+    assert (pixels[..., 1] == 50).all()
+
+
+def test_a_digit_is_turned_to_the_left(plug):
+    """The camera's first row becomes the left column, as after transposing and turning over."""
+    with Digit(finger="a", device=plug(FakeCamera()), **QUICK) as gel:
+        pixels = gel.read(10).pixels
+    assert pixels.shape == (8, 6, 3)
+    assert (pixels[:, 0, 0] == 200).all()
+    assert (pixels[:, 1:, 0] == 100).all()
+    picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    np.testing.assert_array_equal(np.rot90(picture), cv2.flip(cv2.transpose(picture), 0))
+
+
+def test_the_border_of_a_gelsight_mini_is_cut_off_and_the_size_is_as_asked(plug):
+    camera = FakeCamera(size=(100, 80))
+    with GelSightMini(finger="a", device=plug(camera), **QUICK) as gel:
+        assert gel.read(10).pixels.shape == (56, 70, 3)  # 80 - 2 * 12 by 100 - 2 * 15
+    with GelSightMini(finger="a", device=plug(camera), crop=[0.1, 0.0, 0.1, 0.5], output_px=[40, 30], **QUICK) as gel:
+        assert gel.read(10).pixels.shape == (30, 40, 3)
+
+
+def test_a_calibration_file_for_another_size_is_found_when_connecting(plug, tmp_path):
+    path = tmp_path / "gel.json"
+    path.write_text('{"image_px": [64, 48], "crop": [0.1, 0.1, 0.1, 0.1]}')
+    camera = FakeCamera()
+    gel = OpencvTactile(finger="a", device=plug(camera), calibration=str(path), **QUICK)
+    with pytest.raises(DeviceError, match="must be 64 x 48 pixels, as in the calibration file, got 8 x 6"):
+        gel.connect()
+    assert not camera.open_captures
+    path.write_text('{"image_px": [8, 6], "crop": [0.0, 0.5, 0.0, 0.0]}')
+    with gel:
+        assert gel.read(10).pixels.shape == (3, 8, 3)
+
+
+def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):
+    camera = FakeCamera(stamps=True)
+    stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 1e6)
+    capture = camera.captures[0]
+    for taken_s, expected_s in ((1e6 - 0.03, 1e6 - 0.03), (1e6 - 2.0, 1e6), (1e6 + 1.0, 1e6), (0.0, 1e6)):
+        capture.grab = lambda taken_s=taken_s: setattr(capture, "taken_s", taken_s) or True
+        assert stream.next().time_s == pytest.approx(expected_s, abs=1e-6)
+    stream.close()
+
+
+def test_a_few_damaged_pictures_are_passed_over_and_many_are_a_lost_stream(plug):
+    camera = FakeCamera(fps=1000.0)
+    stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 0.0)
+    camera.damaged = 10
+    assert stream.next().pixels.shape == (6, 8, 3)
+    camera.damaged = 11
+    with pytest.raises(DeviceError, match="gives no more pictures"):
+        stream.next()
+    stream.close()
+
+
+@pytest.mark.parametrize("method", ["grab", "retrieve", "set"])
+def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
+    camera = FakeCamera()
+    name = plug(camera)
+
+    def fail(*_):
+        raise cv2.error("Unknown error")
+
+    monkeypatch.setattr("tests.fake_video.FakeCapture." + method, fail)
+    with pytest.raises(DeviceError, match="OpenCV failed"):
+        CaptureStream(name, CaptureSettings(), lambda: 0.0).next()
+    if method == "set":
+        assert not camera.open_captures
+
+
+# Coming back ------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_plugged_in_again_under_another_number_goes_on_with_its_settings_written_again(plug):
+    first, second = FakeCamera(), FakeCamera(stubborn=[cv2.CAP_PROP_FPS])
+    with GelSight(finger="a", device=plug(first, number=0), **QUICK) as gel:
+        gel.read(10)
+        assert gel.refused == {}
+        plug(second, number=1)
+        first.dead = True
+        gel.recover()
+        assert gel.read(10).pixels.shape == (6, 8, 3)
+        assert gel.lost >= 1
+        assert written(second)[:3] == written(first)[:3]
+        assert gel.refused == {"fps": "asked 30, has 15"}
+    assert not first.open_captures
+    assert not second.open_captures
+
+
+def test_a_camera_that_is_gone_is_an_error_that_says_so_also_to_recover(plug, dev):
+    camera = FakeCamera()
+    with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3) as gel:
+        camera.dead = True
+        (dev / "video0").unlink()
+        with pytest.raises(DeviceError, match="must be there, but is not; is the camera plugged in"):
+            gel.recover()
+        with pytest.raises(DeviceError, match="must be there, but is not; is the camera plugged in"):
+            gel.read()
+
+
+def test_a_frozen_camera_is_an_error(plug):
+    camera = FakeCamera()
+    with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3, frozen_s=0.05) as gel:
+        camera.frozen = True
+        until(lambda: gel.lost)
+        with pytest.raises(DeviceError, match="frozen: the same picture"):
+            gel.recover()
+        camera.frozen = False
+        gel.recover()
+        gel.read(10)
+
+
+def test_a_driver_that_waits_for_ever_gives_stale_pictures_which_are_refused(plug):
+    camera = FakeCamera()
+    with OpencvTactile(finger="a", device=plug(camera), **QUICK) as gel:
+        camera.hangs = threading.Event()
+        until(lambda: time.monotonic() - gel.read(10).time_s > 0.05)
+        with pytest.raises(DeviceError, match=r"the frame must be at most 0\.05 s old"):
+            gel.read(0.05)
+        camera.hangs.set()

@@ -1,0 +1,151 @@
+"""From a camera's picture to the gel alone."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.drivers.rectify import Rectifier, load_rectifier, make_rectifier
+from robot.errors import DeviceError, RobotConfigError
+
+CORNERS = ((10.0, 5.0), (49.0, 5.0), (49.0, 24.0), (10.0, 24.0))
+
+
+def ramp(width=60, height=40):
+    """Red is the column, green the row."""
+    y, x = np.mgrid[:height, :width]
+    return np.dstack([x, y, np.zeros_like(x)]).astype(np.uint8)
+
+
+def written(tmp_path, document):
+    path = tmp_path / "gel.json"
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+    return path
+
+
+def test_nothing_asked_is_nothing_done():
+    np.testing.assert_array_equal(Rectifier().apply(ramp()), ramp())
+
+
+def test_a_crop_cuts_shares_off_left_top_right_and_bottom():
+    cut = Rectifier(crop=(0.1, 0.25, 0.2, 0.5)).apply(ramp())
+    np.testing.assert_array_equal(cut, ramp()[10:20, 6:48])
+
+
+def test_a_crop_leaves_at_least_a_pixel():
+    assert Rectifier(crop=(0.5, 0.5, 0.49, 0.49)).apply(ramp(3, 2)).shape == (1, 1, 3)
+
+
+def test_corners_of_an_upright_rectangle_cut_it_out_pixel_by_pixel():
+    cut = Rectifier(corners_px=CORNERS, image_px=(60, 40)).apply(ramp())
+    np.testing.assert_array_equal(cut, ramp()[5:25, 10:50])
+
+
+def test_corners_named_from_another_one_on_turn_the_picture():
+    """With what was bottom left as top left, the gel lay on its left side: it comes out turned to the right."""
+    turned = (CORNERS[3], *CORNERS[:3])
+    cut = Rectifier(corners_px=turned, image_px=(60, 40)).apply(ramp())
+    np.testing.assert_array_equal(cut, np.rot90(ramp()[5:25, 10:50], -1))
+
+
+def test_a_slanted_square_comes_out_straight_with_its_corners_in_the_corners():
+    corners = ((30.0, 4.0), (46.0, 20.0), (30.0, 36.0), (14.0, 20.0))  # sides of 22.6 pixels
+    cut = Rectifier(corners_px=corners, image_px=(60, 40)).apply(ramp()).astype(int)
+    assert cut.shape == (24, 24, 3)
+    found = [cut[0, 0, :2], cut[0, -1, :2], cut[-1, -1, :2], cut[-1, 0, :2]]
+    np.testing.assert_allclose(found, corners, atol=1)  # whole grey levels
+    np.testing.assert_allclose(cut[11:13, 11:13, :2].mean(axis=(0, 1)), [30, 20], atol=1)
+
+
+def test_a_picture_of_another_size_than_the_calibrations_is_refused():
+    with pytest.raises(DeviceError, match="must be 60 x 40 pixels, as in the calibration file, got 30 x 20"):
+        Rectifier(corners_px=CORNERS, image_px=(60, 40)).apply(ramp(30, 20))
+
+
+def test_shrinking_takes_means_so_that_fine_lines_do_not_become_coarse_ones():
+    """Lines of one pixel, shrunk to a third: grey. Taking every third pixel would make black and white of them."""
+    lines = np.zeros((60, 60, 3), np.uint8)
+    lines[:, ::2] = 200
+    shrunk = Rectifier(output_px=(20, 20)).apply(lines)
+    assert shrunk.shape == (20, 20, 3)
+    assert shrunk.min() > 60
+    assert shrunk.max() < 140
+    assert set(lines[::3, ::3].ravel().tolist()) == {0, 200}
+
+
+def test_a_calibration_file_is_read(tmp_path):
+    path = written(
+        tmp_path,
+        {"image_px": [60, 40], "corners_px": [[10, 5], [49, 5], [49, 24], [10, 24]], "output_px": [20, 10], "note": ""},
+    )
+    assert load_rectifier(path) == Rectifier((), CORNERS, (60, 40), (20, 10))
+    assert make_rectifier(str(path)).apply(ramp()).shape == (10, 20, 3)
+    assert make_rectifier(str(path), output_px=[8, 4]).apply(ramp()).shape == (4, 8, 3)
+
+
+def test_a_files_crop_excludes_the_settings_and_settings_count_before_a_preset(tmp_path):
+    path = written(tmp_path, {"image_px": [60, 40], "crop": [0.1, 0.1, 0.1, 0.1]})
+    with pytest.raises(RobotConfigError, match="by crop or by a calibration file"):
+        make_rectifier(str(path), crop=[0.2, 0.2, 0.2, 0.2])
+    assert make_rectifier(str(path), default_crop=[0.2] * 4).crop == (0.1,) * 4
+    assert make_rectifier(crop=[0.3] * 4, default_crop=[0.2] * 4).crop == (0.3,) * 4
+    assert make_rectifier(default_crop=[0.2] * 4).crop == (0.2,) * 4
+
+
+SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "one JSON object"),
+        ({"image_px": [10, 10]}, "one of corners_px and crop"),
+        ({"crop": [0, 0, 0, 0]}, "must have image_px"),
+        ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "corners_px": SQUARE}, "one of corners_px and crop"),
+        ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "rotate": 1}, "unknown key 'rotate'"),
+        ({"image_px": [10], "crop": [0, 0, 0, 0]}, "image_px"),
+        ({"image_px": [10, 0], "crop": [0, 0, 0, 0]}, "image_px"),
+        ({"image_px": [10, 9.5], "crop": [0, 0, 0, 0]}, "whole numbers"),
+        ({"image_px": [10, 10], "crop": [0, 0, 0]}, "crop"),
+        ({"image_px": [10, 10], "crop": [0.6, 0, 0.4, 0]}, "crop"),
+        ({"image_px": [10, 10], "crop": [True, 0, 0, 0]}, "crop"),
+        ({"image_px": [10, 10], "corners_px": 3}, "four points"),
+        ({"image_px": [10, 10], "corners_px": SQUARE[:3]}, "four points"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [9], [1, 9]]}, "2 numbers"),
+        ({"image_px": [10, 10], "corners_px": SQUARE[::-1]}, "top left, top right"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [3, 3], [1, 9]]}, "bulges"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [1, 1], [9, 9], [1, 9]]}, "bulges"),
+        ({"image_px": [9, 9], "corners_px": SQUARE}, "inside image_px"),
+        ({"image_px": [10, 10], "corners_px": SQUARE, "output_px": [5]}, "output_px"),
+    ],
+)
+def test_a_calibration_file_that_makes_no_picture_is_refused_by_its_name(tmp_path, document, words):
+    with pytest.raises(RobotConfigError, match=f"gel.json.*{words}"):
+        load_rectifier(written(tmp_path, document))
+
+
+def test_a_calibration_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(RobotConfigError, match=r"none\.json cannot be read"):
+        load_rectifier(tmp_path / "none.json")
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers(-5, 70) | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(("image_px", "crop", "corners_px", "output_px"), anything)))
+def test_whatever_a_calibration_file_holds_it_works_or_is_refused(tmp_path_factory, document):
+    path = tmp_path_factory.mktemp("any") / "gel.json"
+    path.write_text(json.dumps(document))
+    try:
+        rectifier = load_rectifier(path)
+    except RobotConfigError:
+        return
+    width, height = rectifier.image_px
+    assert rectifier.apply(np.zeros((height, width, 3), np.uint8)).size

@@ -1,0 +1,295 @@
+"""Films, folders of pictures and recordings as devices."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.attempt import depth_in_mm
+from robot.drivers.replay import ImagesSensor, ReplayCamera, VideoSensor
+from robot.errors import DeviceError, RobotConfigError
+from robot.recording import RecordingWriter
+from tests.fake_video import EXTRINSICS
+
+LEVELS = (20, 60, 100, 140, 180, 220)
+LENS = {"fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.5}
+
+
+class Clock:
+    def __init__(self):
+        self.now_s = 50.0
+
+    def __call__(self):
+        return self.now_s
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def film(tmp_path):
+    """Six grey pictures, ten a second."""
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
+    for level in LEVELS:
+        writer.write(np.full((48, 64, 3), level, np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Six pictures by name, whose blue is 255, and a file that is none."""
+    path = tmp_path / "pictures"
+    path.mkdir()
+    for number, level in enumerate(LEVELS):
+        cv2.imwrite(str(path / f"{number}.png"), np.full((48, 64, 3), (255, level, level), np.uint8))
+    (path / "notes.txt").write_text("taken by hand")
+    return path
+
+
+def level(frame):
+    """Grey level; films are not exact."""
+    return min(LEVELS, key=lambda each: abs(each - float(frame.pixels[..., 1].mean())))
+
+
+@pytest.fixture(params=["film", "folder"])
+def make(request, film, folder, clock):
+    """The same six pictures, from a film or from a folder."""
+    kind, path = {"film": (VideoSensor, film), "folder": (ImagesSensor, folder)}[request.param]
+    return lambda **more: kind(finger="a", path=str(path), fps=10.0, clock=clock, **more)
+
+
+def test_pictures_come_in_their_time_and_carry_it(make, clock):
+    with make() as gel:
+        for later, expected, taken in ((0.0, 20, 0.0), (0.05, 20, 0.0), (0.15, 60, 0.1), (0.5625, 220, 0.5)):
+            clock.now_s = 50.0 + later
+            frame = gel.read()
+            assert level(frame) == expected
+            assert frame.time_s == pytest.approx(50.0 + taken)
+
+
+def test_after_the_last_picture_comes_the_first(make, clock):
+    with make() as gel:
+        for later, expected in ((0.65, 20), (0.95, 140), (60.05, 20), (60.15, 60)):
+            clock.now_s = 50.0 + later
+            frame = gel.read()
+            assert level(frame) == expected
+            assert 0 <= clock.now_s - frame.time_s < 0.1 + 1e-9
+
+
+def test_the_end_is_an_error_where_it_is_not_to_begin_again(make, clock):
+    with make(loop=False) as gel:
+        clock.now_s += 0.55
+        assert level(gel.read()) == 220
+        clock.now_s += 0.1
+        with pytest.raises(DeviceError, match=r"its 6 pictures lasted 0\.6 s; set loop = true"):
+            gel.read()
+
+
+def test_the_picture_nearest_to_a_time_is_found_and_none_of_the_future(make, clock):
+    with make() as gel:
+        clock.now_s = 50.35
+        assert [level(gel.read(10, near_s=50.0 + near)) for near in (0.0, 0.12, 0.19, 9.0, -9.0)] == [
+            20,
+            60,
+            100,
+            140,
+            20,
+        ]
+
+
+def test_connecting_again_begins_again(make, clock):
+    gel = make()
+    for _ in range(2):
+        with gel:
+            assert level(gel.read()) == 20
+            clock.now_s += 0.25
+            assert level(gel.read()) == 100
+    gel.close()
+
+
+def test_two_sensors_of_one_clock_show_the_same_moment(make, clock):
+    with make() as one, make() as other:
+        clock.now_s += 0.45
+        assert one.read().time_s == other.read().time_s
+
+
+def test_pictures_are_cut_and_resized_like_those_of_a_camera(make):
+    with make(crop=[0.5, 0.0, 0.0, 0.0], output_px=[16, 12]) as gel:
+        assert gel.read(10).pixels.shape == (12, 16, 3)
+    with pytest.raises(RobotConfigError, match="crop"):
+        make(crop=[2.0])
+
+
+def test_what_is_replayed_is_said(make):
+    with make() as gel:
+        found = gel.settings()
+    assert (found["pictures"], found["fps"], found["loop"]) == (6, 10.0, True)
+
+
+def test_pictures_are_in_rgb(folder, clock):
+    with ImagesSensor(finger="a", path=str(folder), clock=clock) as gel:
+        assert gel.read().pixels[0, 0].tolist() == [20, 20, 255]
+
+
+def test_a_film_has_its_own_rate_unless_another_is_asked_for(film, clock):
+    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+        assert gel.settings()["fps"] == pytest.approx(10.0)
+
+
+def test_a_film_is_decoded_forward_and_opened_again_to_go_back(film, clock, monkeypatch):
+    opened = []
+    real = cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: opened.append(path) or real(path))
+    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+        monkeypatch.setattr("robot.drivers.replay._KEPT", 1)
+        for later in (0.0, 0.15, 0.15, 0.45):
+            clock.now_s = 50.0 + later
+            gel.read()
+        assert len(opened) == 1
+        clock.now_s = 50.75
+        assert level(gel.read()) == 60
+        assert len(opened) == 2
+
+
+def test_a_film_shorter_than_it_says_is_an_error(film, clock):
+    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+        gel._count = 10
+        clock.now_s += 0.85
+        with pytest.raises(DeviceError, match="must have 10 pictures, it ends after 6"):
+            gel.read()
+
+
+@pytest.mark.parametrize("kind", [VideoSensor, ImagesSensor])
+def test_what_holds_no_pictures_cannot_be_connected(kind, tmp_path, clock):
+    empty = tmp_path / "empty"
+    empty.mkdir() if kind is ImagesSensor else empty.write_text("no film")
+    for path in (empty, tmp_path / "none"):
+        with pytest.raises(DeviceError):
+            kind(finger="a", path=str(path), clock=clock).connect()
+
+
+def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
+    (folder / "0.png").write_bytes(b"not a picture")
+    with pytest.raises(DeviceError, match=r"0\.png must be a picture"):
+        ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
+
+
+@pytest.mark.parametrize("fps", [-1.0, float("nan"), 2000.0])
+def test_a_rate_out_of_range_is_refused(fps):
+    with pytest.raises(RobotConfigError, match="fps"):
+        VideoSensor(finger="a", path="film.avi", fps=fps)
+
+
+# The camera -------------------------------------------------------------------------------------------------
+
+DEPTH_MM = np.array([[0, 900, 1500, 65535]] * 3, np.uint16)
+
+
+def colour(number):
+    """RGB."""
+    return np.full((3, 4, 3), (200, number, 0), np.uint8)
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    """Two pictures with depth, and intrinsics."""
+    path = tmp_path / "scene"
+    path.mkdir()
+    for number in (1, 2):
+        cv2.imwrite(str(path / f"view{number}.png"), colour(number)[..., ::-1])
+        cv2.imwrite(str(path / f"view{number}_depth.png"), number * (DEPTH_MM // 2))
+    (path / "intrinsics.json").write_text(json.dumps(LENS))
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Two grasps of a recording; pixels of the second are brighter."""
+    path = tmp_path / "recording"
+    depth = depth_in_mm(np.array([[np.nan, 0.9, 1.5, 0.4]] * 3, np.float32))
+    with RecordingWriter(path, {"source": "test", "sensor": "gel"}) as writer:
+        for number in (1, 2):
+            images = {"photo": colour(number), "depth": depth, "touch_a": colour(0)}
+            writer.append(f"g{number}", "mug", images)
+    return path
+
+
+def camera(path, **more):
+    return ReplayCamera(path=str(path), extrinsics=EXTRINSICS, **more)
+
+
+def test_each_read_shows_the_next_picture_and_after_the_last_the_first(pairs):
+    with camera(pairs) as eye:
+        assert [int(eye.read().colour[0, 0, 1]) for _ in range(3)] == [1, 2, 1]
+        eye.show(3)
+        assert int(eye.read().colour[0, 0, 1]) == 2
+
+
+def test_depth_is_in_metres_and_nan_where_unknown(pairs):
+    with camera(pairs) as eye:
+        image = eye.read()
+    np.testing.assert_allclose(image.depth_m[0], [np.nan, 0.45, 0.75, 32.767], rtol=1e-6)
+    assert image.colour[0, 0].tolist() == [200, 1, 0]
+    assert (image.intrinsics.fx, image.intrinsics.cy) == (10.0, 2.5)
+
+
+def test_without_depth_no_depth_is_read(pairs):
+    (pairs / "view1_depth.png").write_bytes(b"damaged")
+    with camera(pairs) as eye:
+        assert eye.read(depth=False).depth_m is None
+        eye.show(0)
+        with pytest.raises(DeviceError, match=r"view1_depth\.png must be a picture"):
+            eye.read()
+
+
+def test_a_folder_in_which_a_depth_is_missing_is_a_camera_of_colour_only(pairs):
+    (pairs / "view2_depth.png").unlink()
+    (pairs / "intrinsics.json").unlink()
+    with camera(pairs) as eye:
+        assert not eye.has_depth
+        assert eye.read(depth=False).depth_m is None
+        with pytest.raises(DeviceError, match="sees colour only"):
+            eye.read()
+
+
+def test_depth_without_intrinsics_cannot_be_connected(recording):
+    with pytest.raises(DeviceError, match="holds depth: give fx, fy, cx and cy"):
+        camera(recording).connect()
+
+
+def test_the_cameras_of_a_recording_are_replayed_with_intrinsics_from_the_rigs_file(recording):
+    with camera(recording, **LENS) as eye:
+        first, second = eye.read(), eye.read()
+    assert [int(image.colour[0, 0, 1]) for image in (first, second)] == [1, 2]
+    np.testing.assert_allclose(first.depth_m[0], [np.nan, 0.9, 1.5, 0.4], rtol=1e-6)
+    assert first.intrinsics.fy == 11.0
+
+
+def test_intrinsics_are_given_whole_or_not_at_all(pairs):
+    with pytest.raises(RobotConfigError, match="fx, fy, cx and cy must be given together"):
+        camera(pairs, fx=10.0)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"fx": 1}', '{"fx": 1, "fy": 1, "cx": "0", "cy": 0}', '{"fx": NaN}'])
+def test_intrinsics_that_are_none_are_refused_by_their_file(pairs, text):
+    (pairs / "intrinsics.json").write_text(text)
+    with pytest.raises(DeviceError, match=r"intrinsics\.json.* must"):
+        camera(pairs).connect()
+
+
+def test_depth_that_is_not_16_bit_is_refused(pairs):
+    cv2.imwrite(str(pairs / "view1_depth.png"), np.zeros((3, 4), np.uint8))
+    with camera(pairs) as eye, pytest.raises(DeviceError, match="must be 16-bit grey"):
+        eye.read()
+
+
+def test_folders_that_hold_no_pictures_cannot_be_connected(tmp_path):
+    with pytest.raises(DeviceError, match="must hold pictures"):
+        camera(tmp_path).connect()
+    with pytest.raises(DeviceError, match="cannot be connected"):
+        camera(tmp_path / "none").connect()
