@@ -1,0 +1,396 @@
+"""What an emulated WSG-50 does with commands, in time. No I/O: robot.drivers.wsg50_emulator gives it ports.
+
+Written from the protocol's facts (robot.drivers.wsg50_codec names them) with its own packing and numbers, so that it
+and the driver cannot share a misreading; they share framing and check sum, which are tested against printed frames.
+Where the facts are silent it does the least convenient thing that they allow: it denies what it is not known to allow.
+"""
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from robot.drivers.wsg50_codec import Frame
+from robot.drivers.wsg50_mechanics import STROKE_MM, Mechanics
+
+IDLE, GRASPING, NO_PART, PART_LOST, HOLDING, RELEASING, POSITIONING, ERROR = range(8)
+OK, NOT_AVAILABLE, NOT_INITIALIZED, RUNNING, NO_PARAM, FEW_PARAMS, UNKNOWN = 0, 1, 3, 4, 12, 13, 14
+FORMAT, DENIED, FAILED, ABORTED, INVALID, PENDING, RANGE, BLOCKED = 15, 16, 18, 19, 24, 26, 28, 29
+FAULT_BITS = {"temperature": 14, "power": 15, "current": 16, "finger": 17}
+UPDATES = frozenset({0x40, 0x41, 0x43, 0x44, 0x45})
+_REFERENCED, _MOVING, _MINUS, _PLUS, _STOPPED, _REACHED, _FORCE, _FAST_STOP = 0, 1, 2, 3, 6, 7, 9, 12
+_SPEEDS, _ACCELERATIONS, _FORCES, _OVERDRIVE_N = (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0), 120.0
+_LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x30: 4, 0x32: 4, 0x34: 8, 0x37: 1, 0x42: 1}
+_ANY_LENGTH = {0x06, 0x51}
+_HOMING_MM_S = 100.0
+_CLAMPING_MM = 3.0
+"""Clamping travel: how far beyond the nominal width the fingers look for a part."""
+
+Answer = int | bytes
+"""A status alone, or the parameters of a success."""
+
+
+class Emulator:
+    """A WSG-50. `receive` takes a command, `tick` lets time pass; both return what it says, in order.
+
+    object_mm: width of the rigid object between the jaws, or None; may be set at any time, and a held part is lost by
+    it. speed_up: its time runs so many times faster than `clock`. referenced: False needs homing first. Switches:
+    has_force_fingers (else it cannot be tared), keeps_force_n (the force limit it has whatever it is told), jammed (the
+    jaws move and no motion ends), silent (hears, and says nothing), mute_updates (says nothing unasked).
+    heard: ids of all commands. Safe to use from several threads.
+    """
+
+    def __init__(
+        self,
+        *,
+        object_mm: float | None = None,
+        opening_mm: float = 50.0,
+        referenced: bool = False,
+        speed_up: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._lock = threading.RLock()
+        self._jaws = Mechanics(opening_mm, object_mm)
+        self.speed_up, self._clock = speed_up, clock
+        self.has_force_fingers = self.jammed = self.silent = self.mute_updates = False
+        self.error_on_disconnect = True
+        self.keeps_force_n: float | None = None
+        self.heard: list[int] = []
+        self.grasping, self._bits = IDLE, {_REFERENCED} if referenced else set()
+        self.force_limit_n = 40.0
+        self.soft_limits: tuple[float, float] | None = None
+        self._tag, self._counts = b"emulated", [0, 0, 0]
+        self._running: tuple[int, Callable[[], int | None]] | None = None
+        self._updates: dict[int, list[float]] = {}
+        self._last: dict[int, bytes] = {}
+        self._announced = False
+        self._now = clock()
+
+    # --- from outside -----------------------------------------------------------------------------------------------
+
+    @property
+    def object_mm(self) -> float | None:
+        """Width of what is between the jaws, or None."""
+        return self._jaws.object_mm
+
+    @object_mm.setter
+    def object_mm(self, width: float | None) -> None:
+        with self._lock:
+            self._jaws.object_mm = width
+
+    @property
+    def opening_mm(self) -> float:
+        """Where the jaws are now."""
+        with self._lock:
+            self._advance()
+            return self._jaws.opening_mm
+
+    @property
+    def moves(self) -> bool:
+        """Whether the jaws are on their way."""
+        with self._lock:
+            self._advance()
+            return self._jaws.moves
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether the jaws are on their way to close on something."""
+        return self.moves and self.grasping == GRASPING
+
+    @property
+    def in_fast_stop(self) -> bool:
+        """Whether it waits for an acknowledgement."""
+        return _FAST_STOP in self._bits
+
+    def fail(self, fault: str | None = None) -> None:
+        """Raise a FAST STOP, with the flag of a fault of FAULT_BITS."""
+        with self._lock:
+            self._bits |= {_FAST_STOP} | ({FAULT_BITS[fault]} if fault else set())
+            self._bits.discard(_FORCE)
+            self._jaws.stand()
+            self.grasping = ERROR
+
+    def lose_reference(self) -> None:
+        """As after a loss of power."""
+        with self._lock:
+            self._bits.discard(_REFERENCED)
+
+    def connected(self) -> None:
+        """A client has come."""
+        with self._lock:
+            self._announced = False
+            self._updates.clear()
+
+    def disconnected(self) -> None:
+        """The client has gone: a FAST STOP, unless it said so before."""
+        with self._lock:
+            self._updates.clear()
+            if self.error_on_disconnect and not self._announced:
+                self.fail()
+                self._running = None
+
+    def receive(self, frame: Frame) -> list[Frame]:
+        """Do a command; returns what it answers at once."""
+        with self._lock:
+            self._advance()
+            self.heard.append(frame.id)
+            aborted = self._running
+            answer = self._answer(frame.id, frame.payload)
+            said = [Frame(aborted[0], _status(ABORTED))] if aborted and not self._running else []
+            said.append(Frame(frame.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer))
+            return [] if self.silent else said
+
+    def tick(self) -> list[Frame]:
+        """Let time pass up to now; returns results of motions, and automatic updates."""
+        with self._lock:
+            self._advance()
+            said = [*self._ended(), *self._due()]
+            return [] if self.silent else said
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    def _advance(self) -> None:
+        now = self._clock()
+        passed, self._now = now - self._now, now
+        if not self.jammed:
+            self._jaws.advance(passed * self.speed_up)
+
+    def _ended(self) -> Iterator[Frame]:
+        """The result of a motion that has ended; a held part that is gone."""
+        if self._running and (status := self._running[1]()) is not None:
+            command, self._running = self._running[0], None
+            yield Frame(command, _status(status))
+        if self.grasping == HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
+            self.grasping = PART_LOST
+            self._bits.discard(_FORCE)
+            self._counts[2] += 1
+
+    def _due(self) -> Iterator[Frame]:
+        for command, update in self._updates.items():
+            only_changes, period, next_s = update
+            if self._now < next_s or self.mute_updates:
+                continue
+            update[2] = max(next_s + period, self._now)
+            value = self._value(command)
+            if not only_changes or value != self._last.get(command):
+                yield Frame(command, _status(OK) + value)
+            self._last[command] = value
+
+    # --- commands ---------------------------------------------------------------------------------------------------
+
+    def _answer(self, command: int, payload: bytes) -> Answer:
+        if command not in _ACTIONS and command not in UPDATES:
+            return UNKNOWN
+        want = 3 if command in UPDATES else _LENGTHS.get(command, 0)
+        if command not in _ANY_LENGTH and len(payload) != want:
+            return FEW_PARAMS if len(payload) < want else FORMAT if want else NO_PARAM
+        return self._update(command, payload) if command in UPDATES else _ACTIONS[command](self, payload)
+
+    def _update(self, command: int, payload: bytes) -> Answer:
+        flags, period_ms = payload[0], payload[1] | payload[2] << 8
+        self._updates.pop(command, None)
+        if flags & 1:
+            if not period_ms:
+                return RANGE
+            self._updates[command] = [float(flags >> 1 & 1), period_ms / 1000, self._now + period_ms / 1000]
+            self._last[command] = self._value(command)
+        return self._value(command)
+
+    def _value(self, command: int) -> bytes:
+        if command == 0x40:
+            return struct.pack("<I", sum(1 << bit for bit in self._flags()))
+        if command == 0x41:
+            return bytes([self.grasping])
+        force = self.force_limit_n if self.grasping == HOLDING else 0.0
+        value = {0x43: self._jaws.opening_mm, 0x44: self._jaws.speed_mm_s, 0x45: force}[command]
+        return struct.pack("<f", value)
+
+    def _flags(self) -> set[int]:
+        now = {_MOVING: self._jaws.moves, _MINUS: self._jaws.blocked < 0, _PLUS: self._jaws.blocked > 0}
+        return self._bits | {bit for bit, on in now.items() if on}
+
+    def _begin(self, command: int, state: int, to_mm: float, speed: float, ended: Callable[[], int | None]) -> int:
+        self._bits -= {_STOPPED, _REACHED, _FORCE}
+        self.grasping, self._running = state, (command, ended)
+        self._jaws.go(to_mm, speed)
+        return PENDING
+
+    def _refusal(self, states: Sequence[int], width: float, speed: float) -> int | None:
+        """Why a motion cannot be begun now."""
+        if _FAST_STOP in self._bits:
+            return DENIED
+        if self._running:
+            return RUNNING
+        if _REFERENCED not in self._bits:
+            return NOT_INITIALIZED
+        if self.grasping not in states:
+            return DENIED
+        low, high = self.soft_limits or (0.0, STROKE_MM)
+        return None if low <= width <= high and _SPEEDS[0] <= speed <= _SPEEDS[1] else RANGE
+
+    def _home(self, payload: bytes) -> Answer:
+        if payload[0] > 2:
+            return INVALID
+        if _FAST_STOP in self._bits or self._running:
+            return DENIED if _FAST_STOP in self._bits else RUNNING
+        self._bits.discard(_REFERENCED)
+
+        def ended() -> int | None:
+            if self._jaws.moves:
+                return None
+            self.grasping = IDLE
+            if self._jaws.blocked:
+                return BLOCKED
+            self._bits |= {_REFERENCED, _REACHED}
+            return OK
+
+        return self._begin(0x20, POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
+
+    def _move(self, payload: bytes) -> Answer:
+        flags, width, speed = struct.unpack("<Bff", payload)
+        width += self._jaws.opening_mm if flags & 1 else 0.0
+        if (refused := self._refusal((IDLE,), width, speed)) is not None:
+            return refused
+        return self._begin(0x21, POSITIONING, width, speed, self._arrived)
+
+    def _arrived(self) -> int | None:
+        if self._jaws.moves:
+            return None
+        self.grasping = IDLE
+        if self._jaws.blocked:
+            return BLOCKED
+        self._bits.add(_REACHED)
+        return OK
+
+    def _release(self, payload: bytes) -> Answer:
+        width, speed = struct.unpack("<ff", payload)
+        if (refused := self._refusal((NO_PART, PART_LOST, HOLDING), width, speed)) is not None:
+            return refused
+        return self._begin(0x26, RELEASING, width, speed, self._arrived)
+
+    def _grasp(self, payload: bytes) -> Answer:
+        width, speed = struct.unpack("<ff", payload)
+        if (refused := self._refusal((IDLE,), width, speed)) is not None:
+            return refused
+        self._counts[0] += 1
+        return self._begin(0x25, GRASPING, max(0.0, width - _CLAMPING_MM), speed, self._grasped)
+
+    def _grasped(self) -> int | None:
+        if self._jaws.moves:
+            return None
+        if self._jaws.blocked < 0:
+            self.grasping = HOLDING
+            self._bits.add(_FORCE)
+            return OK
+        self.grasping = NO_PART
+        self._counts[1] += 1
+        return FAILED
+
+    def _stop(self, _: bytes) -> Answer:
+        self._jaws.stand()
+        self._running = None
+        self._bits.add(_STOPPED)
+        self._bits.discard(_FORCE)
+        self.grasping = self.grasping if self.grasping == ERROR else IDLE
+        return OK
+
+    def _fast_stop(self, _: bytes) -> Answer:
+        self.fail()
+        self._running = None
+        return OK
+
+    def _acknowledge(self, payload: bytes) -> Answer:
+        if payload != b"\x61\x63\x6b":
+            return INVALID
+        if _FAST_STOP not in self._bits:
+            return DENIED
+        self._bits -= {_FAST_STOP, *FAULT_BITS.values()}
+        self.grasping = IDLE
+        return OK
+
+    def _announce(self, _: bytes) -> Answer:
+        self._announced = True
+        return OK
+
+    def _set_acceleration(self, payload: bytes) -> Answer:
+        (value,) = struct.unpack("<f", payload)
+        if refused := self._unsettable(_ACCELERATIONS[0] <= value <= _ACCELERATIONS[1]):
+            return refused
+        self._jaws.acceleration_mm_s2 = value
+        return OK
+
+    def _set_force(self, payload: bytes) -> Answer:
+        (value,) = struct.unpack("<f", payload)
+        if refused := self._unsettable(_FORCES[0] <= value <= _FORCES[1]):
+            return refused
+        self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
+        return OK
+
+    def _set_soft_limits(self, payload: bytes) -> Answer:
+        low, high = struct.unpack("<ff", payload)
+        if refused := self._unsettable(0 <= low < high <= STROKE_MM):
+            return refused
+        self.soft_limits = low, high
+        return OK
+
+    def _clear_soft_limits(self, _: bytes) -> Answer:
+        self.soft_limits = None
+        return OK
+
+    def _unsettable(self, in_range: bool) -> int:
+        """Changing parameters while it moves raises a FAST STOP."""
+        if self._jaws.moves:
+            self.fail()
+            self._running = None
+            return DENIED
+        return OK if in_range else RANGE
+
+    def _tare(self, _: bytes) -> Answer:
+        if not self.has_force_fingers:
+            return NOT_AVAILABLE
+        return DENIED if self.grasping == HOLDING else OK
+
+    def _statistics(self, payload: bytes) -> Answer:
+        counts = struct.pack("<IHH", *self._counts)
+        if payload[0]:
+            self._counts = [0, 0, 0]
+        return counts
+
+    def _set_tag(self, payload: bytes) -> Answer:
+        self._tag = payload
+        return OK
+
+    def _get_soft_limits(self, _: bytes) -> Answer:
+        return NOT_AVAILABLE if self.soft_limits is None else struct.pack("<ff", *self.soft_limits)
+
+
+def _status(number: int) -> bytes:
+    return struct.pack("<H", number)
+
+
+_ACTIONS: dict[int, Callable[[Emulator, bytes], Answer]] = {
+    0x06: lambda _, payload: payload,
+    0x07: Emulator._announce,
+    0x20: Emulator._home,
+    0x21: Emulator._move,
+    0x22: Emulator._stop,
+    0x23: Emulator._fast_stop,
+    0x24: Emulator._acknowledge,
+    0x25: Emulator._grasp,
+    0x26: Emulator._release,
+    0x30: Emulator._set_acceleration,
+    0x31: lambda own, _: struct.pack("<f", own._jaws.acceleration_mm_s2),
+    0x32: Emulator._set_force,
+    0x33: lambda own, _: struct.pack("<f", own.force_limit_n),
+    0x34: Emulator._set_soft_limits,
+    0x35: Emulator._get_soft_limits,
+    0x36: Emulator._clear_soft_limits,
+    0x37: lambda _, payload: OK if payload[0] < 2 else INVALID,
+    0x38: Emulator._tare,
+    0x42: Emulator._statistics,
+    0x46: lambda _, payload: struct.pack("<h", 253),
+    0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
+    0x51: Emulator._set_tag,
+    0x52: lambda own, _: own._tag,
+    0x53: lambda _, payload: struct.pack("<8f", STROKE_MM, *_SPEEDS, *_ACCELERATIONS, *_FORCES, _OVERDRIVE_N),
+}

@@ -1,0 +1,311 @@
+"""The WSG-50's frames to the byte, and what is found in damaged, cut and noisy streams."""
+
+import contextlib
+import itertools
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.drivers import wsg50_codec as codec
+from robot.drivers import wsg50_commands as commands
+from robot.drivers.wsg50_codec import Frame, WireError, decode, encode
+from robot.drivers.wsg50_commands import Command, GraspingState, Status, SystemState
+from robot.errors import DeviceError
+from tests.wsg50_frames import COMMANDS, FRAMES, MANUAL_REPLIES, bytes_of
+
+BUILT = {
+    "acknowledge": commands.acknowledge(),
+    "clear soft limits": commands.ask(Command.CLEAR_SOFT_LIMITS),
+    "disconnect": commands.disconnect(),
+    "fast stop": commands.fast_stop(),
+    "stop": commands.stop(),
+    "get tag": commands.ask(Command.GET_TAG),
+    "get force limit": commands.ask(Command.GET_FORCE_LIMIT),
+    "grasping state every 4E0Eh ms": commands.update(Command.GRASPING_STATE, 0x4E0E),
+    "opening every 1234h ms": commands.update(Command.OPENING, 0x1234),
+    "info": commands.ask(Command.INFO),
+    "temperature": commands.ask(Command.TEMPERATURE),
+    "grasp 12 mm 34 mm/s": commands.grasp(12.0, 34.0),
+    "loop abc": commands.loop(b"abc"),
+    "overdrive on": commands.overdrive(True),
+    "move to 34 mm at 56 mm/s, stop on block": commands.move(34.0, 56.0),
+    "set tag abcd": commands.set_tag(b"abcd"),
+}
+
+PARSERS = (
+    "number",
+    "soft_limits",
+    "limits",
+    "info",
+    "statistics_of",
+    "system_state",
+    "grasping_state",
+    "temperature",
+)
+
+
+def all_frames(stream):
+    """Every frame of a stream that is there as a whole."""
+    buffer, found = bytearray(stream), []
+    while True:
+        used, frame = decode(buffer)
+        del buffer[:used]
+        if frame is None:
+            return found
+        found.append(frame)
+
+
+def fed(chunks):
+    """Every frame of a stream that comes in pieces."""
+    buffer, found = bytearray(), []
+    for chunk in chunks:
+        buffer += chunk
+        while True:
+            used, frame = decode(buffer)
+            del buffer[:used]
+            if frame is None:
+                break
+            found.append(frame)
+    return found
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_frame_of_the_manual_is_written_and_read_to_the_byte(name):
+    text, command, payload = FRAMES[name]
+    frame = Frame(command, bytes.fromhex(payload))
+    assert encode(frame) == bytes.fromhex(text)
+    assert decode(bytes.fromhex(text)) == (len(bytes.fromhex(text)), frame)
+
+
+def test_every_command_of_the_public_tests_comes_out_of_its_builder():
+    assert set(BUILT) == set(COMMANDS)
+    for name, frame in BUILT.items():
+        assert encode(frame) == bytes_of(name), name
+
+
+def test_the_check_sum_runs_to_zero_over_a_frame_and_to_50f5_over_the_preamble():
+    assert codec.checksum(b"\xaa\xaa\xaa") == 0x50F5
+    assert [codec.checksum(bytes_of(name)) for name in FRAMES] == [0] * len(FRAMES)
+
+
+def test_the_check_sum_is_not_the_textbook_ccitt():
+    import binascii
+
+    body = bytes_of("stop")[:-2]
+    assert codec.checksum(body) == 0x760E
+    assert binascii.crc_hqx(body, 0xFFFF) != 0x760E
+
+
+def test_builders_without_a_printed_frame_pack_what_the_table_says():
+    assert commands.home(2) == Frame(0x20, b"\x02")
+    assert commands.move(1.0, 2.0, relative=True, stop_on_block=False).payload[0] == 1
+    assert commands.release(1.0, 2.0) == Frame(0x26, struct.pack("<ff", 1, 2))
+    assert commands.set_acceleration(150.0) == Frame(0x30, bytes.fromhex("00001643"))
+    assert commands.set_force_limit(40.0) == Frame(0x32, struct.pack("<f", 40))
+    assert commands.set_soft_limits(5.0, 100.0) == Frame(0x34, struct.pack("<ff", 5, 100))
+    assert commands.statistics(reset=True) == Frame(0x42, b"\x01")
+    assert commands.ask(Command.OPENING) == Frame(0x43, b"\x00\x00\x00")
+    assert commands.update(Command.FORCE, 20, on_change=True) == Frame(0x45, b"\x03\x14\x00")
+
+
+def test_replies_mean_what_the_manual_says():
+    answers = [name for name in MANUAL_REPLIES if FRAMES[name][1] != 0x01]
+    status = {name: commands.reply(decode(bytes_of(name))[1])[0] for name in answers}
+    assert status == {
+        "homing done": Status.SUCCESS,
+        "unknown command 90h": Status.CMD_UNKNOWN,
+        "acceleration 150": Status.SUCCESS,
+        "move pending": Status.CMD_PENDING,
+        "move done": Status.SUCCESS,
+    }
+    assert commands.number(commands.reply(decode(bytes_of("acceleration 150"))[1])[1]) == 150.0
+
+
+def test_parsers_read_what_was_packed_by_hand():
+    assert commands.system_state(struct.pack("<I", 0x1003)) == (
+        SystemState.REFERENCED | SystemState.MOVING | SystemState.FAST_STOP
+    )
+    assert commands.grasping_state(b"\x04") is GraspingState.HOLDING
+    assert commands.soft_limits(struct.pack("<ff", 5, 100)) == (5.0, 100.0)
+    assert commands.statistics_of(struct.pack("<IHH", 70000, 3, 2)) == commands.Statistics(70000, 3, 2)
+    assert commands.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456)) == commands.Info(1, 6, 0x4000, 123456)
+    assert commands.temperature(struct.pack("<h", -15)) == -1.5
+    limits = commands.limits(struct.pack("<8f", 110, 5, 420, 100, 5000, 5, 80, 120))
+    assert (limits.stroke_mm, limits.min_speed_mm_s, limits.max_force_n) == (110.0, 5.0, 80.0)
+
+
+def test_every_status_and_bit_has_the_number_of_the_manual():
+    assert [int(status) for status in Status] == list(range(31))
+    assert [bit.bit_length() - 1 for bit in SystemState] == [*range(10), *range(12, 21)]
+    assert [int(state) for state in GraspingState] == list(range(8))
+
+
+@pytest.mark.parametrize(
+    "misuse",
+    [
+        lambda: commands.reply(Frame(0x22, b"\x00")),
+        lambda: commands.reply(Frame(0x22, b"\x63\x00")),
+        lambda: commands.number(b"\x00\x00\x00"),
+        lambda: commands.number(struct.pack("<f", math.nan)),
+        lambda: commands.limits(bytes(31)),
+        lambda: commands.info(bytes(9)),
+        lambda: commands.statistics_of(b""),
+        lambda: commands.system_state(bytes(5)),
+        lambda: commands.grasping_state(b"\x08"),
+        lambda: commands.temperature(b"\x00"),
+        lambda: commands.soft_limits(bytes(4)),
+        lambda: commands.home(3),
+        lambda: commands.grasp(math.nan, 1.0),
+        lambda: commands.grasp(1e39, 1.0),
+        lambda: commands.update(Command.INFO, 10),
+        lambda: commands.update(Command.FORCE, 0),
+        lambda: commands.update(Command.FORCE, 65536),
+        lambda: Frame(0xAA),
+        lambda: Frame(256),
+        lambda: Frame(1, bytes(codec.MAX_PAYLOAD + 1)),
+    ],
+)
+def test_what_cannot_be_is_the_codecs_own_error(misuse):
+    with pytest.raises(WireError) as caught:
+        misuse()
+    assert isinstance(caught.value, DeviceError)
+
+
+def test_a_stream_is_the_same_whole_halved_and_byte_by_byte():
+    stream = b"".join(bytes_of(name) for name in FRAMES)
+    want = [Frame(command, bytes.fromhex(payload)) for _, command, payload in FRAMES.values()]
+    assert all_frames(stream) == want
+    assert fed([stream[: len(stream) // 2], stream[len(stream) // 2 :]]) == want
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == want
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_frame_cut_at_any_length_is_waited_for(name):
+    whole = bytes_of(name)
+    for length in range(len(whole)):
+        used, frame = decode(whole[:length])
+        assert (used, frame) == (0, None)
+
+
+@pytest.mark.parametrize(
+    "noise", [b"\x00", b"\xaa", b"\xaa\xaa", b"\xaa\xaa\xaa", b"\xaa\xaa\x00", b"\xaa" * 9, b"hello"]
+)
+@pytest.mark.parametrize("name", FRAMES)
+def test_noise_before_and_between_costs_no_frame(name, noise):
+    frame = decode(bytes_of(name))[1]
+    stream = noise + bytes_of(name) + noise + bytes_of(name)
+    assert all_frames(stream) == [frame, frame]
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [frame, frame]
+
+
+def test_three_aa_must_stand_in_a_row():
+    """Public drivers count any three AA: AA 00 AA AA then begins a frame for them."""
+    spread = b"\xaa\x00\xaa\xaa" + bytes_of("stop")[3:]
+    assert all_frames(spread + bytes_of("info")) == [Frame(0x50)]
+
+
+@pytest.mark.parametrize(
+    "payload", [b"\xaa\xaa\xaa", b"\xaa" * 7, b"x\xaa\xaa\xaa\x22\x00\x00", b"\xaa\xaa\xaa\xaa\x06"]
+)
+def test_a_preamble_inside_a_payload_splits_no_frame(payload):
+    frame = Frame(Command.LOOP, payload)
+    stream = encode(frame) + encode(frame)
+    assert all_frames(stream) == [frame, frame]
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [frame, frame]
+
+
+def test_a_whole_frame_inside_a_payload_stays_inside():
+    frame = Frame(Command.LOOP, bytes_of("fast stop"))
+    assert all_frames(encode(frame)) == [frame]
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_frame_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
+    good = bytes_of(name)
+    after = Frame(Command.LOOP, bytes(range(16)))
+    close = bytes(codec.MAX_PAYLOAD)  # a flipped length may claim so much more
+    for bit in range(8 * len(good)):
+        bad = bytearray(good)
+        bad[bit // 8] ^= 1 << bit % 8
+        found = all_frames(bytes(bad) + encode(after) + close)
+        assert found[-1:] == [after]
+        assert decode(good)[1] not in found[:-1]
+
+
+def test_a_good_frame_that_begins_inside_a_damaged_one_is_found():
+    damaged = bytes_of("grasp 12 mm 34 mm/s")[:9]  # cut: its length claims the beginning of the next
+    assert all_frames(damaged + bytes_of("stop") + bytes_of("info")) == [Frame(0x22), Frame(0x50)]
+
+
+def test_a_length_above_the_largest_payload_is_noise_at_once():
+    claim = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD + 1)
+    assert all_frames(claim + bytes_of("stop")) == [Frame(0x22)]
+    waits = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD)
+    assert decode(waits + bytes_of("stop")) == (0, None)
+    assert all_frames((waits + bytes_of("stop"))[1:]) == [Frame(0x22)]  # what a caller does when no more comes
+
+
+@given(st.binary(max_size=80), st.integers(0, 255).filter(lambda number: number != 0xAA), st.binary(max_size=64))
+def test_whatever_is_framed_is_read_back(noise, command, payload):
+    frame = Frame(command, payload)
+    assert decode(encode(frame)) == (len(encode(frame)), frame)
+    assert frame in all_frames(noise + encode(frame) + bytes(codec.MAX_PAYLOAD + 8))
+
+
+@given(st.lists(st.binary(max_size=30), max_size=6))
+def test_pieces_change_nothing(chunks):
+    assert fed(chunks) == all_frames(b"".join(chunks))
+
+
+def fuzzed(seed):
+    """A million bytes rich in AA, 00 and 01 with 2000 frames planted in them, and where each of these begins."""
+    rng = np.random.default_rng(seed)
+    alphabet = np.array([0xAA] * 6 + [0x00] * 4 + [0x01] + list(range(2, 7)), np.uint8)
+    noise = rng.choice(alphabet, 1_000_000).tobytes()
+    stream, planted, before = bytearray(), {}, 0
+    for cut, name in zip(np.sort(rng.choice(len(noise), 2000, replace=False)), itertools.cycle(FRAMES), strict=False):
+        stream += noise[before:cut]
+        planted[len(stream)] = name
+        stream += bytes_of(name)
+        before = cut
+    return stream + noise[before:] + bytes(codec.MAX_PAYLOAD + 8), planted
+
+
+def places(stream):
+    """Where each frame begins that is found."""
+    buffer, found, at = bytearray(stream), {}, 0
+    while True:
+        used, frame = decode(buffer)
+        if frame is None:
+            return found
+        found[at + used - len(encode(frame))] = frame
+        at += used
+        del buffer[:used]
+
+
+def test_a_million_fuzzed_bytes_cost_a_planted_frame_only_where_noise_makes_a_frame_of_it():
+    """A planted frame is found, unless it lies inside noise that is itself a frame: a beginning, a length that reaches
+    so far, and a check sum that holds, which is so for 1 in 65536 of them. Nothing else is lost."""
+    stream, planted = fuzzed(0)
+    found = places(stream)
+    lost = {at for at in planted if at not in found}
+    inside = {at for start, frame in found.items() for at in range(start + 1, start + len(encode(frame)))}
+    swallowed = inside & set(planted)
+    assert lost == swallowed
+    assert len(lost) <= 2
+    assert all(found[at] == decode(bytes_of(name))[1] for at, name in planted.items() if at in found)
+    assert fed([stream[at : at + 997] for at in range(0, len(stream), 997)]) == list(found.values())
+
+
+def test_whatever_is_found_in_noise_is_parsed_or_refused_with_the_drivers_own_error():
+    parsers = [getattr(commands, name) for name in PARSERS]
+    for payload in (np.random.default_rng(size).bytes(size) for size in range(40) for _ in range(5)):
+        for parse in parsers:
+            with contextlib.suppress(WireError):
+                parse(payload)
+        with contextlib.suppress(WireError):
+            commands.reply(Frame(0x40, payload))

@@ -1,0 +1,253 @@
+"""The line to a WSG-50: deadlines, replies told apart, old ones dropped, ports that go away."""
+
+import os
+import socket
+import sys
+import threading
+import time
+from contextlib import closing
+
+import pytest
+
+from robot.drivers import wsg50_commands as commands
+from robot.drivers.wsg50_codec import Frame, decode, encode
+from robot.drivers.wsg50_commands import Command, Status
+from robot.drivers.wsg50_link import CommandFailed, Link, NoReply
+from robot.drivers.wsg50_port import LinkLost, Port
+from robot.errors import DeviceError
+from tests.wsg50_frames import bytes_of
+
+OK = bytes(2)
+
+
+class Peer:
+    """The other end of a TCP line: answers each frame by a function frame -> bytes, or None to hang up."""
+
+    def __init__(self, answer):
+        self.answer, self.heard = answer, []
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self):
+        try:
+            client, _ = self.server.accept()
+        except OSError:
+            return
+        buffer = bytearray()
+        with client:
+            while data := self.receive(client):
+                buffer += data
+                while True:
+                    used, frame = decode(buffer)
+                    del buffer[:used]
+                    if frame is None:
+                        break
+                    self.heard.append(frame.id)
+                    answer = self.answer(frame)
+                    if answer is None:
+                        return
+                    client.sendall(answer)
+
+    def receive(self, client):
+        try:
+            return client.recv(4096)
+        except OSError:
+            return b""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.server.shutdown(socket.SHUT_RDWR)
+        self.server.close()
+        self.thread.join()
+
+
+def reply(frame, parameters=b"", status=0):
+    return encode(Frame(frame.id, status.to_bytes(2, "little") + parameters))
+
+
+def echoing(frame):
+    """Answers LOOP, and nothing else."""
+    return reply(frame, frame.payload) if frame.id == Command.LOOP else b""
+
+
+def linked(peer, timeout_s=0.2):
+    link = Link(peer.url, timeout_s=timeout_s)
+    link.open()
+    return closing(link)
+
+
+@pytest.fixture(autouse=True)
+def quick_close(monkeypatch):
+    """pyserial waits 0.3 s after closing a socket."""
+    import serial.urlhandler.protocol_socket as protocol
+
+    monkeypatch.setattr(protocol, "time", type("NoWait", (), {"sleep": staticmethod(lambda _: None)}))
+
+
+def test_a_loopback_port_gives_back_what_it_is_given():
+    port = Port("loop://", baud=115200, stop_bits=2, write_timeout_s=1.0)
+    port.write(bytes_of("stop"))
+    got = b""
+    while len(got) < len(bytes_of("stop")):
+        got += port.read(1.0)
+    assert got == bytes_of("stop")
+    assert port.read(0.01) == b""
+    port.close()
+
+
+def test_a_reply_is_found_among_updates_and_noise():
+    def answer(frame):
+        if frame.id == Command.LOOP:
+            return echoing(frame)
+        update = encode(Frame(Command.OPENING, OK + b"\x00\x00\x16\x43"))
+        return update + b"\xaa\xaa noise" + update + reply(frame, b"\x00\x00\x20\x42")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 40.0
+        assert commands.number(link.updates[Command.OPENING][0]) == 150.0
+
+
+def test_pending_is_not_the_end_of_a_command():
+    def answer(frame):
+        return echoing(frame) or reply(frame, status=Status.CMD_PENDING) + reply(frame)
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.call(Frame(Command.TARE)) == b""
+        link.begin(Frame(Command.HOME, b"\0"))
+        assert [link.poll(Command.HOME, 1.0), link.poll(Command.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
+        assert link.poll(Command.HOME, 0.01) is None
+
+
+def test_another_status_than_success_says_which_command_and_why():
+    with Peer(lambda frame: echoing(frame) or reply(frame, status=16)) as peer, linked(peer) as link:
+        with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
+            link.tell(commands.stop())
+        assert caught.value.status is Status.ACCESS_DENIED
+        assert peer.heard.count(Command.STOP) == 1  # an answer is an answer
+
+
+def test_silence_ends_with_the_deadline_and_is_asked_three_times():
+    with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
+        started = time.monotonic()
+        with pytest.raises(NoReply, match=r"INFO \(50h\) within 0.05 s"):
+            link.ask(commands.ask(Command.INFO), commands.info)
+        assert time.monotonic() - started < 5
+        assert peer.heard.count(Command.INFO) == 3
+        assert link.counts["asked again"] == 2
+
+
+def test_a_gripper_that_echoes_nothing_is_not_there():
+    with Peer(lambda frame: b"") as peer, linked(peer, timeout_s=0.05) as link:
+        with pytest.raises(NoReply, match="is it on, and connected"):
+            link.call(commands.stop())
+        assert set(peer.heard) == {Command.LOOP}  # nothing was told to a line in doubt
+
+
+def test_a_late_reply_is_never_taken_for_the_present_one():
+    """The first question is answered after the second was asked; without the echo the old value would be taken."""
+    late = []
+
+    def answer(frame):
+        if frame.id == Command.LOOP:
+            return b"".join(late) + echoing(frame)
+        if not late:
+            late.append(reply(frame, b"\x00\x00\x80\x3f"))  # 1.0
+            return b""
+        return reply(frame, b"\x00\x00\x00\x40")  # 2.0
+
+    with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
+        with pytest.raises(NoReply):
+            link.call(commands.ask(Command.GET_FORCE_LIMIT))
+        assert commands.number(link.call(commands.ask(Command.GET_FORCE_LIMIT))) == 2.0
+        assert link.counts["unexpected"] == 1
+
+
+def test_a_doubled_reply_raises_doubt_before_the_next_command():
+    def answer(frame):
+        return echoing(frame) or 2 * reply(frame, b"\x00\x00\x80\x3f")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        link.call(commands.ask(Command.GET_FORCE_LIMIT))
+        link.pump(0.05)
+        loops = peer.heard.count(Command.LOOP)
+        link.call(commands.ask(Command.GET_ACCELERATION))
+        assert peer.heard.count(Command.LOOP) == loops + 1
+
+
+def test_a_frame_that_stops_half_way_hides_nothing_behind_it():
+    half = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never come
+
+    def answer(frame):
+        return echoing(frame) or half + reply(frame, b"\x00\x00\x80\x3f")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert commands.number(link.call(commands.ask(Command.GET_FORCE_LIMIT))) == 1.0
+        assert link.counts["given up"] >= 1
+
+
+def test_replies_of_the_wrong_length_are_asked_again():
+    answers = [b"\x01", b"\x00\x00\x80\x3f"]
+
+    def answer(frame):
+        return echoing(frame) or reply(frame, answers.pop(0))
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 1.0
+        assert answers == []
+
+
+def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
+    with Peer(lambda frame: echoing(frame) or reply(frame)) as peer, linked(peer) as link:
+        link.doubt()
+        link.urgent(commands.stop())
+        assert peer.heard == [Command.STOP]
+
+
+def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
+    with Peer(lambda frame: None) as peer:
+        link = Link(peer.url, timeout_s=0.5)
+        link.open()
+        with pytest.raises(LinkLost, match=r"is gone.*recover"):
+            link.sync()
+        assert not link.is_open
+        with pytest.raises(LinkLost, match="must be open"):
+            link.tell(commands.stop())
+        link.close()
+    with Peer(echoing) as other:
+        link.name = other.url
+        link.open()
+        link.open()
+        link.sync()
+        link.close()
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "port", ["/nowhere/tty", "socket://127.0.0.1:1", "socket://127.0.0.1", "what://is this", "loop://?x=1"]
+)
+def test_a_port_that_cannot_be_opened_is_a_sentence(port):
+    with pytest.raises(LinkLost, match="cannot be opened"):
+        Link(port).open()
+
+
+def test_a_terminal_that_goes_away_is_noticed():
+    own, other = os.openpty()
+    link = Link(os.ttyname(other), timeout_s=0.5)
+    link.open()
+    os.close(other)
+    os.close(own)
+    with pytest.raises(LinkLost):
+        link.sync()
+    assert not link.is_open
+
+
+def test_without_pyserial_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(
+        DeviceError, match=r"needs pyserial, which is missing; run pip install 'touch-retrieval\[gripper\]'"
+    ):
+        Link("loop://").open()
