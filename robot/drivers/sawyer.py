@@ -36,7 +36,8 @@ _MOST_LAG_RAD = 0.35
 """An arm this far behind its commands is blocked; half a second of lag at 0.5 rad/s is 0.25."""
 _MOST_TURN_RAD = 0.5
 """Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
-_STILL_RAD, _STILL_TICKS, _STILL_S = 1e-3, 5, 2.0
+_STILL_RAD, _STILL_S, _STOP_S = 1e-3, 0.1, 2.0
+"""An arm stands when no joint has moved by more in so long; one that was told to hold must stand after _STOP_S."""
 _BACK_OFF_S = 0.25
 
 
@@ -183,6 +184,7 @@ class Sawyer(Arm):
         try:
             self._link.check()
             self._fresh_joints()
+            self._robot_state()
         except DeviceError as error:
             _LOG.warning("%s: %s; connecting again", self.name, error)
             self._rejoin()
@@ -265,16 +267,32 @@ class Sawyer(Arm):
             at, last = at + min(now - last, 2 * self._tick_s), now
 
     def _settle(self, goal: Joints, began: float) -> None:
-        """Wait until every joint is within `arrival_rad`. Raises DeviceError after `settle_s`."""
+        """Wait until every joint is within `arrival_rad` and stands. Raises DeviceError for one that does not arrive
+        in `settle_s`; one that trembles where it should be is let be."""
         deadline = self.clock() + self._settle_s
-        while (off := float(np.abs(self._watch(goal, began) - goal).max())) > self._arrival_rad:
-            if self.clock() > deadline:
+        while True:
+            off = float(np.abs(self._watch(goal, began) - goal).max())
+            late = self.clock() > deadline
+            if off <= self._arrival_rad and (late or self._stands(began)):
+                return
+            if late:
                 raise DeviceError(
                     f"{self.name}: every joint must come within {self._arrival_rad:g} rad of its goal, after "
                     f"{self._settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
                 )
             self._command(goal)
             time.sleep(self._tick_s)
+
+    def _stands(self, since_s: float) -> bool:
+        """Whether the joint states of the last _STILL_S, none from before `since_s`, are of an arm that stands."""
+        now = self.clock()
+        recent = [
+            joints
+            for arrival in self._link.history(messages.JOINT_STATES[0])
+            if arrival.time_s >= max(since_s, now - _STILL_S)
+            and (joints := messages.joints_of(arrival.message)) is not None
+        ]
+        return now - since_s >= _STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < _STILL_RAD
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
         """The joints now. Raises DeviceError where anything says that the arm must not go on."""
@@ -293,16 +311,13 @@ class Sawyer(Arm):
     def _stop(self) -> None:
         """Hold the joints where they are now and wait until they stand."""
         self._link.check()
-        hold = last = self._fresh_joints()
-        still, deadline = 0, self.clock() + _STILL_S
-        while still < _STILL_TICKS:
-            if self.clock() > deadline:
+        hold, began = self._fresh_joints(), self.clock()
+        while not self._stands(began):
+            if self.clock() - began > _STOP_S:
                 raise DeviceError(f"{self.name}: the arm was told to hold and still moves; press the emergency stop")
+            self._fresh_joints()
             self._command(hold)
             time.sleep(self._tick_s)
-            joints = self._fresh_joints()
-            still = still + 1 if float(np.abs(joints - last).max()) < _STILL_RAD else 0
-            last = joints
 
     def _command(self, joints: Joints) -> None:
         self._link.publish(messages.JOINT_COMMAND[0], messages.joint_command(joints))
