@@ -3,6 +3,9 @@
 import contextlib
 import logging
 import math
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -461,6 +464,48 @@ def test_ctrl_c_leaves_the_arm_standing():
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
         wait_until(lambda: stands(emulator))
         assert offset(arm.pose(), FAR)[0] > 50
+
+
+PROGRAM = """
+from robot.drivers.sawyer import Sawyer
+from robot.readings import Box, Pose
+box = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
+with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
+    arm.move_to(Pose(0.0, 0.0, 260.0, 0.0), 20.0)
+"""
+
+
+def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
+    emulator = Emulator()
+    with serve(emulator) as url:
+        code = PROGRAM.replace("PORT", url.rpartition(":")[2])
+        with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as process:
+            try:
+                wait_until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 30.0)
+                process.send_signal(signal.SIGINT)
+                errors = process.communicate(timeout=30)[1]
+            finally:
+                process.kill()
+        assert "KeyboardInterrupt" in errors
+        assert "and while" not in errors
+        assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
+        wait_until(lambda: stands(emulator))
+
+
+def test_closing_from_another_thread_ends_a_motion():
+    with connected() as (emulator, arm):
+        with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is gone"):
+            arm.move_to(FAR, 20.0)
+        wait_until(lambda: stands(emulator))
+        assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.05
+        assert not arm.is_connected
+
+
+def test_closing_an_arm_that_nobody_moves_sends_it_nothing():
+    with connected() as (emulator, _):
+        pass
+    assert not emulator.commands
 
 
 def test_the_robots_kinematics_is_asked_again_with_another_seed_and_not_for_ever():

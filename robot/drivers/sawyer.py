@@ -107,6 +107,7 @@ class Sawyer(Arm):
         self._arrival_rad, self._settle_s = arrival_rad, settle_s
         self._command_timeout_s, self._timeout_s = command_timeout_s, timeout_s
         self._ik_retries, self._reconnect_tries = ik_retries, reconnect_tries
+        self._under_way = False
         self._link = self._new_link()
 
     def _new_link(self) -> RosbridgeLink:
@@ -156,9 +157,11 @@ class Sawyer(Arm):
         self._check_free()
 
     def _close(self) -> None:
+        """Hold the arm where another thread still moves it; one that nobody moves from here is left alone."""
         try:
-            with contextlib.suppress(DeviceError):
-                self._command(self._fresh_joints())
+            if self._under_way:
+                with contextlib.suppress(DeviceError):
+                    self._command(self._fresh_joints())
         finally:
             self._link.close()
 
@@ -222,8 +225,12 @@ class Sawyer(Arm):
         poses = way_points(self._pose(), pose)
         joints = self._solve(poses, start)
         schedule = Schedule.of(poses, joints, speed_mm_s, self._joint_speed_rad_s, self._ramp_s)
-        self._follow(schedule, began)
-        self._settle(joints[-1], began)
+        self._under_way = True
+        try:
+            self._follow(schedule, began)
+            self._settle(joints[-1], began)
+        finally:
+            self._under_way = False
         return self._pose_since(self.clock())
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
