@@ -186,9 +186,10 @@ def test_a_frozen_stream_is_an_error_although_the_age_of_its_pictures_looks_well
 
 
 def test_a_frozen_stream_stays_frozen_when_it_is_opened_again_until_its_picture_changes(script, make):
-    script.show(0.0, 3.0, picture=7)
+    script.show(0.0, picture=7)
     reader = make()
     reader.start()
+    script.show(3.0, picture=7)
     until(lambda: script.opened == 2)
     script.show(3.1, picture=7)
     until(lambda: script.opened == 3)

@@ -17,7 +17,7 @@ import numpy as np
 
 from robot.devices import TactileSensor, read_together
 from robot.drivers.opencv_tactile import OpencvTactile
-from robot.drivers.rectify import Rectifier
+from robot.drivers.rectify import Rectifier, in_rgb
 from robot.drivers.replay import VideoSensor
 from tests.benchmarks.common import Line, duration
 from tests.fake_video import FakeCamera
@@ -67,9 +67,8 @@ def _rate(fps: float, seconds: float) -> Line:
         rate = (gel.frames_seen - before) / (time.monotonic() - start)
     median, late = float(np.median(ages)), float(np.quantile(ages, 0.99))
     text = f"{rate:.1f} of {fps:g} pictures a second; read at an age of {duration(median)}, .99: {duration(late)}"
-    return Line(
-        "cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, {"per_s": rate, "age_s": median, "age_99_s": late}
-    )
+    figures = {"per_s": rate, "age_s": median, "age_99_s": late}
+    return Line("cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, figures)
 
 
 def _skew(way: str, keep: int, seconds: float) -> Line:
@@ -133,7 +132,7 @@ def _seconds(way: Rectifier, picture: np.ndarray) -> float:
     best = math.inf
     for _ in range(10):
         start = time.perf_counter()
-        way.apply(np.ascontiguousarray(picture[..., ::-1]))
+        in_rgb(way.apply(picture))
         best = min(best, time.perf_counter() - start)
     return best
 
