@@ -96,7 +96,7 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
 ):
     from tests.fake_rig import FakeGripper, FakeRig
 
-    rigs, real_init, real_grasp = [], FakeRig.__init__, FakeGripper._grasp
+    rigs, real_prepare, real_grasp = [], FakeRig.prepare, FakeGripper._grasp
 
     def ended(self, force_n, speed_mm_s):
         state = real_grasp(self, force_n, speed_mm_s)
@@ -105,11 +105,12 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
         return state
 
     monkeypatch.setattr(FakeGripper, "_grasp", ended)
-    monkeypatch.setattr(FakeRig, "__init__", lambda self, *a, **k: (rigs.append(self), real_init(self, *a, **k))[1])
+    monkeypatch.setattr(FakeRig, "prepare", lambda self, *which: (rigs.append(self), real_prepare(self, *which))[1])
     before = signal.getsignal(signal.SIGTERM)
     assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 1
     assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
     assert signal.getsignal(signal.SIGTERM) is before
     assert rigs[0].world.force is None
     assert not any(device.is_connected for device in rigs[0].devices)
+    monkeypatch.setattr(FakeGripper, "_grasp", real_grasp)
     assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 0

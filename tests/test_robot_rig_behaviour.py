@@ -1,30 +1,42 @@
 """What every rig does, whatever it is made of: one suite over a table of rigs. A driver's rig is a row here."""
 
+import contextlib
 import dataclasses
 import math
 
 import numpy as np
 import pytest
 
+from robot.devices import read_together
 from robot.errors import DeviceError
 from robot.readings import STATUSES, Pose
 from robot.rig import Rig, load_rig
+from tests.emulated_rig import emulated_rig
 from tests.fake_rig import FakeRig
+from tests.replay_rig import replay_rig
 
-RIGS = {"fake": lambda: FakeRig(5), "sim": lambda: load_rig("sim", seed=5)}
-
-
-@pytest.fixture(params=sorted(RIGS))
-def rig(request):
-    """A connected rig with its first object on the table."""
-    with RIGS[request.param]() as rig:
-        rig.prepare(rig.object_ids(1)[0], 0)
-        yield rig
+RIGS = {
+    "fake": lambda: contextlib.nullcontext(FakeRig(5)),
+    "sim": lambda: contextlib.nullcontext(load_rig("sim", seed=5)),
+    "emulated, tcp": lambda: emulated_rig(5, port="tcp"),
+    "emulated, pty": lambda: emulated_rig(5, port="pty"),
+    "replayed": replay_rig,
+}
+"""Rigs by name, each a context in which its devices are there."""
 
 
 @pytest.fixture(params=sorted(RIGS))
 def unconnected(request):
-    return RIGS[request.param]()
+    with RIGS[request.param]() as rig:
+        yield rig
+
+
+@pytest.fixture
+def rig(unconnected):
+    """A connected rig with its first object on the table."""
+    with unconnected as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        yield rig
 
 
 def middle(rig, share=0.5):
@@ -63,6 +75,72 @@ def test_no_device_works_before_it_is_connected(unconnected: Rig):
     for use in uses:
         with pytest.raises(DeviceError, match="must be connected"):
             use()
+
+
+def test_where_the_last_device_does_not_connect_none_stays_connected(unconnected: Rig, monkeypatch):
+    def missing(self):
+        raise OSError(19, "No such device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(unconnected.camera), "_connect", missing)
+        with pytest.raises(DeviceError, match="cannot be connected: No such device"):
+            unconnected.connect()
+        assert not any(device.is_connected for device in unconnected.devices)
+    with unconnected:
+        assert all(device.is_connected for device in unconnected.devices)
+
+
+def test_what_was_closed_cannot_be_used(unconnected: Rig):
+    with unconnected:
+        pass
+    for use in (unconnected.arm.pose, unconnected.gripper.state, unconnected.gripper.stop, unconnected.camera.read):
+        with pytest.raises(DeviceError, match="must be connected"):
+            use()
+
+
+def test_a_stale_frame_is_refused(rig: Rig, monkeypatch):
+    for device in (*rig.sensors.values(), rig.camera):
+        real = device._read
+        old = lambda *given, real=real: dataclasses.replace(real(*given), time_s=rig.clock() - 5.0)  # noqa: E731
+        monkeypatch.setattr(device, "_read", old)
+        with pytest.raises(DeviceError, match=r"must be at most 0\.5 s old, it is 5"):
+            device.read()
+
+
+def test_stopping_what_stands_and_recovering_what_works_changes_nothing(rig: Rig):
+    rig.arm.move_to(middle(rig), 100.0)
+    before = rig.gripper.open(40.0)
+    rig.gripper.stop()
+    rig.recover()
+    after = rig.gripper.state()
+    assert after.opening_mm == pytest.approx(before.opening_mm, abs=0.5)
+    assert after.status == "idle"
+    rig.arm.stop()
+    rig.arm.move_to(middle(rig), 100.0)
+    assert math.dist(rig.arm.pose().as_tuple(), middle(rig).as_tuple()) < 1.0
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, DeviceError])
+def test_what_fails_while_it_closes_leaves_jaws_that_stand_and_can_be_opened(rig: Rig, monkeypatch, error):
+    def failing(*_):
+        raise error("in the middle")
+
+    stopped, real = [], rig.gripper._stop
+    with monkeypatch.context() as patched:
+        patched.setattr(rig.gripper, "_grasp", failing)
+        patched.setattr(rig.gripper, "_stop", lambda: stopped.append(real()))
+        with pytest.raises(error, match="in the middle"):
+            rig.gripper.grasp(rig.gripper.min_force_n)
+    assert len(stopped) == 1
+    first = rig.gripper.state().opening_mm
+    assert rig.gripper.state().opening_mm == pytest.approx(first, abs=0.5)
+    assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
+
+
+def test_fingers_are_seen_at_once(rig: Rig):
+    frames, skew_s = read_together(rig.sensors)
+    assert set(frames) == set(rig.sensors)
+    assert 0 <= skew_s < 0.1
 
 
 def test_the_arm_goes_where_it_is_told_and_nowhere_else(rig: Rig):

@@ -1,0 +1,280 @@
+"""A rig of the real drivers over emulated devices, in one world: what the hand does, the gels and the camera see.
+
+    python -m tests.emulated_rig --grasps 500 --out faulty/       # with faults in 1 of 50 operations, counted
+
+The gripper's driver speaks to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to cameras of
+arithmetic through OpenCV's interface; arm and camera are drivers of their own, of this file. Faults can be had at every
+device, counted by kind.
+"""
+
+import argparse
+import contextlib
+import logging
+import math
+import time
+import zlib
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from retrieval.check import check_recording
+from robot.attempt_settings import AttemptSettings
+from robot.collect import CollectSettings, collect
+from robot.devices import Arm, Camera
+from robot.drivers import opencv_stream
+from robot.drivers.opencv_tactile import OpencvTactile
+from robot.drivers.wsg50 import WSG50
+from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
+from robot.errors import DeviceError
+from robot.readings import RGBD, Box, Intrinsics, Pose
+from robot.recording import read_recording
+from robot.rig import Rig
+from tests import views
+from tests.fake_video import FakeCamera
+
+WORKSPACE = Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
+LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
+HOLDING = 4
+SPEED_UP = 50.0
+FRAMES = 4
+"""Frames on the line for an operation of the gripper: command, pending, state, result. Each may meet a fault."""
+QUICK = AttemptSettings(settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4)
+SERVERS = {"tcp": serve_tcp, "pty": serve_pty}
+
+
+class World:
+    """What all devices share. rate: how often an operation of arm, camera or a gel's stream meets a fault."""
+
+    def __init__(self, seed, rate=0.0):
+        self.seed, self.rate = seed, rate
+        self.rng, self.counts = np.random.default_rng([7, seed]), Counter()
+        self.emulator = Emulator(speed_up=SPEED_UP, referenced=True)
+        self.line = Faults(rate / FRAMES, seed=seed)
+        self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
+
+    def fault(self, device, *kinds):
+        """The kind of fault that this operation of a device meets, or None."""
+        if not kinds or self.rng.uniform() >= self.rate:
+            return None
+        kind = str(self.rng.choice(kinds))
+        self.counts[f"{device}: {kind}"] += 1
+        return kind
+
+    @property
+    def all_counts(self):
+        """Faults so far, by device and kind."""
+        return dict(self.counts) | {f"gripper's line: {kind}": count for kind, count in self.line.counts.items()}
+
+    @property
+    def holding(self):
+        return self.emulator.grasping == HOLDING and self.emulator.object_mm is not None
+
+    def hand_at(self, pose):
+        """The hand has been moved, and with it what it holds; else the jaws now stand about what is there."""
+        lifted, self.pose = pose.z_mm > self.pose.z_mm + 1, pose
+        if not self.holding:
+            self.emulator.object_mm = self._chord(pose)
+        elif self.slips and lifted:
+            self.emulator.object_mm = None
+
+    def _chord(self, pose):
+        """Width of the cylinder between the fingers, None where they meet nothing."""
+        solid = self.solid
+        if solid is None or pose.z_mm > solid.height:
+            return None
+        across = -math.sin(pose.yaw_rad) * (solid.x - pose.x_mm) + math.cos(pose.yaw_rad) * (solid.y - pose.y_mm)
+        return 2 * math.sqrt(solid.radius**2 - across**2) if abs(across) < solid.radius else None
+
+
+class EmulatedArm(Arm):
+    """At its place at once, unless it fails."""
+
+    def __init__(self, world):
+        super().__init__("emulated arm", WORKSPACE)
+        self.world = world
+
+    def _connect(self): ...
+
+    def _close(self): ...
+
+    def _stop(self): ...
+
+    def _move_to(self, pose, speed_mm_s):
+        kind = self.world.fault("arm", "did not arrive", "link lost")
+        if kind == "link lost":
+            raise OSError(104, "Connection reset by peer")
+        if kind:
+            raise DeviceError("the emulated arm must arrive within 5 s, it is 40 mm off")
+        self.world.hand_at(pose)
+        return pose
+
+    def _pose(self):
+        return self.world.pose
+
+
+class EmulatedCamera(Camera):
+    """Sees the cylinder that stands on the table."""
+
+    def __init__(self, world):
+        super().__init__("emulated camera", views.camera_pose())
+        self.world = world
+
+    def _connect(self): ...
+
+    def _close(self): ...
+
+    def _read(self, depth):
+        kind = self.world.fault("camera", "unplugged", "stale", "blind")
+        if kind == "unplugged":
+            raise OSError(19, "No such device")
+        world = self.world
+        image = views.view(*([world.solid] if world.solid else []), seed=world.noise, lens=LENS, px=PX)
+        depth_m = np.full(PX, np.nan, np.float32) if kind == "blind" else image.depth_m
+        return RGBD(image.colour, depth_m if depth else None, LENS, time.monotonic() - 5 * (kind == "stale"))
+
+
+class EmulatedGel(FakeCamera):
+    """A gel with a blob where it touches. A trouble lasts a while from when it begins."""
+
+    LASTS_S = 0.3
+
+    def __init__(self, world, finger):
+        self.world, self.finger, self._trouble = world, finger, (None, 0.0)
+        super().__init__(fps=100.0, size=(32, 24), phase_s=0.003 * (finger == "b"))
+        self.rng = np.random.default_rng([8, world.seed, ord(finger)])
+
+    def begin_trouble(self):
+        """Now and then; called once an attempt for its three pictures."""
+        for _ in range(3):
+            if kind := self.world.fault(f"gel {self.finger}", "unplugged", "frozen", "damaged"):
+                self._trouble = (kind, time.monotonic() + self.LASTS_S)
+
+    def _has(self, kind):
+        return self._trouble[0] == kind and time.monotonic() < self._trouble[1]
+
+    dead = property(lambda self: self._has("unplugged"), lambda self, value: None)
+    frozen = property(lambda self: self._has("frozen"), lambda self, value: None)
+    damaged = property(lambda self: int(self._has("damaged")), lambda self, value: None)
+
+    def picture(self, number):
+        if self.frozen and self._last is not None:
+            return self._last
+        image = np.full((24, 32, 3), 90.0) + self.rng.normal(0, 2, (24, 32, 3))
+        if self.world.holding:
+            size = 2 + int(self.world.emulator.force_limit_n / 8)
+            image[max(0, 12 - size) : 12 + size, max(0, 16 - size) : 16 + size] += [20, -40, 60]
+        self._last = np.clip(image, 0, 255).astype(np.uint8)
+        return self._last
+
+    _last = None
+
+
+class EmulatedRig(Rig):
+    """The rig. Objects are cylinders by name, placed at random for each attempt; now and then one slips."""
+
+    def __init__(self, url, world, gels, **gripper):
+        self.world, self.gels, self.closed_unasked = world, gels, 0
+        quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
+        super().__init__(
+            EmulatedArm(world),
+            WSG50(port=url, **quick | gripper),
+            {
+                finger: OpencvTactile(finger=finger, device=gel_path(finger), warmup_s=0.0, timeout_s=1.0, frozen_s=0.2)
+                for finger in gels
+            },
+            EmulatedCamera(world),
+            info={"source": "emulated rig", "sensor": "emulated gel"},
+            attempt=QUICK,
+        )
+
+    def prepare(self, object_id, number):
+        world, name = self.world, zlib.crc32(object_id.encode())
+        rng = np.random.default_rng([2, world.seed, name, number])
+        radius, height = np.random.default_rng([1, name]).uniform((18, 60), (40, 140))
+        x, y = rng.uniform(-20, 20, 2)
+        self.closed_unasked += world.emulator.is_closing  # what was before has failed or ended
+        world.solid = views.Upright(float(radius), float(height), float(x), float(y))
+        world.slips, world.noise = bool(rng.uniform() < 0.1), int(rng.integers(2**31))
+        world.hand_at(world.pose)
+        for gel in self.gels.values():
+            gel.begin_trouble()
+
+
+def gel_path(finger):
+    """What stands for a stable name of the finger's camera."""
+    return f"/dev/v4l/by-id/usb-Emulated_Gel_{finger}-video-index0"
+
+
+@contextlib.contextmanager
+def emulated_rig(seed=0, *, port="tcp", rate=0.0, **gripper):
+    """An EmulatedRig, not connected, whose devices are there as long as this is open."""
+    world = World(seed, rate)
+    gels = {finger: EmulatedGel(world, finger) for finger in "ab"}
+    by_path = {gel_path(finger): gel for finger, gel in gels.items()}
+    with (
+        SERVERS[port](world.emulator, world.line) as url,
+        patch.object(opencv_stream, "open_capture", lambda device: by_path[device].open(device)),
+    ):
+        yield EmulatedRig(url, world, gels, **gripper)
+
+
+@dataclass
+class Outcome:
+    """What came of a collection among faults."""
+
+    grasps: int
+    attempts: int
+    stops: list[str]
+    faults: dict[str, int]
+    left_closing: int
+
+    def lines(self):
+        yield f"{self.grasps} whole grasps of {self.attempts} attempts; stopped {len(self.stops)} times"
+        yield from (f"  stopped: {reason}" for reason in self.stops)
+        yield f"jaws left closing: {self.left_closing} times"
+        yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
+
+
+def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=5, progress=None):
+    """Collect `grasps` accepted ones with faults at every device; begun again, as a person would, where it stops."""
+    stops, left_closing, faults = [], 0, Counter()
+    names = [f"can-{number}" for number in range(objects)]
+    while True:
+        with emulated_rig(seed + len(stops), port=port, rate=rate) as rig:
+            try:
+                wanted = CollectSettings(grasps // objects)
+                tallies = collect(lambda: rig, out, objects=names, seed=seed, settings=wanted, progress=progress)
+                return Outcome(
+                    sum(tally.accepted for tally in tallies),
+                    sum(tally.attempts for tally in tallies),
+                    stops,
+                    dict(faults + Counter(rig.world.all_counts)),
+                    left_closing + rig.closed_unasked + rig.world.emulator.is_closing,
+                )
+            except DeviceError as error:
+                stops.append(str(error))
+                left_closing += rig.closed_unasked + rig.world.emulator.is_closing
+                faults += Counter(rig.world.all_counts)
+
+
+def main():
+    """Print what was collected and every fault by kind; the recording is read again whole."""
+    parser = argparse.ArgumentParser(prog="python -m tests.emulated_rig", description=main.__doc__)
+    parser.add_argument("--grasps", type=int, default=500)
+    parser.add_argument("--rate", type=float, default=0.02, help="share of operations that meet a fault")
+    parser.add_argument("--port", choices=sorted(SERVERS), default="tcp")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="recording folder")
+    given = parser.parse_args()
+    logging.disable(logging.WARNING)  # one for each fault
+    found = collect_among_faults(given.out, given.grasps, rate=given.rate, seed=given.seed, port=given.port)
+    print("\n".join(found.lines()))
+    broken = [finding.message for finding in check_recording(given.out) if finding.severity == "error"]
+    print(f"{len(read_recording(given.out).grasps)} grasps in {given.out}, {len(broken)} errors found in them")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""A rig from a file: a person's arm, an emulated gripper, recorded gels and recorded depth; nobody needs to be there.
+
+Its pictures are those of a recording that the arithmetic rig of tests/fake_rig.py makes once.
+"""
+
+import contextlib
+import shutil
+import tempfile
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from robot import hand_eye
+from robot.collect import CollectSettings, collect
+from robot.drivers.wsg50_emulator import Emulator, serve_tcp
+from robot.recording import read_recording
+from robot.rig import load_rig
+from tests import views
+from tests.fake_rig import LENS, FakeRig
+
+FILE = """
+rig = "real"
+source = "replayed"
+sensor = "fake gel"
+
+[limits]
+workspace_lower_mm = [-150, -150, 8]
+workspace_upper_mm = [150, 150, 500]
+arm_speed_mm_s = 1000
+jaw_speed_mm_s = 400
+
+[arm]
+driver = "manual"
+
+[gripper]
+driver = "wsg50"
+port = "{port}"
+
+[sensors.a]
+driver = "images"
+path = "{folder}/a"
+
+[sensors.b]
+driver = "images"
+path = "{folder}/b"
+
+[camera]
+driver = "replay"
+path = "{folder}/recording"
+hand_eye = "{folder}/hand_eye.json"
+fx = {lens.fx}
+fy = {lens.fy}
+cx = {lens.cx}
+cy = {lens.cy}
+
+[attempt]
+settle_s = 0.1
+hold_s = 0.1
+"""
+
+
+@contextlib.contextmanager
+def replay_rig(emulator=None):
+    """The rig, not connected; whoever is asked to do something has done it."""
+    emulator = emulator or Emulator(speed_up=50.0, referenced=True)
+    with (
+        tempfile.TemporaryDirectory() as name,
+        serve_tcp(emulator) as url,
+        patch("robot.rig.input", lambda: "", create=True),
+    ):
+        folder = Path(name)
+        record(folder)
+        (folder / "rig.toml").write_text(FILE.format(port=url, folder=folder, lens=LENS))
+        yield load_rig(str(folder / "rig.toml"), seed=0)
+
+
+def record(folder):
+    """A recording, its gels' pictures as folders of their own, and a calibration that tells where its camera stood."""
+    wanted = CollectSettings(grasps=2)
+    collect(lambda: FakeRig(5), folder / "recording", objects=["round-0", "round-1"], seed=5, settings=wanted)
+    for finger in "ab":
+        (folder / finger).mkdir()
+        for grasp in read_recording(folder / "recording").grasps:
+            for moment in (grasp.touches_before, grasp.touches, grasp.touches_after):
+                shutil.copy(folder / "recording" / moment[finger], folder / finger)
+    camera = np.random.default_rng(1).uniform((-200, -200, 700), (200, 200, 1100), (8, 3))
+    matrix = views.camera_pose()
+    hand_eye.fit_hand_eye(camera, camera @ matrix[:3, :3].T + matrix[:3, 3]).save(folder / "hand_eye.json")
