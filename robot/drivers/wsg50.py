@@ -142,12 +142,15 @@ class WSG50(Gripper):
                 raise
 
     def _stop(self) -> None:
-        try:
-            self._motions.stop()
-        except LinkLost:
+        for left in reversed(range(self._wanted.reconnect_tries)):
+            try:
+                self._motions.stop()
+                return
+            except LinkLost:
+                if not left:
+                    raise
             _log.warning("%s: the line was lost while it may have moved: opening it again to stop it", self.name)
-            self._link.open()
-            self._motions.stop()
+            self._setup.open_again()
 
     def _state(self) -> GripperState:
         return self._as_state(read(self._link))
@@ -187,17 +190,12 @@ class WSG50(Gripper):
     def set_acceleration(self, acceleration_mm_s2: float) -> float:
         """Set the acceleration; returns what the gripper has then (mm/s^2). Raises DeviceError."""
         with self._use("cannot set its acceleration"):
-            limits = self._setup.limits
-            low, high = limits.min_acceleration_mm_s2, limits.max_acceleration_mm_s2
-            self._check("acceleration", acceleration_mm_s2, low, high, "mm/s^2")
             self._setup.check_stands()
             return self._setup.set_acceleration(acceleration_mm_s2)
 
     def set_soft_limits(self, least_mm: float, greatest_mm: float) -> tuple[float, float] | None:
         """Set the openings that no motion leaves; returns what the gripper has then. Raises DeviceError."""
         with self._use("cannot set its soft limits"):
-            stroke = self._setup.limits.stroke_mm
-            self._check("the greatest opening", greatest_mm, 0.0, stroke, "mm")
             self._check("the least opening", least_mm, 0.0, greatest_mm, "mm")
             self._setup.check_stands()
             has = self._setup.set_soft_limits((least_mm, greatest_mm))

@@ -13,6 +13,7 @@ from robot.drivers.wsg50_commands import Command, Limits, Status, SystemState
 from robot.drivers.wsg50_force import of_gripper, on_finger
 from robot.drivers.wsg50_link import CommandFailed, Link
 from robot.drivers.wsg50_motion import Motions, Reading, causes, read
+from robot.drivers.wsg50_port import LinkLost
 from robot.errors import DeviceError, RobotConfigError
 
 _log = logging.getLogger(__name__)
@@ -117,6 +118,13 @@ class Setup:
             time.sleep(wait_s)
             wait_s *= 2
 
+    def open_again(self) -> None:
+        """Open the port, or wait a little where it cannot be opened."""
+        try:
+            self.link.open()
+        except LinkLost:
+            time.sleep(self.settings.reconnect_s)
+
     def home(self) -> Reading:
         """Find the reference."""
         frame = commands.home(_DIRECTIONS[self.settings.home_direction])
@@ -150,6 +158,8 @@ class Setup:
 
     def set_acceleration(self, acceleration_mm_s2: float) -> float:
         """Set the acceleration; returns what the gripper has then."""
+        least, most = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
+        self._require("acceleration_mm_s2", acceleration_mm_s2, least, most)
         self.link.tell(commands.set_acceleration(acceleration_mm_s2))
         has = self.link.ask(commands.ask(Command.GET_ACCELERATION), commands.number)
         self._note("acceleration_mm_s2", acceleration_mm_s2, has)
@@ -157,6 +167,8 @@ class Setup:
 
     def set_soft_limits(self, asked: Sequence[float]) -> tuple[float, float] | None:
         """Set the openings that no motion leaves, or clear them where `asked` is empty; returns what it has then."""
+        for each in asked:
+            self._require("soft_limits_mm", each, 0.0, self.limits.stroke_mm)
         self.link.tell(commands.set_soft_limits(*asked) if asked else commands.ask(Command.CLEAR_SOFT_LIMITS))
         return self._learn_openings(asked)
 
@@ -237,6 +249,10 @@ class Setup:
         least, greatest = has or (0.0, self.limits.stroke_mm)
         self.openings = max(0.0, least), min(greatest, self.limits.stroke_mm)
         return has
+
+    def _require(self, name: str, value: float, least: float, most: float) -> None:
+        if not least <= value <= most:
+            raise DeviceError(f"{self.name}: {name} must be from {least:g} to {most:g}, got {value:g}")
 
     def _note(self, name: str, asked: float, has: float) -> None:
         self.refused.pop(name, None)
