@@ -542,6 +542,17 @@ def test_answers_that_never_come_end_in_time(kind):
             call(messages.IK_SERVICE, messages.ik_request({}, "right_hand", None))
 
 
+def test_an_arm_that_stands_outside_the_workspace_is_not_moved_from_here():
+    """Within 20 mm of it, as after a stop, it is."""
+    with connected(base_xyz_mm=[500.0, 0.0, -20.0]) as (emulator, arm):
+        with pytest.raises(DeviceError, match=r"must be in the workspace .*first, but is at .* bring it there by hand"):
+            arm.move_to(Pose(0.0, 0.0, 30.0, 0.0), 100.0)
+        assert stands(emulator)
+    with connected(base_xyz_mm=[500.0, 0.0, -60.0]) as (_, arm):
+        assert arm.pose().z_mm == pytest.approx(-10.0, abs=0.5)
+        arm.move_to(Pose(0.0, 0.0, 5.0, 0.0), 100.0)
+
+
 def test_an_arm_held_by_somebody_is_not_pushed_on():
     class Held(SawyerModel):
         def command(self, target):

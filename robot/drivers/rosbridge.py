@@ -18,7 +18,7 @@ import socket
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -58,6 +58,13 @@ def decode(text: str | bytes) -> Message | None:
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
+
+
+def rate_of(arrivals: Sequence[Arrival]) -> float | None:
+    """Messages a second; None for fewer than two."""
+    if len(arrivals) < 2 or arrivals[-1].time_s <= arrivals[0].time_s:
+        return None
+    return round((len(arrivals) - 1) / (arrivals[-1].time_s - arrivals[0].time_s), 1)
 
 
 class RosbridgeLink:
@@ -113,7 +120,8 @@ class RosbridgeLink:
     def close(self) -> None:
         """Close; does nothing where it is closed."""
         self._lose("it was closed")
-        self._held.close()
+        with contextlib.suppress(Exception):  # closed it is, whatever the goodbye met
+            self._held.close()
         if self._reader is not None:
             self._reader.join(self.timeout_s)
 

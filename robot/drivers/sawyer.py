@@ -22,7 +22,8 @@ import numpy as np
 
 from robot.devices import Arm, Clock
 from robot.drivers import sawyer_messages as messages
-from robot.drivers.rosbridge import Arrival, RosbridgeLink
+from robot.drivers import straight_line
+from robot.drivers.rosbridge import RosbridgeLink, rate_of
 from robot.drivers.sawyer_messages import Joints, Mount
 from robot.drivers.straight_line import Schedule, way_points
 from robot.errors import DeviceError, RobotConfigError
@@ -39,6 +40,8 @@ _MOST_TURN_RAD = 0.5
 _STILL_RAD, _STILL_S, _STOP_S = 1e-3, 0.1, 2.0
 """An arm stands when no joint has moved by more in so long; one that was told to hold must stand after _STOP_S."""
 _BACK_OFF_S = 0.25
+_MARGIN_MM = 20.0
+"""So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
 
 
 class Sawyer(Arm):
@@ -46,8 +49,8 @@ class Sawyer(Arm):
 
     base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: from the origin of `tip` along its z
     axis to the point between the fingertips; tool_yaw_deg: from the tip's x axis about z to where finger a closes to.
-    enable: whether the motors may be enabled from here (never after an emergency stop). max_state_age_s: joint states
-    older than this stop the arm.
+    enable: whether the motors may be enabled from here (never while an emergency stop holds). max_state_age_s: joint
+    states older than this stop the arm.
     """
 
     def __init__(
@@ -124,7 +127,6 @@ class Sawyer(Arm):
         for topic, kind in (*_READ, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
         self._link.advertise(*messages.JOINT_COMMAND)
-        self._link.advertise(*messages.ENABLE)
         for topic, _ in (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES):
             self._link.wait_for(topic)
         self._set("speed_ratio", messages.SPEED_RATIO, self._speed_ratio)
@@ -150,6 +152,7 @@ class Sawyer(Arm):
         state = self._robot_state()
         if self._enable and not (state.enabled or state.stopped or state.error):
             _LOG.warning("%s: the motors are being enabled", self.name)
+            self._link.advertise(*messages.ENABLE)
             self._link.publish(messages.ENABLE[0], {"data": True})
             deadline = self.clock() + self._timeout_s
             while not self._robot_state().enabled and self.clock() < deadline:
@@ -175,7 +178,7 @@ class Sawyer(Arm):
             "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
             "enabled": state.enabled,
             "stopped": state.stopped,
-            "joint_states_hz": _rate(arrivals),
+            "joint_states_hz": rate_of(arrivals),
         }
 
     def _read_back(self, topic: tuple[str, str]) -> float | None:
@@ -222,7 +225,7 @@ class Sawyer(Arm):
         if self._collided_since(began, newest=True):
             raise self._collision()
         start = self._fresh_joints()
-        poses = way_points(self._pose(), pose)
+        poses = way_points(self._inside(self._pose()), pose)
         joints = self._solve(poses, start)
         schedule = Schedule.of(poses, joints, speed_mm_s, self._joint_speed_rad_s, self._ramp_s)
         self._under_way = True
@@ -232,6 +235,15 @@ class Sawyer(Arm):
         finally:
             self._under_way = False
         return self._pose_since(self.clock())
+
+    def _inside(self, pose: Pose) -> Pose:
+        """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
+        if not straight_line.is_near(self.workspace, pose, _MARGIN_MM):
+            raise DeviceError(
+                f"{self.name}: the hand must be in the workspace {self.workspace.lower} to {self.workspace.upper} first, "
+                f"but is at {pose}; bring it there by hand, or check base_xyz_mm and tool_mm"
+            )
+        return pose
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
         """Joint angles (N, 7) of way-points, the first of them where the arm is."""
@@ -376,13 +388,6 @@ class Sawyer(Arm):
             f"{self.name}: the robot reports a collision, the arm holds: look what it touches and free it by hand "
             "before you go on"
         )
-
-
-def _rate(arrivals: Sequence[Arrival]) -> float | None:
-    """Messages a second."""
-    if len(arrivals) < 2 or arrivals[-1].time_s <= arrivals[0].time_s:
-        return None
-    return round((len(arrivals) - 1) / (arrivals[-1].time_s - arrivals[0].time_s), 1)
 
 
 def _require(name: str, value: float, low: float, high: float) -> None:
