@@ -239,9 +239,9 @@ class Sawyer(Arm):
     def _inside(self, pose: Pose) -> Pose:
         """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
         if not straight_line.is_near(self.workspace, pose, _MARGIN_MM):
+            lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(
-                f"{self.name}: the hand must be in the workspace {self.workspace.lower} to {self.workspace.upper} first, "
-                f"but is at {pose}; bring it there by hand, or check base_xyz_mm and tool_mm"
+                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; bring it there by hand, or check base_xyz_mm and tool_mm"
             )
         return pose
 
