@@ -309,6 +309,30 @@ def test_a_state_that_does_not_come_stops_the_motion(port):
         assert not slow.moves
 
 
+def test_a_program_that_was_held_up_is_no_silent_gripper(monkeypatch):
+    slow = Emulator(referenced=True, object_mm=40.0)
+    with bench(emulator=slow, max_state_age_s=0.1) as (gripper, _):
+        poll, waits = gripper._link.poll, [0.3]
+
+        def held_up(command, seconds):
+            status = poll(command, seconds)
+            time.sleep(waits.pop() if waits else 0)
+            return status
+
+        monkeypatch.setattr(gripper._link, "poll", held_up)
+        assert gripper.grasp(10.0, 100.0).status == "holding"
+
+
+def test_a_fault_in_the_middle_of_a_motion_is_named():
+    slow = Emulator(referenced=True, opening_mm=100.0)
+    with bench(emulator=slow) as (gripper, _):
+        thread = threading.Thread(target=lambda: (until(lambda: slow.moves), slow.fail("current")))
+        thread.start()
+        with pytest.raises(DeviceError, match=r"answered CMD_ABORTED to GRASP .* current fault"):
+            gripper.grasp(10.0, 10.0)
+        thread.join()
+
+
 def test_a_motion_that_never_ends_is_stopped(monkeypatch):
     monkeypatch.setattr(wsg50, "_SLACK_S", 0.0)
     with bench() as (gripper, emulator):

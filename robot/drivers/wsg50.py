@@ -41,7 +41,9 @@ _WORDS: dict[GraspingState, Word] = {
 _CLOSED_ON = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
 """States that only RELEASE leaves; GRASP is refused in them."""
 
-_REACHED_MM = 1.0
+_REACHED_MM, _SAME_MM = 1.0, 0.1
+"""A motion has arrived so near its target; nearer than the second it need not be begun."""
+
 _REGRIP_MM = 5.0
 """So far are the jaws opened to let go of what they hold before they grasp again."""
 
@@ -52,6 +54,7 @@ _SLACK_S = 2.0
 class WSG50(Gripper):
     """A WSG-50 at `port`: a path, or socket://192.168.1.20:1000. Forces are those on each finger (wsg50_force).
 
+    baud, stop_bits: of a serial line, as set in the gripper (the defaults are not verified). timeout_s: of an answer.
     home_direction: "default" as the gripper is configured, "out" or "in"; it is homed on connecting if it has lost its
     reference. acceleration_mm_s2: 0 leaves the gripper's own; soft_limits_mm: least and greatest opening, empty leaves
     its own. tare: the force-measuring fingers on connecting. acknowledge_faults: end a FAST STOP that is found, after
@@ -59,6 +62,9 @@ class WSG50(Gripper):
     held at less is the other finger, not a part. finger_share: see wsg50_force. update_ms: period of the state while
     it moves, which must not be older than max_state_age_s. reconnect_tries, reconnect_s: how often `recover` opens the
     port again, and the first wait (s), which doubles. max_force_n, max_speed_mm_s: ceilings.
+
+    `stop` lets go of what is held, since STOP ends the gripper's force control. For one thread: to stop it from
+    outside, interrupt that thread (Ctrl-C).
 
     Raises RobotConfigError for a setting out of range.
     """
@@ -160,7 +166,7 @@ class WSG50(Gripper):
         reading = self._ready()
         if reading.grasping in _CLOSED_ON:
             reading = self._release(max(opening_mm, self._further(reading)))
-        if abs(reading.opening_mm - opening_mm) > _REACHED_MM:
+        if abs(reading.opening_mm - opening_mm) > _SAME_MM:
             reading = self._move(opening_mm, closing=opening_mm < reading.opening_mm)
         return self._as_state(reading)
 

@@ -63,10 +63,9 @@ class Emulator:
         self._running: tuple[int, Callable[[], int | None]] | None = None
         self._updates: dict[int, list[float]] = {}
         self._last: dict[int, bytes] = {}
+        self._owed: list[Frame] = []
         self._announced = False
         self._now = clock()
-
-    # --- from outside -----------------------------------------------------------------------------------------------
 
     @property
     def object_mm(self) -> float | None:
@@ -106,8 +105,7 @@ class Emulator:
         """Raise a FAST STOP, with the flag of a fault of FAULT_BITS."""
         with self._lock:
             self._bits |= {_FAST_STOP} | ({FAULT_BITS[fault]} if fault else set())
-            self._bits.discard(_FORCE)
-            self._jaws.stand()
+            self._stand()
             self.grasping = ERROR
 
     def lose_reference(self) -> None:
@@ -127,27 +125,35 @@ class Emulator:
             self._updates.clear()
             if self.error_on_disconnect and not self._announced:
                 self.fail()
-                self._running = None
+            self._owed.clear()
 
     def receive(self, frame: Frame) -> list[Frame]:
         """Do a command; returns what it answers at once."""
         with self._lock:
             self._advance()
             self.heard.append(frame.id)
-            aborted = self._running
             answer = self._answer(frame.id, frame.payload)
-            said = [Frame(aborted[0], _status(ABORTED))] if aborted and not self._running else []
-            said.append(Frame(frame.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer))
-            return [] if self.silent else said
+            self._owed.append(Frame(frame.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer))
+            return self._say()
 
     def tick(self) -> list[Frame]:
         """Let time pass up to now; returns results of motions, and automatic updates."""
         with self._lock:
             self._advance()
-            said = [*self._ended(), *self._due()]
-            return [] if self.silent else said
+            self._owed += [*self._ended(), *self._due()]
+            return self._say()
 
-    # --- time -------------------------------------------------------------------------------------------------------
+    def _say(self) -> list[Frame]:
+        said, self._owed = self._owed, []
+        return [] if self.silent else said
+
+    def _stand(self) -> None:
+        """Stop dead; a motion that was running is answered as aborted."""
+        self._jaws.stand()
+        self._bits.discard(_FORCE)
+        if self._running:
+            self._owed.append(Frame(self._running[0], _status(ABORTED)))
+            self._running = None
 
     def _advance(self) -> None:
         now = self._clock()
@@ -175,8 +181,6 @@ class Emulator:
             if not only_changes or value != self._last.get(command):
                 yield Frame(command, _status(OK) + value)
             self._last[command] = value
-
-    # --- commands ---------------------------------------------------------------------------------------------------
 
     def _answer(self, command: int, payload: bytes) -> Answer:
         if command not in _ACTIONS and command not in UPDATES:
@@ -287,16 +291,13 @@ class Emulator:
         return FAILED
 
     def _stop(self, _: bytes) -> Answer:
-        self._jaws.stand()
-        self._running = None
+        self._stand()
         self._bits.add(_STOPPED)
-        self._bits.discard(_FORCE)
         self.grasping = self.grasping if self.grasping == ERROR else IDLE
         return OK
 
     def _fast_stop(self, _: bytes) -> Answer:
         self.fail()
-        self._running = None
         return OK
 
     def _acknowledge(self, payload: bytes) -> Answer:
@@ -341,7 +342,6 @@ class Emulator:
         """Changing parameters while it moves raises a FAST STOP."""
         if self._jaws.moves:
             self.fail()
-            self._running = None
             return DENIED
         return OK if in_range else RANGE
 

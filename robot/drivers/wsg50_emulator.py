@@ -222,12 +222,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     emulator = Emulator(object_mm=options.object_mm, speed_up=options.speed_up)
     faults = Faults(options.faults, seed=options.seed)
     serving = serve_pty(emulator, faults) if options.pty else serve_tcp(emulator, faults, port=options.tcp)
-    with serving as address:
-        print(address, flush=True)
-        try:
+    try:
+        with serving as address:
+            print(address, flush=True)
             threading.Event().wait()
-        except KeyboardInterrupt:
-            print(f"faults: {faults.counts}", file=sys.stderr)
+    except KeyboardInterrupt:
+        print(f"faults: {faults.counts}", file=sys.stderr)
 
 
 if __name__ == "__main__":

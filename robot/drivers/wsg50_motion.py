@@ -6,6 +6,7 @@ has said that it stands and has not done it. While it moves, its state comes by 
 does not, the motion is stopped.
 """
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from robot.drivers.wsg50_commands import Command, GraspingState, Status, SystemS
 from robot.drivers.wsg50_link import CommandFailed, Link, NoReply
 from robot.errors import DeviceError
 
+_log = logging.getLogger(__name__)
 _WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.SPEED, Command.FORCE)
 _MOVING = {GraspingState.GRASPING, GraspingState.RELEASING, GraspingState.POSITIONING}
 _FAULTS = (
@@ -114,6 +116,8 @@ class Motions:
 
     def _say_stop(self) -> None:
         for number, frame in enumerate(_STOPS, start=1):
+            if frame.id == Command.FAST_STOP:
+                _log.warning("the gripper does not answer STOP: telling it to FAST STOP")
             try:
                 self.link.urgent(frame)
                 return
@@ -148,7 +152,10 @@ class Motions:
 
     def _check_age(self, now: float) -> None:
         """The watchdog: FAST STOP and DeviceError where the gripper has gone silent."""
-        age = now - self.link.updates[Command.SYSTEM_STATE][1]
+        if now - self.link.updates[Command.SYSTEM_STATE][1] <= self.max_age_s:
+            return
+        self.link.pump(0.0)  # it may be this program that was held up: what has come meanwhile counts
+        age = time.monotonic() - self.link.updates[Command.SYSTEM_STATE][1]
         if age <= self.max_age_s:
             return
         error = DeviceError(

@@ -1,5 +1,6 @@
 """A serial or TCP port to a WSG-50: bytes in and out with deadlines, whatever pyserial does underneath."""
 
+import io
 import select
 import time
 from importlib import import_module
@@ -63,12 +64,8 @@ class Port:
     def _readable(self, timeout_s: float) -> bool:
         try:
             number = self._serial.fileno()
-        except NotImplementedError:
+        except io.UnsupportedOperation:
             return self._readable_without_number(timeout_s)
-        except OSError as error:
-            if self.name.startswith("loop:"):  # io.UnsupportedOperation
-                return self._readable_without_number(timeout_s)
-            raise error
         return bool(select.select([number], [], [], timeout_s)[0])
 
     def _readable_without_number(self, timeout_s: float) -> bool:
