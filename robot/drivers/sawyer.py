@@ -241,7 +241,8 @@ class Sawyer(Arm):
         if not straight_line.is_near(self.workspace, pose, _MARGIN_MM):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(
-                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; bring it there by hand, or check base_xyz_mm and tool_mm"
+                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; "
+                "bring it there by hand, or check base_xyz_mm and tool_mm"
             )
         return pose
 
