@@ -46,12 +46,12 @@ from typing import Any
 
 import numpy as np
 
+from robot import hand_eye
 from robot.attempt_settings import AttemptSettings
 from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasp import GraspSettings
-from robot import hand_eye
 from robot.readings import Box
 from robot.rig import Rig, ask_on_terminal
 from robot.settings import build, check_type

@@ -14,6 +14,7 @@ import pytest
 
 from robot.drivers import wsg50
 from robot.drivers.wsg50 import WSG50
+from robot.drivers.wsg50_codec import Frame, encode
 from robot.drivers.wsg50_commands import Statistics
 from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
 from robot.drivers.wsg50_faults import KINDS, Piece
@@ -26,7 +27,8 @@ HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE, TARE = 0x20, 0x21, 0x22, 0x23,
 
 class Script(Faults):
     """Does to the frames named by (id, number of the frame with this id) what it is told: the counting starts when
-    told. Commands and replies count together: 1 the command, 2 its first reply."""
+    told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
+    none comes before it."""
 
     def __init__(self):
         super().__init__()
@@ -38,8 +40,10 @@ class Script(Faults):
     def on(self, frame):
         self.seen[frame.id] = self.seen.get(frame.id, 0) + 1
         kind = self.plan.get((frame.id, self.seen[frame.id])) or self.plan.get(frame.id)
-        plain = list(super().on(frame))
-        return self._damaged(kind, frame, plain[0].data) if kind else plain
+        plain = encode(frame)
+        if kind == "after a result":
+            return [Piece(encode(Frame(frame.id, bytes(2))) + plain)]
+        return list(self._damaged(kind, frame, plain) if kind else [Piece(plain)])
 
 
 @contextlib.contextmanager
@@ -88,6 +92,12 @@ def test_it_grasps_holds_and_lets_go(port):
         assert gripper.state() == opened
         assert gripper.statistics() == Statistics(1, 0, 0)
         assert gripper.line_counts == {}
+
+
+def test_a_serial_line_takes_its_rate_and_stop_bits():
+    with bench("pty", baud=9600, stop_bits=2) as (gripper, _):
+        assert (gripper._link._port._serial.baudrate, gripper._link._port._serial.stopbits) == (9600, 2)
+        assert gripper.state().status == "idle"
 
 
 def test_closing_on_nothing_is_no_part_and_is_left_by_opening_or_grasping(port):
@@ -518,6 +528,16 @@ def test_a_result_that_comes_twice_does_not_end_the_next_motion():
         state = gripper.open(40.0)
         assert state.status == "idle"
         assert state.opening_mm == pytest.approx(40.0, abs=0.1)
+
+
+def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
+    script = Script()
+    slow = Emulator(referenced=True, opening_mm=50.0)
+    with bench(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
+        script.tell({(MOVE, 2): "after a result"})
+        assert gripper.open(40.0).opening_mm == pytest.approx(40.0, abs=0.1)
+        assert not slow.moves
+        assert slow.heard.count(MOVE) == 1
 
 
 def test_every_reading_that_is_lost_is_asked_again():

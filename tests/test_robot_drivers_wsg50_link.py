@@ -2,6 +2,7 @@
 
 import os
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -251,3 +252,8 @@ def test_without_pyserial_it_says_what_to_install(monkeypatch):
         DeviceError, match=r"needs pyserial, which is missing; run pip install 'touch-retrieval\[gripper\]'"
     ):
         Link("loop://").open()
+
+
+def test_no_module_of_the_driver_needs_pyserial_to_be_imported():
+    blocked = "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50, robot.drivers.wsg50_emulator"
+    subprocess.run([sys.executable, "-c", blocked], check=True, timeout=60)

@@ -8,7 +8,7 @@ import json
 import torch
 
 from retrieval.towers import TOWERS
-from tests.benchmarks import build, cold, cylinder, grasp, query, rerank, step
+from tests.benchmarks import arm, build, cameras, cold, cylinder, grasp, gripper, query, rerank, step
 from tests.benchmarks.common import config_of
 
 BENCHMARKS = {"rerank": rerank.measure, "query": query.measure, "build": build.measure, "step": step.measure}
@@ -17,6 +17,9 @@ WITHOUT_TOWER = {
     "grasp": grasp.measure,
     "shipped": query.measure_shipped,
     "cold": cold.measure,
+    "gripper": gripper.measure,
+    "arm": arm.measure,
+    "cameras": cameras.measure,
 }
 
 
