@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from robot.drivers import wsg50
+from robot.drivers import wsg50, wsg50_emulated
 from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_codec import Frame, encode
 from robot.drivers.wsg50_commands import Statistics
@@ -385,6 +385,17 @@ def test_stop_is_always_allowed_and_becomes_a_fast_stop_if_nobody_answers():
         gripper.stop()
         assert emulator.heard.count(FAST_STOP) == 1
         assert emulator.in_fast_stop
+
+
+def test_a_stop_that_is_answered_and_does_nothing_becomes_a_fast_stop(monkeypatch):
+    monkeypatch.setitem(wsg50_emulated._ACTIONS, STOP, lambda own, _: 0)
+    slow = Emulator(referenced=True, opening_mm=100.0)
+    with bench(emulator=slow, max_state_age_s=0.1) as (gripper, _):
+        gripper._link.begin(wsg50.commands.move(10.0, 5.0))
+        until(lambda: slow.moves)
+        gripper.stop()
+        assert not slow.moves
+        assert slow.heard.count(FAST_STOP) == 1
 
 
 @pytest.mark.parametrize(

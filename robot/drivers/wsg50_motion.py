@@ -8,7 +8,7 @@ does not, the motion is stopped.
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from robot.drivers import wsg50_commands as commands
@@ -29,7 +29,6 @@ _FAULTS = (
     | SystemState.SCRIPT_FAILURE
 )
 _POLL_S = 0.01
-_STOPS = (commands.stop(), commands.stop(), commands.fast_stop(), commands.fast_stop())
 
 
 @dataclass(frozen=True)
@@ -98,33 +97,38 @@ class Motions:
                 break
             self.link.counts["sent again"] += 1
         answer = "nothing" if status is None else status.name
+        stop = f", FAST STOP: {causes(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
             f"the gripper answered {answer} to {name_of(frame.id)} and stands at {reading.opening_mm:.1f} mm, "
-            f"{reading.grasping.name.lower()}; faults: {causes(reading.system)}; look at it, then call recover()"
+            f"{reading.grasping.name.lower()}{stop}; look at it, then call recover()"
         )
 
     def stop(self) -> None:
-        """Stop the jaws, by FAST STOP if nothing else is answered, and see that they stand. Raises DeviceError."""
-        self._say_stop()
+        """Stop the jaws, by FAST STOP if nothing else helps, and see that they stand. Raises DeviceError."""
+        patience_s = self.max_age_s + self.link.timeout_s
+        self._say((commands.stop(), commands.stop(), commands.fast_stop(), commands.fast_stop()))
+        if self._last_reading(time.monotonic() + patience_s).moves:
+            self._say((commands.fast_stop(), commands.fast_stop()))
+            self._standing(time.monotonic() + patience_s)
         self.quiet()
-        self._standing(time.monotonic() + self.max_age_s + self.link.timeout_s)
 
     def quiet(self) -> None:
         """End the updates. Raises DeviceError."""
         for command in _WATCHED:
             self.link.tell(commands.ask(command))
 
-    def _say_stop(self) -> None:
-        for number, frame in enumerate(_STOPS, start=1):
+    def _say(self, frames: Sequence[Frame]) -> None:
+        """One after the other, until one is answered."""
+        for number, frame in enumerate(frames, start=1):
             if frame.id == Command.FAST_STOP:
-                _log.warning("the gripper does not answer STOP: telling it to FAST STOP")
+                _log.warning("the gripper does not stop when told to: telling it to FAST STOP")
             try:
                 self.link.urgent(frame)
                 return
             except CommandFailed:
                 return  # heard, and of no use: where it stands is read next
             except NoReply:
-                if number == len(_STOPS):
+                if number == len(frames):
                     raise
 
     def _watch(self, frame: Frame, deadline: float) -> Status | None:
@@ -179,8 +183,13 @@ class Motions:
 
     def _standing(self, deadline: float) -> Reading:
         """What the gripper says when it stands."""
-        while (reading := read(self.link)).moves:
-            if time.monotonic() > deadline:
-                raise DeviceError(f"the gripper must stand, and still moves at {reading.opening_mm:.1f} mm")
+        reading = self._last_reading(deadline)
+        if reading.moves:
+            raise DeviceError(f"the gripper must stand, and still moves at {reading.opening_mm:.1f} mm: stop its power")
+        return reading
+
+    def _last_reading(self, deadline: float) -> Reading:
+        """What the gripper says when it stands, or at the deadline."""
+        while (reading := read(self.link)).moves and time.monotonic() < deadline:
             self.link.pump(_POLL_S)
         return reading
