@@ -3,8 +3,8 @@
     python -m tests.emulated_rig --grasps 500 --out faulty/       # with faults in 1 of 50 operations, counted
 
 The gripper's driver speaks to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to cameras of
-arithmetic through OpenCV's interface; arm and camera are drivers of their own, of this file. Faults can be had at every
-device, counted by kind.
+arithmetic through OpenCV's interface, and Sawyer's to an emulated one over a websocket, unless an arm of this file
+does, which is at its place at once. The camera is of this file too. Faults can be had at every device, counted by kind.
 """
 
 import argparse
@@ -24,11 +24,13 @@ import numpy as np
 from robot.attempt_settings import AttemptSettings
 from robot.collect import CollectSettings, collect
 from robot.devices import Arm, Camera
-from robot.drivers import opencv_stream
+from robot.drivers import opencv_stream, rosbridge_emulator
 from robot.drivers.opencv_tactile import OpencvTactile
+from robot.drivers.sawyer import Sawyer
 from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
 from robot.errors import DeviceError
+from robot.grasp import GraspSettings
 from robot.readings import RGBD, Box, Intrinsics, Pose
 from robot.recording import read_recording
 from robot.rig import Rig
@@ -41,7 +43,11 @@ HOLDING = 4
 SPEED_UP = 50.0
 FRAMES = 4
 """Frames on the line for an operation of the gripper: command, pending, state, result. Each may meet a fault."""
-QUICK = AttemptSettings(settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4)
+LOW_WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+"""Where the emulated Sawyer reaches."""
+QUICK = AttemptSettings(
+    GraspSettings(lift_mm=100.0), settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4
+)
 SERVERS = {"tcp": serve_tcp, "pty": serve_pty}
 
 
@@ -53,6 +59,7 @@ class World:
         self.rng, self.counts = np.random.default_rng([7, seed]), Counter()
         self.emulator = Emulator(speed_up=SPEED_UP, referenced=True)
         self.line = Faults(rate / FRAMES, seed=seed)
+        self.arm_faults = None
         self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
 
     def fault(self, device, *kinds):
@@ -66,7 +73,9 @@ class World:
     @property
     def all_counts(self):
         """Faults so far, by device and kind."""
-        return dict(self.counts) | {f"gripper's line: {kind}": count for kind, count in self.line.counts.items()}
+        lines = {"gripper's line": self.line.counts, "arm's line": self.arm_faults.counts if self.arm_faults else {}}
+        of_lines = {f"{line}: {kind}": count for line, counts in lines.items() for kind, count in counts.items()}
+        return dict(self.counts) | of_lines
 
     @property
     def holding(self):
@@ -113,6 +122,36 @@ class EmulatedArm(Arm):
 
     def _pose(self):
         return self.world.pose
+
+
+class TrackedSawyer(Sawyer):
+    """Sawyer's driver; the world learns where it has gone."""
+
+    def __init__(self, world, port):
+        mount = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
+        quick = {"joint_speed_rad_s": 1.5, "max_speed_mm_s": 1000.0, "max_state_age_s": 1.0, "timeout_s": 0.5}
+        super().__init__(workspace=LOW_WORKSPACE, host="127.0.0.1", port=port, **mount, **quick)
+        self.world = world
+
+    def _move_to(self, pose, speed_mm_s):
+        reached = super()._move_to(pose, speed_mm_s)
+        self.world.hand_at(reached)
+        return reached
+
+
+@contextlib.contextmanager
+def _at_once(world):
+    yield EmulatedArm(world)
+
+
+@contextlib.contextmanager
+def _sawyer(world):
+    world.arm_faults = rosbridge_emulator.Faults(world.rate, seed=world.seed)
+    with rosbridge_emulator.serve(rosbridge_emulator.Emulator(faults=world.arm_faults)) as url:
+        yield TrackedSawyer(world, int(url.rpartition(":")[2]))
+
+
+ARMS = {"at once": _at_once, "sawyer": _sawyer}
 
 
 class EmulatedCamera(Camera):
@@ -175,11 +214,11 @@ class EmulatedGel(FakeCamera):
 class EmulatedRig(Rig):
     """The rig. Objects are cylinders by name, placed at random for each attempt; now and then one slips."""
 
-    def __init__(self, url, world, gels, **gripper):
+    def __init__(self, url, world, gels, arm, **gripper):
         self.world, self.gels, self.closed_unasked = world, gels, 0
         quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         super().__init__(
-            EmulatedArm(world),
+            arm,
             WSG50(port=url, **quick | gripper),
             {
                 finger: OpencvTactile(finger=finger, device=gel_path(finger), warmup_s=0.0, timeout_s=1.0, frozen_s=0.2)
@@ -209,16 +248,17 @@ def gel_path(finger):
 
 
 @contextlib.contextmanager
-def emulated_rig(seed=0, *, port="tcp", rate=0.0, **gripper):
+def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
     """An EmulatedRig, not connected, whose devices are there as long as this is open."""
     world = World(seed, rate)
     gels = {finger: EmulatedGel(world, finger) for finger in "ab"}
     by_path = {gel_path(finger): gel for finger, gel in gels.items()}
     with (
         SERVERS[port](world.emulator, world.line) as url,
+        ARMS[arm](world) as hand,
         patch.object(opencv_stream, "open_capture", lambda device: by_path[device].open(device)),
     ):
-        yield EmulatedRig(url, world, gels, **gripper)
+        yield EmulatedRig(url, world, gels, hand, **gripper)
 
 
 @dataclass
@@ -238,15 +278,15 @@ class Outcome:
         yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
 
 
-def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=5, progress=None):
+def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", arm="at once", objects=5):
     """Collect `grasps` accepted ones with faults at every device; begun again, as a person would, where it stops."""
     stops, left_closing, faults = [], 0, Counter()
     names = [f"can-{number}" for number in range(objects)]
     while True:
-        with emulated_rig(seed + len(stops), port=port, rate=rate) as rig:
+        with emulated_rig(seed + len(stops), port=port, arm=arm, rate=rate) as rig:
             try:
                 wanted = CollectSettings(grasps // objects)
-                tallies = collect(lambda: rig, out, objects=names, seed=seed, settings=wanted, progress=progress)
+                tallies = collect(lambda: rig, out, objects=names, seed=seed, settings=wanted)
                 return Outcome(
                     sum(tally.accepted for tally in tallies),
                     sum(tally.attempts for tally in tallies),
@@ -272,11 +312,14 @@ def main():
     parser.add_argument("--grasps", type=int, default=500)
     parser.add_argument("--rate", type=float, default=0.02, help="share of operations that meet a fault")
     parser.add_argument("--port", choices=sorted(SERVERS), default="tcp")
+    parser.add_argument("--arm", choices=sorted(ARMS), default="at once")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="recording folder")
     given = parser.parse_args()
     logging.disable(logging.WARNING)  # one for each fault
-    found = collect_among_faults(given.out, given.grasps, rate=given.rate, seed=given.seed, port=given.port)
+    found = collect_among_faults(
+        given.out, given.grasps, rate=given.rate, seed=given.seed, port=given.port, arm=given.arm
+    )
     print("\n".join(found.lines()))
     grasps = read_recording(given.out).grasps
     print(f"{len(grasps)} grasps in {given.out}, {len(broken_images(given.out))} of their pictures broken")
