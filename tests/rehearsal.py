@@ -8,6 +8,7 @@ the gel before, while it holds, and after the lift. Then the commands for any re
 import argparse
 import contextlib
 import json
+import os
 import shutil
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ MOMENTS = ("before", "during", "after")
 
 def rehearse(folder, objects=OBJECTS, grasps=GRASPS, iterations=2):
     """All of it, in `folder`; returns the recording that was replayed and the one that was made of it."""
+    os.environ["XDG_STATE_HOME"] = str(folder / "state")  # what is trained here is nobody's default
     source, made = folder / "source", folder / "recording"
     _run("collect", "--rig", "sim", "--objects", objects, "--grasps", grasps, "--seed", SEED, "--out", source)
     with replayed(folder, source, grasps) as name:

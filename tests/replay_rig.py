@@ -63,6 +63,13 @@ hold_s = 0.1
 @contextlib.contextmanager
 def replay_rig(emulator=None):
     """The rig, not connected; whoever is asked to do something has done it."""
+    with replay_file(emulator) as path:
+        yield load_rig(str(path), seed=0)
+
+
+@contextlib.contextmanager
+def replay_file(emulator=None):
+    """The rig's file, whose devices are there as long as this is open."""
     emulator = emulator or Emulator(speed_up=50.0, referenced=True)
     with (
         tempfile.TemporaryDirectory() as name,
@@ -72,7 +79,7 @@ def replay_rig(emulator=None):
         folder = Path(name)
         record(folder)
         (folder / "rig.toml").write_text(FILE.format(port=url, folder=folder, lens=LENS))
-        yield load_rig(str(folder / "rig.toml"), seed=0)
+        yield folder / "rig.toml"
 
 
 def record(folder):

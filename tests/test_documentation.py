@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 
 from retrieval import cli
+from robot.drivers.wsg50_emulator import Emulator
 from robot.rig import load_rig
 from tests import synthetic
+from tests.replay_rig import replay_file
+from tests.test_retrieval_rig_commands import POINTS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
@@ -38,8 +41,11 @@ def home(tmp_path, recording, catalogue, monkeypatch):
         (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    (tmp_path / "points.csv").write_text(POINTS)
     monkeypatch.chdir(tmp_path)
-    return tmp_path
+    with replay_file(Emulator(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
+        shutil.copy(rig, tmp_path)
+        yield tmp_path
 
 
 def test_every_retrieve_command_of_the_readme_runs(home):
@@ -47,6 +53,7 @@ def test_every_retrieve_command_of_the_readme_runs(home):
     shorter = {
         "demo": ["--objects", "4", "--jobs", "1"],
         "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
+        "rig": [],
         "train": ["--iterations", "2"],
         "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
         "frontier": ["--quick", "--only", "closing"],
@@ -58,7 +65,10 @@ def test_every_retrieve_command_of_the_readme_runs(home):
         assert cli.main([*line[1:], *shorter.get(line[1], [])]) in accepted, line
 
 
-def test_the_settings_in_the_readme_make_a_rig(tmp_path):
+def test_the_settings_in_the_readme_make_a_rig(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "points.csv").write_text(POINTS)
+    assert cli.main(["rig", "calibrate", "points.csv"]) == 0
     for number, block in enumerate(re.findall(r"```toml\n(.*?)```", README, flags=re.S)):
         (tmp_path / f"{number}.toml").write_text(block)
         rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)

@@ -115,6 +115,48 @@ def test_robot_imports_without_torch():
     assert done.returncode == 0, done.stderr
 
 
+OF_DEVICES = ("serial", "websockets", "pyrealsense2", "pylibfreenect2", "roslibpy", "trimesh", "torch", "faiss")
+
+
+def test_every_module_of_robot_imports_without_the_packages_of_devices():
+    names = [str(path.relative_to(ROOT).with_suffix("")).replace("/", ".") for path in modules("robot")]
+    plain = [name.removesuffix(".__init__") for name in names]
+    assert "robot.drivers.wsg50" in plain
+    done = run_blocked("import " + ", ".join(plain), OF_DEVICES)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("role", "table", "said"),
+    [
+        ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install 'touch-retrieval[gripper]'"),
+        (
+            "arm",
+            {"driver": "sawyer", "host": "127.0.0.1", "base_xyz_mm": [0, 0, 0], "tool_mm": 150.0},
+            "pip install 'touch-retrieval[sawyer]'",
+        ),
+        ("camera", {"driver": "realsense"}, "pip install 'touch-retrieval[realsense]'"),
+        ("camera", {"driver": "kinect2"}, "pylibfreenect2"),
+    ],
+)
+def test_a_driver_without_its_package_says_what_to_install(role, table, said):
+    code = f"""
+import numpy as np
+from robot.errors import DeviceError
+from robot.real_rig import load_driver
+from robot.readings import Box
+given = {{"workspace": Box((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
+device = load_driver({role!r}, {table!r}, "table", **given)
+try:
+    device.connect()
+except DeviceError as error:
+    print(error)
+"""
+    done = run_blocked(code, OF_DEVICES)
+    assert said in done.stdout, done.stderr
+    assert "missing" in done.stdout
+
+
 def test_the_collector_knows_the_contract_and_no_rig():
     """A rig is imported when it is asked for by name."""
     code = "import sys, robot.collect, robot.rig; print([name for name in sys.modules if name.startswith('robot.sim')])"
@@ -142,6 +184,9 @@ def test_indexes_import_with_numpy_alone():
         ["export"],
         ["evaluate"],
         ["frontier"],
+        ["rig"],
+        ["rig", "check"],
+        ["rig", "calibrate"],
     ],
 )
 def test_help_loads_nothing_heavy(command):
