@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import build, cold, common, cylinder, query, rerank, step
+from tests.benchmarks import arm, build, cameras, cold, common, cylinder, gripper, query, rerank, step
 from tests.conftest import TINY
 
 SMALLEST = {
@@ -32,6 +32,22 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
     for line in lines:
         assert str(line).startswith(f"{name}, small: ")
         assert all(value > 0 for value in line.figures.values())
+        json.dumps(line.figures, allow_nan=False)
+
+
+OF_DEVICES = {
+    "gripper": lambda: gripper.measure(trips=5, grasps=1, seconds=0.05),
+    "arm": lambda: arm.measure(calls=5),
+    "cameras": lambda: cameras.measure(seconds=0.2),
+}
+
+
+@pytest.mark.parametrize("name", sorted(OF_DEVICES))
+def test_a_benchmark_of_devices_gives_its_lines(name):
+    lines = list(OF_DEVICES[name]())
+    assert len(lines) > 2
+    for line in lines:
+        assert str(line).startswith(f"{name}, ")
         json.dumps(line.figures, allow_nan=False)
 
 

@@ -24,7 +24,8 @@ from retrieval.search import Encoder, Searcher
 from retrieval.stored import fingerprint, read_judge
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
 
-PHOTOS = 10_000
+PHOTOS, CANDIDATES = 10_000, 132
+"""As many candidates as tests.benchmarks.scale finds needed for so many photos; build-index writes them down."""
 GEL_PX = (240, 320)
 STAGES = ("decode", "encode", "candidates", "rerank")
 
@@ -73,8 +74,8 @@ def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Pat
     return Line(
         "query",
         checkpoint.config.matcher.tower,
-        f"{encoder.name}, {generation.count} photos: {duration(times.median('query'))} ({shown} ms), "
-        f"{duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
+        f"{encoder.name}, {generation.count} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
+        f"({shown} ms), {duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
         {"photos": generation.count, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
     )
 
@@ -125,15 +126,15 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
         {"halves": halves},
         {"calibration": Calibration(1.0, 0.0, 0.0, 10, 10, 0.5, 0.5, 0.1, 0.1).to_dict()},
         fingerprint=fingerprint(checkpoint),
-        about={"catalogue": str(out), "checkpoint": str(checkpoint.path)},
+        about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},
     )
 
 
 def gel_images(folder: Path, fingers: int) -> list[Path]:
-    """One smooth picture for each finger, as large as those of the sensor."""
+    """One smooth picture for each finger, as large as those of the sensor and as a rig records them."""
     rows, columns = (np.linspace(0, 9, size) for size in GEL_PX)
-    paths = [folder / f"{finger}.png" for finger in range(fingers)]
+    paths = [folder / f"{finger}.jpg" for finger in range(fingers)]
     for number, path in enumerate(paths):
         waves = [np.sin((k + 1) * rows + number)[:, None] * np.cos((k + 2) * columns)[None] for k in range(3)]
-        Image.fromarray((127 + 100 * np.stack(waves, axis=2)).astype(np.uint8)).save(path)
+        Image.fromarray((127 + 100 * np.stack(waves, axis=2)).astype(np.uint8)).save(path, quality=95)
     return paths
