@@ -16,7 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -159,7 +159,12 @@ class Actuator(Device):
 
 
 class Arm(Actuator):
-    """Moves the gripper, held upright, inside `workspace` (limits of the point between the fingertips)."""
+    """Moves the gripper, held upright, inside `workspace` (limits of the point between the fingertips).
+
+    by_hand: a person moves it when asked to; no speed is kept then.
+    """
+
+    by_hand: ClassVar[bool] = False
 
     def __init__(
         self, name: str, workspace: Box, *, max_speed_mm_s: float = 1000.0, clock: Clock = time.monotonic

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Device, TactileSensor, read_together
-from robot.errors import DeviceError
+from robot.errors import DeviceError, RobotError
 from robot.readings import RGBD, Frame
 from robot.rig import Rig
 
@@ -65,20 +65,19 @@ def _checked(device: Device, role: str, check: Callable[[], dict[str, str]]) -> 
     try:
         with device:
             row = replace(row, measured=check(), refused=dict(device.refused))
-    except DeviceError as error:
+    except RobotError as error:  # also what wants a person where there is no terminal
         return replace(row, failure=str(error))
     return row
 
 
 def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
-    """Up a little and back; a person's arm has no pose before it was asked to go somewhere, so there it goes first."""
+    """Up a little and back."""
     arm = rig.arm
+    if arm.by_hand:
+        return {"moved": "by a person"}
     if not motion:
-        return {"motion": "not tried"}
-    try:
-        start = arm.pose()
-    except DeviceError:
-        start = arm.move_to(rig.home, ARM_MM_S)
+        return {"moved": "not"} | _round_trip(rig, arm.pose)
+    start = arm.pose()
     top = arm.workspace.upper[2]
     up = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
     speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()

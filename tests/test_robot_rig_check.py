@@ -3,7 +3,6 @@
 import pytest
 
 from robot import rig_check
-from robot.errors import DeviceError
 from robot.readings import GripperState, Pose
 from robot.rig_check import check_rig
 from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
@@ -37,7 +36,8 @@ def test_every_device_is_exercised_and_closed_and_comes_back(rig):
 
 def test_without_motion_arm_and_jaws_stay_where_they_are(rig):
     rows = list(check_rig(rig, motion=False))
-    assert rows[0].measured == {"motion": "not tried"}
+    assert rows[0].measured["moved"] == "not"
+    assert rows[0].measured["state in"].startswith("0.00 ms")
     assert {"arm", "open", "grasp"}.isdisjoint(rig.world.calls)
 
 
@@ -64,20 +64,11 @@ def test_settings_that_a_device_refused_are_told(rig, monkeypatch):
     assert row.line().endswith("; refused exposure: asked 5, has 8")
 
 
-def test_an_arm_that_knows_no_pose_before_it_was_moved_goes_home_first(rig, monkeypatch):
-    real, moved = type(rig.arm)._pose, []
-
-    def pose(self):
-        if not moved:
-            raise DeviceError("the fake arm must be moved before it knows its pose")
-        return real(self)
-
-    move = type(rig.arm)._move_to
-    monkeypatch.setattr(type(rig.arm), "_pose", pose)
-    monkeypatch.setattr(type(rig.arm), "_move_to", lambda *given: moved.append(given[1]) or move(*given))
+def test_an_arm_that_is_a_person_is_not_asked_for_motions(rig, monkeypatch):
+    monkeypatch.setattr(type(rig.arm), "by_hand", True)
     row = next(check_rig(rig))
-    assert row.failure is None
-    assert moved[0] == rig.home
+    assert row.measured == {"moved": "by a person"}
+    assert "arm" not in rig.world.calls
 
 
 def test_a_stream_that_stands_is_one_frame(rig, monkeypatch):

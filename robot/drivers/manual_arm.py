@@ -15,6 +15,8 @@ NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
 class ManualArm(Arm):
     """Asks a person to bring the hand to each pose, and believes them. `ask` shows a sentence and returns when done."""
 
+    by_hand = True
+
     def __init__(
         self,
         *,
