@@ -208,7 +208,10 @@ class Link:
     def _guarded(self, use: Callable[[Port], _T]) -> _T:
         """Use the port, and close it where it is gone."""
         if self._port is None:
-            raise LinkLost(f"the gripper's port {self.name} must be open, and was lost; see to its cable and power, recover() opens it again")
+            raise LinkLost(
+                f"the gripper's port {self.name} must be open, and was lost; see to its cable and power, "
+                "recover() opens it again"
+            )
         try:
             return use(self._port)
         except LinkLost:

@@ -40,7 +40,10 @@ class Port:
             data: bytes = self._serial.read(_CHUNK)  # with a time-out of 0 it returns what there is
             return data
         except (OSError, ValueError, TypeError) as error:  # a closed one is None to select
-            raise LinkLost(f"the gripper's port {self.name} is gone: {_words(error)}; see to its cable and power, recover() opens it again") from error
+            raise LinkLost(
+                f"the gripper's port {self.name} is gone: {_words(error)}; see to its cable and power, "
+                "recover() opens it again"
+            ) from error
 
     def write(self, data: bytes) -> None:
         """Send all of it."""
@@ -48,7 +51,10 @@ class Port:
             while data:
                 data = data[self._serial.write(data) :]
         except (OSError, ValueError, TypeError) as error:
-            raise LinkLost(f"the gripper's port {self.name} takes no bytes: {_words(error)}; see to its cable and power, recover() opens it again") from error
+            raise LinkLost(
+                f"the gripper's port {self.name} takes no bytes: {_words(error)}; see to its cable and power, "
+                "recover() opens it again"
+            ) from error
 
     def close(self) -> None:
         """Never raises."""
