@@ -63,7 +63,7 @@ class Attempter:
     def run(self, object_id: str, number: int) -> Attempt:
         """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
 
-        Whatever happens, Ctrl-C included, the jaws do not stay closed.
+        Whatever happens, Ctrl-C included, the jaws are opened, or the error says that they could not be.
         """
         for trial in range(self.settings.retries + 1):
             try:
@@ -71,26 +71,30 @@ class Attempter:
                     self.rig.recover()
                 return self._once(object_id, number)
             except DeviceError as error:
-                self._let_go()
+                left = self._let_go()
                 if trial == self.settings.retries:
                     raise DeviceError(
-                        f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}"
+                        f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}{left}"
                     ) from error
-            except BaseException:
-                self._let_go()
+            except BaseException as error:
+                if left := self._let_go():
+                    error.add_note(left)
                 raise
         raise AssertionError("the loop returns or raises")
 
-    def _let_go(self) -> None:
-        """Open the jaws, of a gripper that must be brought back first where it must; the error at hand matters more
-        than that this may fail too."""
+    def _let_go(self) -> str:
+        """Open the jaws, of a gripper that must be brought back first where it must; returns what to add to the error at
+        hand where that fails too."""
         gripper = self.rig.gripper
         try:
-            gripper.open(gripper.stroke_mm)
-        except Exception:
-            with contextlib.suppress(Exception):
-                gripper.recover()
+            with contextlib.suppress(DeviceError):
                 gripper.open(gripper.stroke_mm)
+                return ""
+            gripper.recover()
+            gripper.open(gripper.stroke_mm)
+        except Exception as second:
+            return f"; and the jaws could not be opened: {second}"
+        return ""
 
     def _once(self, object_id: str, number: int) -> Attempt:
         rig = self.rig

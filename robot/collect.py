@@ -97,7 +97,7 @@ def collect(
     the rig's. gate: see robot.gates; gate_name says which one it is, for it must be the same when a collection goes on.
     Raises RobotConfigError, RecordingError (the folder holds something else, or was collected otherwise), DeviceError
     (a device failed too often), StorageError; what was recorded before is whole, and the rig is closed with its jaws
-    open. KeyboardInterrupt likewise.
+    open, unless the error says that they could not be opened. KeyboardInterrupt likewise.
     """
     settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
     rig = make_rig()

@@ -52,9 +52,11 @@ class Device(ABC):
         try:
             with self._named_errors("cannot be connected"):
                 self._connect()
-        except BaseException:
-            with contextlib.suppress(Exception):
+        except BaseException as error:
+            try:
                 self._close()
+            except Exception as second:
+                error.add_note(f"and while {self.name} was closed: {second}")
             raise
         self._connected = True
 
@@ -216,6 +218,7 @@ class Gripper(Actuator):
         clock: Clock = time.monotonic,
     ) -> None:
         super().__init__(name, max_speed_mm_s=max_speed_mm_s, clock=clock)
+        self.min_opening_mm, self.min_speed_mm_s = 0.0, 1e-3
         self.stroke_mm = stroke_mm
         self.min_force_n, self.max_force_n = min_force_n, max_force_n
 
@@ -225,15 +228,15 @@ class Gripper(Actuator):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Move the jaws apart to `opening_mm`, 0 to the stroke; lets go of what is held. Raises DeviceError."""
-        self._check("opening", opening_mm, 0.0, self.stroke_mm, "mm")
+        """Move the jaws apart to `opening_mm`, at most the stroke; lets go of what is held. Raises DeviceError."""
+        self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
         """Close until `force_n` is reached or nothing is met; returns when the jaws stand. Raises DeviceError."""
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
-        self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
+        self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
             return self._grasp(float(force_n), float(speed_mm_s))
 
