@@ -83,6 +83,9 @@ def _check_rig(arguments: argparse.Namespace) -> None:
 
     if arguments.rig is None:
         found = discover()
+        if arguments.json:
+            print_json({"found": [dataclasses.asdict(device) for device in found]})
+            return
         for device in found:
             print(f"# {device.kind}: {device.label}\n{device.toml}\n")
         say(f"{len(found)} device(s) found; the lines above go into a rig's file" if found else "no device was found")

@@ -8,7 +8,7 @@ import contextlib
 import math
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -83,7 +83,7 @@ class Attempter:
         raise AssertionError("the loop returns or raises")
 
     def _let_go(self) -> str:
-        """Open the jaws, of a gripper that must be brought back first where it must; returns what to add to the error at
+        """Open the jaws, of a gripper that is brought back first where it must be; returns what to add to the error at
         hand where that fails too."""
         gripper = self.rig.gripper
         try:
@@ -100,6 +100,7 @@ class Attempter:
         rig = self.rig
         rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
         rig.gripper.open(rig.gripper.stroke_mm)
+        self._rise()
         rig.arm.move_to(rig.home, self.settings.travel_mm_s)
         rig.prepare(object_id, number)
         start = rig.clock()
@@ -126,6 +127,15 @@ class Attempter:
             at_s=round(at - start, 3),
             lasted_s=round(rig.clock() - start, 3),
         )
+
+    def _rise(self) -> None:
+        """Straight up from wherever the hand is: on a slant, open jaws would sweep over what stands between them."""
+        arm = self.rig.arm
+        if arm.by_hand:
+            return
+        here, top = arm.pose(), arm.workspace.upper[2]
+        if here.z_mm < top and arm.workspace.contains(here):
+            arm.move_to(replace(here, z_mm=top), self.settings.approach_mm_s)
 
     @property
     def _needs_depth(self) -> bool:
@@ -185,6 +195,8 @@ class Attempter:
             rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.travel_mm_s)
             rig.arm.move_to(Pose(float(x), float(y), z, yaw), settings.approach_mm_s)
         rig.gripper.open(rig.gripper.stroke_mm)
+        if held:
+            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.approach_mm_s)
 
     def _pictures(self, image: RGBD) -> dict[str, bytes]:
         pictures = {"photo": self._jpeg(image.colour)}

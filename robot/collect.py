@@ -151,7 +151,8 @@ def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dic
 def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> None:
     """Raise RecordingError where a recording that exists was collected otherwise.
 
-    strict: simulated attempts depend on the software, those of a real rig go on after it was brought up to date.
+    strict: simulated attempts depend on the software and on what their devices say. Those of a real rig go on after it
+    was brought up to date, and with devices that read back another exposure: what was asked of them must be the same.
     """
     if not (folder / INFO_FILE).is_file():
         return
@@ -160,6 +161,8 @@ def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> Non
         raise RecordingError(f"{folder} holds a recording that was not collected by a rig; give another folder")
     if strict:
         wanted = {**wanted, "software_version": software_version()}
+    else:
+        wanted = {name: value for name, value in wanted.items() if name != "devices"}
     for name, value in _flat(wanted).items():
         old = _flat(found).get(name)
         if old != value:

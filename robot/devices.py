@@ -131,7 +131,12 @@ class Device(ABC):
 
 
 class Actuator(Device):
-    """Something that moves, at most at `max_speed_mm_s`. An exception, Ctrl-C included, leaves it standing still."""
+    """Something that moves, at most at `max_speed_mm_s`. An exception, Ctrl-C included, leaves it standing still.
+
+    may_move: whether connecting may move it (to find its reference, say) or let it move (enable its motors).
+    """
+
+    may_move: bool = True
 
     def __init__(self, name: str, *, max_speed_mm_s: float, clock: Clock = time.monotonic) -> None:
         super().__init__(name, clock=clock)

@@ -8,7 +8,7 @@ on how another one fared.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +17,7 @@ from robot.cylinder import CylinderFit
 from robot.devices import Arm, Gripper
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import Box, Pose
+from robot.settings import build
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,7 @@ class GraspSettings:
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        low, high = self.force_n
-        if not 0 < low <= high < math.inf:
+        if len(self.force_n) != 2 or not 0 < self.force_n[0] <= self.force_n[1] < math.inf:
             raise RobotConfigError(f"force_n must be a range of forces above 0, lower first, got {self.force_n}")
         for name in ("jitter_mm", "floor_mm", "top_margin_mm", "clearance_mm"):
             self._require(name, 0.0)
@@ -54,18 +54,11 @@ class GraspSettings:
             raise RobotConfigError(f"{name} must be at least {least:g}, got {value}")
 
     @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> Self:
+    def from_dict(cls, settings: Mapping[str, Any], where: str = "") -> Self:
         """From plain values, as TOML gives them. Raises RobotConfigError, also for an unknown name."""
-        known = [field.name for field in fields(cls)]
-        if unknown := sorted(set(settings) - set(known)):
-            raise RobotConfigError(f"grasps have no setting {unknown[0]!r}; known: {', '.join(known)}")
-        given = dict(settings)
-        if "force_n" in given:
-            given["force_n"] = tuple(given["force_n"])
-        try:
-            return cls(**given)
-        except (TypeError, ValueError) as error:
-            raise RobotConfigError(f"grasp settings must be numbers, force_n two of them: {error}") from error
+        made = build(cls, settings, where=where)
+        low, high = made.force_n
+        return replace(made, force_n=(low, high))
 
     def check(self, arm: Arm, gripper: Gripper) -> None:
         """Raise RobotConfigError where this rig cannot do what is asked."""

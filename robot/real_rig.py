@@ -34,6 +34,7 @@
     x_mm = 0
     ...
 
+Homing jaws keep their own speed, and Sawyer's slow /robot/state may be 2 s old whatever `state_age_s`.
 Paths are those of the process that reads the file. Unknown keys are refused everywhere.
 """
 
@@ -86,6 +87,10 @@ HAND_EYE_DAYS = 30.0
 """A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
 
 
+LEAST_WAIT_S = 0.1
+"""Between a motion and the picture of what came of it: three frames of a gel at 30 a second."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """Ceilings: workspace (mm), speeds (mm/s), force on each finger (N), age of the state of what moves (s)."""
@@ -125,8 +130,10 @@ class GivenObject:
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for sizes that are not above 0."""
-        if not (self.height_mm > 0 and self.radius_mm > 0):
-            raise RobotConfigError(f"[object]: height_mm and radius_mm must be above 0, got {self}")
+        if not (self.height_mm > 0 and self.radius_mm > 0 and self.error_mm >= 0):
+            raise RobotConfigError(
+                f"[object]: height_mm and radius_mm must be above 0, error_mm at least 0, got {self}"
+            )
 
     def fit(self) -> CylinderFit:
         """As what a camera would have found."""
@@ -165,13 +172,22 @@ class RealRig(Rig):
             given=build(GivenObject, object, where="[object]").fit() if object else None,
         )
 
+    def connect(self) -> None:
+        """As any rig; a camera may turn out to have no depth only now. Raises RobotConfigError then."""
+        super().connect()
+        if not self.camera.has_depth and self.given is None:
+            self.close()
+            raise RobotConfigError(
+                f"{self.camera.name} has no depth: say where every object stands and how large it is, in [object]"
+            )
+
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -> Any:
     """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
     known = DRIVERS[role]
     settings = dict(table)
     name = settings.pop("driver", None)
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise UnknownName(f"{where}: driver must be one of {', '.join(sorted(known))}; got {name!r}")
     module, class_name = known[name].split(":")
     driver: type[Device] = getattr(import_module(module), class_name)
@@ -218,7 +234,8 @@ def _camera(table: Mapping[str, Any]) -> Camera:
 def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limits) -> AttemptSettings:
     """How attempts are made: as said, else as by default but within the ceilings. Raises RobotConfigError."""
     low, high = GraspSettings.force_n
-    drawn = GraspSettings.from_dict({"force_n": (min(low, limits.force_n), min(high, limits.force_n)), **grasp})
+    force_n = (min(low, limits.force_n), min(high, limits.force_n))
+    drawn = GraspSettings.from_dict({"force_n": force_n, **grasp}, where="[grasp]")
     capped = {
         "travel_mm_s": min(AttemptSettings.travel_mm_s, limits.arm_speed_mm_s),
         "approach_mm_s": min(AttemptSettings.approach_mm_s, limits.arm_speed_mm_s),
@@ -239,3 +256,8 @@ def _check_ceilings(settings: AttemptSettings, limits: Limits) -> None:
     for name, (value, ceiling, limit) in asked.items():
         if value > ceiling:
             raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")
+    for name in ("settle_s", "hold_s"):
+        if getattr(settings, name) < LEAST_WAIT_S:
+            raise RobotConfigError(
+                f"[attempt]: {name} must be at least {LEAST_WAIT_S:g} s, for gels to see what is then"
+            )

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Device, TactileSensor, read_together
-from robot.errors import DeviceError, RobotError
+from robot.errors import RobotError
 from robot.readings import RGBD, Frame
 from robot.rig import Rig
 
@@ -49,6 +49,7 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
 
     `motion`: whether arm and jaws may move a little. Raises nothing of a device: its failure is a row.
     """
+    rig.arm.may_move = rig.gripper.may_move = motion
     if rig.can_run_jobs:  # simulated: an object can be had for nothing, and without one its gels see nothing
         rig.prepare(rig.object_ids(1)[0], 0)
     yield _checked(rig.arm, "arm", lambda: _check_arm(rig, motion))
@@ -165,7 +166,7 @@ def _check_skew(rig: Rig) -> Checked:
         for _ in range(_ASKED):
             skews.append(read_together(rig.sensors)[1])
             rig.sleep(0.05)
-    except DeviceError as error:
+    except RobotError as error:
         return replace(row, failure=str(error))
     finally:
         for sensor in connected:

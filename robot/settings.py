@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from robot.errors import RobotConfigError
 
 _T = TypeVar("_T")
+_MOST = 2**63
 _PLAIN: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
     bool: (bool, "true or false"),
     int: (int, "a whole number"),
@@ -36,7 +37,9 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
 
 
 def check_type(name: str, hint: Any, value: object) -> None:
-    """Raise RobotConfigError for a plain value, table or list of plain values that is not of the annotated type."""
+    """Raise RobotConfigError for a plain value, table or list of plain values that is not of the annotated type, and
+    for numbers that are not finite or beyond 64 bits, which no setting means."""
+    _check_finite(name, value)
     kind, inner = typing.get_origin(hint), typing.get_args(hint)
     if kind in (Sequence, tuple):
         good = isinstance(value, list | tuple) and all(_is_plain(each, inner[0]) for each in value)
@@ -51,6 +54,12 @@ def check_type(name: str, hint: Any, value: object) -> None:
         words = " or ".join(_PLAIN[option][1] for option in options if option in _PLAIN)
     if not good:
         raise RobotConfigError(f"{name} must be {words}, got {value!r}")
+
+
+def _check_finite(name: str, value: object) -> None:
+    for each in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(each, int | float) and not abs(each) < _MOST:  # also refuses NaN
+            raise RobotConfigError(f"{name} must be a finite number, within 64 bits, got {str(each)[:40]}")
 
 
 def _is_plain(value: object, hint: Any) -> bool:

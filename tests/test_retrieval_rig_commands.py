@@ -50,6 +50,8 @@ def test_without_a_rig_what_is_connected_is_listed_as_lines_for_its_file(capsys,
     said = capsys.readouterr()
     assert said.out == '# camera: GelSight Mini R0B\n[sensors.a]\ndriver = "gelsight_mini"\n\n'
     assert "1 device(s) found" in said.err
+    assert main(["rig", "check", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["found"][0]["device"] == "/dev/v4l/by-id/x"
     monkeypatch.setattr("robot.drivers.discover.discover", list)
     assert main(["rig", "check"]) == 0
     assert capsys.readouterr().err == "no device was found\n"

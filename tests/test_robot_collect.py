@@ -17,7 +17,7 @@ from robot.gates import ContactAreaGate
 from robot.grasp import GraspSettings
 from robot.readings import RGBD
 from robot.recording import RecordingWriter, read_recording
-from tests.fake_rig import FakeRig
+from tests.fake_rig import FakeArm, FakeRig
 
 NAMES = ("round-0", "thin-1", "round-2")
 
@@ -178,6 +178,30 @@ def test_progress_is_told_after_every_attempt(tmp_path):
     assert last.seconds_left == 0.0
 
 
+class OneRig(FakeRig):
+    """A rig as real ones are: one of it, whose devices read back a little else each time."""
+
+    can_run_jobs = False
+    times = 0
+
+    def settings(self):
+        OneRig.times += 1
+        return super().settings() | {"fake gel a": {"exposure_ms": 10 + 0.1 * OneRig.times}}
+
+
+def test_a_collection_goes_on_with_devices_that_read_back_other_values(tmp_path):
+    def interrupted(now):
+        if now.attempts == 1:
+            raise KeyboardInterrupt
+
+    given = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(2)}
+    with pytest.raises(KeyboardInterrupt):
+        collect(lambda: OneRig(3), tmp_path / "r", progress=interrupted, **given)
+    collect(lambda: OneRig(3), tmp_path / "r", **given)
+    assert sum(grasp.grasped for grasp in read_recording(tmp_path / "r").grasps) == 2
+    assert OneRig.times == 2
+
+
 # What is asked of the devices -------------------------------------------------------------------------------
 
 
@@ -191,8 +215,34 @@ def calls_of(attempt, name="round-0", faults=None, seed=3):
 def test_an_attempt_asks_in_this_order():
     _, calls = calls_of(AttemptSettings())
     gels = ["gel a", "gel b"]
-    start, close, up = ["open", "arm", "depth", "arm", "open", "arm"], ["grasp"], ["arm"]
-    assert calls == [*start, *gels, *close, *gels, *up, *gels, "arm", "arm", "open"]
+    start, close, up = ["open", "arm", "arm", "depth", "arm", "open", "arm"], ["grasp"], ["arm"]
+    assert calls == [*start, *gels, *close, *gels, *up, *gels, "arm", "arm", "open", "arm"]
+
+
+@pytest.mark.parametrize("faults", [{}, {"grasp": {1}}, {"gel a": {3}}, {"open": {3}}])
+def test_what_begins_low_goes_straight_up_or_down(faults, monkeypatch):
+    """On a slant, open jaws sweep over the object that was put down a moment before."""
+    moves, real = [], FakeArm._move_to
+
+    def noted(self, pose, speed_mm_s):
+        moves.append((self.world.pose, pose))
+        return real(self, pose, speed_mm_s)
+
+    monkeypatch.setattr(FakeArm, "_move_to", noted)
+    rig = FakeRig(3, faults=faults)
+    with rig:
+        attempter = Attempter(rig, 3, AttemptSettings())
+        for number in range(3):
+            attempter.run("round-0", number)
+        low = [(here, there) for here, there in moves if here.z_mm < rig.world.solid.height + 10]
+    assert len(low) >= 3
+    assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
+
+
+def test_a_person_is_not_asked_to_rise_first(monkeypatch):
+    monkeypatch.setattr(FakeArm, "by_hand", True)
+    _, calls = calls_of(AttemptSettings())
+    assert calls[:3] == ["open", "arm", "depth"]
 
 
 def test_what_is_not_recorded_is_not_asked_for(tmp_path):
@@ -209,7 +259,7 @@ def test_what_is_not_recorded_is_not_asked_for(tmp_path):
 def test_no_plan_moves_nothing_but_home():
     result, calls = calls_of(AttemptSettings(), "wide-0")
     assert (result.outcome, result.images) == ("no_plan", {})
-    assert calls == ["open", "arm", "depth"]
+    assert calls == ["open", "arm", "arm", "depth"]
 
 
 def test_the_gate_that_needs_what_is_not_recorded_says_so(tmp_path):

@@ -28,6 +28,7 @@ def test_the_motions_of_an_attempt_are_said_in_order_and_nothing_is_moved():
         "arm: to",  # over the place to put it
         "arm: to",  # down
         "jaws: open",
+        "arm: to",  # up
     ]
     assert said[1] == "arm: to x 0.0, y 150.0, z 500.0 mm, yaw 0.000 rad, at 200 mm/s"
 

@@ -93,6 +93,21 @@ def test_a_camera_with_depth_must_be_calibrated_and_not_long_ago(tmp_path):
     assert load_rig(written(tmp_path, camera=longer), seed=0).camera.has_depth
 
 
+def test_a_recorded_camera_without_depth_is_told_when_it_is_connected(tmp_path, monkeypatch):
+    from robot.errors import RobotError
+
+    points(tmp_path)
+    camera = 'driver = "replay"\npath = "recording"\nhand_eye = "hand_eye.json"\nfx = 9\nfy = 9\ncx = 9\ncy = 9'
+    rig = load_rig(written(tmp_path, camera=camera, object=None), seed=0)
+    for device in rig.devices:
+        monkeypatch.setattr(device, "_connect", lambda: None)
+        monkeypatch.setattr(device, "_close", lambda: None)
+    rig.camera.has_depth = False
+    with pytest.raises(RobotError, match=r"how large it is, in \[object\]"):
+        rig.connect()
+    assert not any(device.is_connected for device in rig.devices)
+
+
 BAD = {
     "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of manual, sawyer; got 'kuka'"),
     "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of wsg50; got None"),
@@ -119,6 +134,13 @@ BAD = {
     ),
     "an unknown habit": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
     "a grasp through the back door": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
+    "a force that is no range": ({"grasp": "force_n = 10"}, r"\[grasp\]: force_n must be a list"),
+    "a force of three": ({"grasp": "force_n = [1, 2, 3]"}, "force_n must be a range of forces"),
+    "a jitter that is no number": ({"grasp": "jitter_mm = true"}, r"\[grasp\]: jitter_mm must be a number, got True"),
+    "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of manual, sawyer; got \['man"),
+    "a speed without end": ({"attempt": "travel_mm_s = inf"}, r"\[attempt\]: travel_mm_s must be a finite number"),
+    "a place that is none": ({"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"}, "x_mm must be a finite"),
+    "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
     "an object of no size": ({"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"}, "must be above 0"),
 }
 

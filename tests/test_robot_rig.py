@@ -122,7 +122,7 @@ def test_a_rig_is_built_from_a_toml_file(fake, tmp_path):
 
 
 def test_an_unknown_rig_lists_the_known_ones(fake):
-    with pytest.raises(UnknownName, match=r"no rig is called 'sawyer'; known: fake, sim, or give a \.toml file"):
+    with pytest.raises(UnknownName, match=r"no rig is called 'sawyer'; known: fake, real, sim, or give a \.toml file"):
         load_rig("sawyer", seed=0)
 
 

@@ -3,6 +3,7 @@
 import pytest
 
 from robot import rig_check
+from robot.errors import RobotConfigError
 from robot.readings import GripperState, Pose
 from robot.rig_check import check_rig
 from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
@@ -39,6 +40,22 @@ def test_without_motion_arm_and_jaws_stay_where_they_are(rig):
     assert rows[0].measured["moved"] == "not"
     assert rows[0].measured["state in"].startswith("0.00 ms")
     assert {"arm", "open", "grasp"}.isdisjoint(rig.world.calls)
+
+
+def test_without_motion_what_connects_knows_that_it_must_not_move(rig):
+    assert rig.gripper.may_move
+    list(check_rig(rig, motion=False))
+    assert not rig.gripper.may_move
+    assert not rig.arm.may_move
+
+
+def test_a_wrong_setting_that_shows_when_connecting_is_a_row_too(rig, monkeypatch):
+    def wrong(self):
+        raise RobotConfigError("the calibration is for another size")
+
+    monkeypatch.setattr(FakeSensor, "_connect", wrong)
+    rows = list(check_rig(rig))
+    assert [row.role for row in rows if row.failure] == ["gel", "gel", "skew"]
 
 
 def test_a_device_that_fails_is_a_row_and_the_others_are_still_checked(rig):

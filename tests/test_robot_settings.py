@@ -28,7 +28,7 @@ class Thing:
 
 def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken():
     made = build(Thing, {"port": "a", "rate": 3, "box": [1, 2.5], "exposure": 4}, clock="tick", unknown="left out").made
-    assert made["port"], made["rate"] == ("a", 3)
+    assert (made["port"], made["rate"]) == ("a", 3)
     assert made["box"] == [1, 2.5]
     assert made["exposure"] == 4
     assert made["clock"] == "tick"
@@ -48,6 +48,9 @@ def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken()
         ({"port": "a", "box": 3}, r"\[thing\]: box must be a list, each of them a number, got 3"),
         ({"port": "a", "names": ["b", 3]}, r"\[thing\]: names must be a list, each of them a text in quotes"),
         ({"port": "a", "exposure": "long"}, r"\[thing\]: exposure must be a whole number, got 'long'"),
+        ({"port": "a", "rate": float("nan")}, r"\[thing\]: rate must be a finite number, within 64 bits, got nan"),
+        ({"port": "a", "box": [1, float("inf")]}, r"\[thing\]: box must be a finite number, within 64 bits, got inf"),
+        ({"port": "a", "tries": 10**400}, r"\[thing\]: tries must be a finite number, within 64 bits, got 1000"),
         ({"port": "a", "table": 3}, r"\[thing\]: table must be a table, got 3"),
     ],
 )
