@@ -1,5 +1,6 @@
 """The thread that reads a camera, over streams whose every picture the test hands out."""
 
+import math
 import queue
 import threading
 
@@ -173,12 +174,35 @@ def test_a_newer_picture_can_be_waited_for(script, make):
     assert reader.after(1.0).time_s == 2.0
 
 
-def test_a_frozen_stream_is_an_error_although_the_age_of_its_pictures_looks_well(script, make):
+def test_a_picture_that_repeats_the_last_is_as_old_as_its_first_copy(script, make):
+    reader = make()
+    script.show(0.0)
+    script.show(0.1, 0.6, 1.1, picture=7)
+    reader.start()
+    seen(reader, 4)
+    assert reader.newest().time_s == reader.near(1.1).time_s == 0.1
+    assert reader.near(0.0).time_s == 0.0  # and pushes no older one out
+    script.show(1.2, picture=8)
+    assert reader.after(0.1).time_s == 1.2
+
+
+def test_a_stream_that_stands_still_gives_nothing_fresh_long_before_it_counts_as_frozen(script, make):
+    script.show(0.0, 0.3, 0.7, picture=7)
+    now = [0.7]
+    gel = Gel("a", make(), clock=lambda: now[0])
+    gel.connect()
+    seen(gel.reader, 3)
+    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, it is 0\.7 s; is the stream frozen"):
+        gel.read()
+    assert gel.reader.lost == 0
+
+
+def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.05, frozen_s=2.0, backoff_s=(ENOUGH_S, ENOUGH_S)))
     script.show(0.0, 1.0, 2.0, picture=7)
     reader.start()
     seen(reader, 3)
-    assert reader.newest().time_s == 2.0  # what an age check alone would go on believing
+    assert reader.lost == 0
     script.show(2.1, picture=7)
     until(lambda: reader.lost)
     with pytest.raises(DeviceError, match=r"frozen: the same picture for 2\.1 s"):
@@ -243,7 +267,19 @@ def test_closing_says_so_when_a_driver_does_not_come_back_and_the_camera_is_let_
     until(lambda: script.closed == 1)
 
 
-@pytest.mark.parametrize("setting", [{"keep": 0}, {"warmup_s": -1.0}, {"timeout_s": 0.0}, {"frozen_s": float("nan")}])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"keep": 0},
+        {"warmup_s": -1.0},
+        {"warmup_s": math.inf},
+        {"timeout_s": 0.0},
+        {"timeout_s": math.inf},
+        {"timeout_s": 1e10},
+        {"frozen_s": math.nan},
+        {"frozen_s": 601.0},
+    ],
+)
 def test_settings_out_of_range_are_refused(setting):
     with pytest.raises(RobotConfigError, match=next(iter(setting))):
         ReaderSettings(**setting)
@@ -252,8 +288,8 @@ def test_settings_out_of_range_are_refused(setting):
 class Gel(TactileSensor):
     """A sensor over a reader."""
 
-    def __init__(self, finger, reader):
-        super().__init__(f"gel {finger}", finger, clock=lambda: 0.1)
+    def __init__(self, finger, reader, clock=lambda: 0.1):
+        super().__init__(f"gel {finger}", finger, clock=clock)
         self.reader = reader
 
     def _connect(self):

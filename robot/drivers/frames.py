@@ -1,8 +1,9 @@
 """Pictures of a camera that never waits: a thread takes every one, notes when, and keeps the newest few.
 
-What is kept is as the camera gives it (BGR); turning, cropping and colour order cost time and wait for a reader. The
-thread owns the stream. When the stream fails, ends or shows one and the same picture for too long, it is closed and
-opened again, waiting a little longer each time; until a new picture has come, whoever asks waits and is then told why.
+What is kept is as the camera gives it (BGR); turning, cropping and colour order cost time and wait for a reader. A
+picture that is the same as the one before counts as that one and keeps its time: a stream that stands still grows old.
+The thread owns the stream. When the stream fails, ends or stands still for too long, it is closed and opened again,
+waiting a little longer each time; until a new picture has come, whoever asks waits and is then told why.
 """
 
 import contextlib
@@ -22,6 +23,9 @@ from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
 
 log = logging.getLogger(__name__)
+MOST_S = 600.0
+"""Nobody waits longer for a camera, and the system's own waits overflow at some length."""
+
 _CLOSING_S = 5.0
 """A thread that waits inside a camera's driver gets so long to come back before `close` says that it has not."""
 
@@ -42,8 +46,8 @@ class Stream(Protocol):
 @dataclass(frozen=True)
 class ReaderSettings:
     """keep: pictures kept. warmup_s: pictures so soon after opening are dropped (automatic exposure, first black ones).
-    timeout_s: how long somebody who asks waits for a picture. frozen_s: the same pixels for longer are a frozen stream;
-    a sensor without noise is none. backoff_s: first and longest wait before a stream is opened again.
+    timeout_s: how long somebody who asks waits for a picture. frozen_s: a stream of the same pixels for longer is
+    opened again; its picture is too old to be used long before that. backoff_s: first and longest wait before that.
     """
 
     keep: int = 4
@@ -57,8 +61,8 @@ class ReaderSettings:
         if not 1 <= self.keep <= 1000:
             raise RobotConfigError(f"keep must be from 1 to 1000 pictures, got {self.keep}")
         for name, least in (("warmup_s", 0.0), ("timeout_s", 1e-3), ("frozen_s", 1e-3)):
-            if not getattr(self, name) >= least:  # also refuses NaN
-                raise RobotConfigError(f"{name} must be at least {least:g} s, got {getattr(self, name)}")
+            if not least <= getattr(self, name) <= MOST_S:  # also refuses NaN
+                raise RobotConfigError(f"{name} must be from {least:g} to {MOST_S:g} s, got {getattr(self, name)}")
 
 
 class FrameReader:
@@ -83,7 +87,7 @@ class FrameReader:
         self._ended, self._hurry = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._last: Frame | None = None
-        self._changed_s = self._warm_s = 0.0
+        self._warm_s = 0.0
         self._trouble = "nothing came"
 
     def start(self) -> None:
@@ -157,17 +161,20 @@ class FrameReader:
             _let_go(stream)
 
     def _take(self, frame: Frame) -> None:
+        """Keep a new picture; one that repeats the last is as old as its first copy, and is not kept again."""
         with self._news:
             self.frames_seen += 1
-            if self._last is None or not _same(self._last.pixels, frame.pixels):
-                self._changed_s = frame.time_s
+            if self._last is not None and _same(self._last.pixels, frame.pixels):
+                self._check_moves(frame.time_s - self._last.time_s)
+                return
             self._last = frame
-            still = frame.time_s - self._changed_s
-            if still > self.settings.frozen_s:
-                raise DeviceError(f"its stream is frozen: the same picture for {still:.1f} s")
             if frame.time_s >= self._warm_s:
                 self._kept.append(frame)
                 self._news.notify_all()
+
+    def _check_moves(self, still_s: float) -> None:
+        if still_s > self.settings.frozen_s:
+            raise DeviceError(f"its stream is frozen: the same picture for {still_s:.1f} s")
 
     def _lose(self, stream: Stream | None, error: Exception, delay: float) -> None:
         with self._news:
