@@ -70,6 +70,34 @@ def test_where_the_system_makes_no_stable_names_cameras_are_found_by_number(root
     assert tomllib.loads(found.toml) == {"driver": "uvc", "device": str(roots[0] / "video2"), "allow_index": True}
 
 
+def test_equal_cameras_that_share_a_name_are_both_found_with_a_note_that_the_name_may_change_sides(roots):
+    dev = roots[0]
+    plug_camera(roots, "usb-Maker_Gel-video-index0", 2, "Gel")
+    plug_camera(roots, None, 0, "Gel")
+    by_path = dev / "v4l" / "by-path"
+    by_path.mkdir()
+    links = (("usb-0:1:1.0", 0), ("usbv2-0:1:1.0", 0), ("usb-0:2:1.0", 2))  # newer systems name a socket twice
+    for name, number in links:
+        (by_path / f"pci-{name}-video-index0").symlink_to(dev / f"video{number}")
+    shared, other = str(dev / "v4l/by-id/usb-Maker_Gel-video-index0"), str(by_path / "pci-usb-0:1:1.0-video-index0")
+    assert discover.camera_names(dev) == [shared, other]
+    found = discover.find_cameras(*roots)
+    assert [(each.device, each.label) for each in found] == [(shared, "Gel"), (other, "Gel")]
+    for each in found:
+        assert "may lead to the other camera tomorrow" in each.toml
+        assert tomllib.loads(each.toml)["device"] == each.device
+
+
+def test_cameras_with_names_of_their_own_are_listed_once_and_without_a_note(roots):
+    dev = roots[0]
+    plug_camera(roots, "usb-Maker_Gel_7-video-index0", 2, "Gel")
+    (dev / "v4l" / "by-path").mkdir()
+    (dev / "v4l" / "by-path" / "pci-1-video-index0").symlink_to(dev / "video2")
+    (found,) = discover.find_cameras(*roots)
+    assert found.device.endswith("by-id/usb-Maker_Gel_7-video-index0")
+    assert "#" not in found.toml
+
+
 def test_serial_ports_are_found_by_their_stable_names(roots):
     (roots[0] / "serial" / "by-id" / "usb-FTDI_7-if00-port0").touch()
     (found,) = discover.discover(*roots)

@@ -16,6 +16,10 @@ log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
 _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
 """Words in a camera's name, and the driver for it; the first that fits."""
+SHARED_NAME = (
+    "a camera here has no name of its own in by-id: where equal cameras share one, it may lead to the other camera "
+    "tomorrow; name those by their sockets, in by-path"
+)
 
 
 @dataclass(frozen=True)
@@ -35,20 +39,31 @@ def discover(dev: Path = DEV, sys: Path = SYS) -> list[Found]:
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
-    """Stable names of the cameras, as paths; by-path (which socket) where two cameras share a name by-id."""
-    return _pictures(dev / "v4l" / "by-id") or _pictures(dev / "v4l" / "by-path")
+    """Stable names of the cameras, as paths: by-id, and by-path (which socket) for those without one."""
+    found = {path.resolve(): str(path) for path in reversed(_pictures(dev / "v4l" / "by-path"))}
+    by_id = _pictures(dev / "v4l" / "by-id")
+    for path in by_id:
+        found.pop(path.resolve(), None)
+    return [*map(str, by_id), *sorted(found.values())]
 
 
-def _pictures(folder: Path) -> list[str]:
-    return [str(path) for path in _entries(folder) if path.name.endswith("-video-index0")]
+def note_on(names: Iterable[str]) -> str:
+    """What must be known of such names, or nothing."""
+    kinds = {Path(name).parent.name for name in names}
+    return SHARED_NAME if kinds >= {"by-id", "by-path"} else ""
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return [path for path in _entries(folder) if path.name.endswith("-video-index0")]
 
 
 def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[Found]:
     """Cameras by stable name; by number where the system makes no stable names."""
-    found = []
-    for name in camera_names(dev):
+    found, names = [], camera_names(dev)
+    note = f"# {note_on(names)}\n" if note_on(names) else ""
+    for name in names:
         label = _label(sys, Path(name).resolve().name) or Path(name).name
-        found.append(Found("camera", name, label, _camera_toml(name, f"{label} {Path(name).name}")))
+        found.append(Found("camera", name, label, note + _camera_toml(name, f"{label} {Path(name).name}")))
     return found or _numbered_cameras(dev, sys)
 
 
