@@ -143,8 +143,12 @@ def test_settings_come_from_plain_values():
     assert GraspSettings.from_dict({"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
     with pytest.raises(RobotConfigError, match="no setting 'jitter'; it knows clearance_mm, finger_mm"):
         GraspSettings.from_dict({"jitter": 3})
-    for wrong in ({"force_n": [1, 2, 3]}, {"force_n": ["a", "b"]}, {"lift_mm": "high"}):
-        with pytest.raises(RobotConfigError, match="must be numbers"):
+    for wrong, said in (
+        ({"force_n": [1, 2, 3]}, "force_n must be a range of forces above 0"),
+        ({"force_n": ["a", "b"]}, "force_n must be a list, each of them a number"),
+        ({"lift_mm": "high"}, "lift_mm must be a number"),
+    ):
+        with pytest.raises(RobotConfigError, match=said):
             GraspSettings.from_dict(wrong)
 
 
