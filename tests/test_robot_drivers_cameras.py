@@ -308,3 +308,9 @@ def test_a_plain_camera_comes_back(usb):
         camera.dead = False
         eye.recover()
         eye.read(depth=False, max_age_s=10)
+
+
+def test_a_plain_camera_named_by_a_number_is_refused_before_it_is_connected(tmp_path, monkeypatch):
+    monkeypatch.setattr(discover, "DEV", tmp_path)
+    with pytest.raises(RobotConfigError, match="set allow_index = true"):
+        UvcCamera(device="0", extrinsics=EXTRINSICS)

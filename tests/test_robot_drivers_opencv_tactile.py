@@ -57,16 +57,30 @@ def written(camera):
 # Which camera -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("device", ["0", "/dev/video2"])
+@pytest.mark.parametrize("device", ["0", "/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
 def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
     name = plug(FakeCamera())
-    with pytest.raises(RobotConfigError, match=f"another camera may have tomorrow. Connected: {name}"):
-        OpencvTactile(finger="a", device=device).connect()
+    with pytest.raises(RobotConfigError, match=f"another camera may have tomorrow. Connected: {name}$"):
+        OpencvTactile(finger="a", device=device)
+
+
+@pytest.mark.parametrize("device", ["", "video0", "usb-Maker_Gel-video-index0"])
+def test_a_camera_that_is_not_named_by_a_whole_path_is_refused(dev, device):
+    with pytest.raises(RobotConfigError, match=f"named by its whole path, got '{device}'"):
+        OpencvTactile(finger="a", device=device, allow_index=True)
+
+
+def test_a_name_that_equal_cameras_share_is_listed_with_a_note(plug, dev):
+    name = plug(FakeCamera(), number=2)
+    (dev / "v4l" / "by-path").mkdir()
+    (dev / "v4l" / "by-path" / "pci-1-video-index0").symlink_to(dev / "video0")
+    with pytest.raises(RobotConfigError, match=rf"Connected: {name}, .*pci-1-video-index0 \(.*other camera tomorrow"):
+        OpencvTactile(finger="a", device="0")
 
 
 def test_where_the_system_makes_no_stable_names_the_way_out_is_said(dev):
     with pytest.raises(RobotConfigError, match="set allow_index = true"):
-        OpencvTactile(finger="a", device="0").connect()
+        OpencvTactile(finger="a", device="0")
     assert stable_path("3", allow_index=True) == "/dev/video3"
     assert stable_path("/dev/video3", allow_index=True) == "/dev/video3"
 
@@ -111,7 +125,7 @@ def test_what_is_no_camera_cannot_be_opened_by_the_real_opencv_either(dev):
 
 def test_nothing_is_touched_before_connecting(monkeypatch):
     monkeypatch.setattr(opencv_stream, "open_capture", lambda device: pytest.fail("opened"))
-    gel = OpencvTactile(finger="b", device="7")
+    gel = OpencvTactile(finger="b", device="7", allow_index=True)
     assert (gel.name, gel.finger, gel.frames_seen, gel.lost) == ("gel b", "b", 0, 0)
     with pytest.raises(DeviceError, match="must be connected before it is used"):
         gel.read()
@@ -199,6 +213,13 @@ def test_a_files_settings_count_before_the_presets(plug):
     assert (found["width"], found["height"], found["fps"], found["led"]) == (640, 480, 30.0, [15, 15, 15])
 
 
+@pytest.mark.parametrize("size", [{"width": 640}, {"height": 480}])
+@pytest.mark.parametrize("make", [GelSight, GelSightMini, Digit])
+def test_half_a_size_is_not_filled_up_with_the_presets(make, size):
+    with pytest.raises(RobotConfigError, match="width and height must be given together"):
+        make(finger="a", device="/dev/v4l/by-id/usb-Gel", **size)
+
+
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
@@ -219,11 +240,13 @@ def test_a_files_settings_count_before_the_presets(plug):
         ({"output_px": [0, 4]}, "output_px"),
         ({"keep": 0}, "keep"),
         ({"frozen_s": 0.0}, "frozen_s"),
+        ({"timeout_s": math.inf}, "timeout_s"),
+        ({"warmup_s": 1e10}, "warmup_s"),
     ],
 )
 def test_settings_out_of_range_are_refused_before_anything_is_connected(setting, words):
     with pytest.raises(RobotConfigError, match=words):
-        OpencvTactile(finger="a", device="usb", **setting)
+        OpencvTactile(finger="a", device="/dev/v4l/by-id/usb-Gel", **setting)
 
 
 def test_every_preset_is_one_that_can_be_asked_for():
@@ -272,8 +295,33 @@ def test_a_calibration_file_for_another_size_is_found_when_connecting(plug, tmp_
         gel.connect()
     assert not camera.open_captures
     path.write_text('{"image_px": [8, 6], "crop": [0.0, 0.5, 0.0, 0.0]}')
-    with gel:
-        assert gel.read(10).pixels.shape == (3, 8, 3)
+    with OpencvTactile(finger="a", device=gel.device, calibration=str(path), **QUICK) as other:
+        assert other.read(10).pixels.shape == (3, 8, 3)
+
+
+def test_a_calibration_file_that_is_none_is_named_before_anything_is_connected(tmp_path):
+    for make in (OpencvTactile, Digit):
+        with pytest.raises(RobotConfigError, match=r"calibration file .*none\.json cannot be read"):
+            make(finger="a", device="/dev/v4l/by-id/usb-Gel", calibration=str(tmp_path / "none.json"))
+
+
+@pytest.mark.parametrize("shape", [(6, 8, 2), (6, 8), (6, 8, 4)])
+@pytest.mark.parametrize("make", [OpencvTactile, Digit, GelSightMini])
+def test_pictures_without_three_colours_are_a_device_error_that_says_what_to_set(plug, make, shape):
+    camera = FakeCamera()
+    camera.picture = lambda number: np.full(shape, number % 256, np.uint8)
+    with pytest.raises(DeviceError, match=r'must give pictures H x W x 3 uint8, .*as "MJPG"'):
+        make(finger="a", device=plug(camera), **QUICK).connect()
+
+
+def test_numbers_that_a_camera_makes_up_never_reach_the_settings(plug):
+    camera = FakeCamera()
+    for number, value in ((cv2.CAP_PROP_GAIN, math.nan), (cv2.CAP_PROP_FPS, math.inf), (cv2.CAP_PROP_FOURCC, 1e300)):
+        camera.values[number] = value
+    with OpencvTactile(finger="a", device=plug(camera), gain=math.nan, **QUICK) as gel:
+        found = gel.settings()
+    assert (found["gain"], found["fps"]) == (None, None)
+    json.dumps(found, allow_nan=False)
 
 
 def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):

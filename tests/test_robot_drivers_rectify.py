@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.rectify import Rectifier, load_rectifier, make_rectifier
+from robot.drivers.rectify import Rectifier, in_rgb, load_rectifier, make_rectifier
 from robot.errors import DeviceError, RobotConfigError
 
 CORNERS = ((10.0, 5.0), (49.0, 5.0), (49.0, 24.0), (10.0, 24.0))
@@ -149,3 +149,12 @@ def test_whatever_a_calibration_file_holds_it_works_or_is_refused(tmp_path_facto
         return
     width, height = rectifier.image_px
     assert rectifier.apply(np.zeros((height, width, 3), np.uint8)).size
+
+
+@pytest.mark.parametrize(
+    "picture", [np.zeros((4, 6, 2), np.uint8), np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint16)]
+)
+def test_what_has_not_three_colours_is_refused(picture):
+    for use in (in_rgb, Rectifier(output_px=(3, 2)).apply):
+        with pytest.raises(DeviceError, match="H x W x 3 uint8"):
+            use(picture)

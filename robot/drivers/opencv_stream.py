@@ -30,7 +30,7 @@ _DAMAGED_IN_A_ROW = 10
 _STAMP_S = (-0.05, 1.0)
 """A picture's own time is believed where it is so much older than now; else it is on another clock."""
 
-_NUMBERED = re.compile(r"\d+|/dev/video\d+")
+_NUMBERED = re.compile(r"/dev/video\d+")
 LEAVE = math.nan
 """For a number: leave it as the camera has it."""
 
@@ -111,7 +111,7 @@ class _Property:
 
 
 def _fourcc_text(number: float) -> str:
-    return int(number).to_bytes(4, "little", signed=int(number) < 0).decode("latin-1")
+    return (int(number) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
 
 
 def _whole(value: float) -> int:
@@ -224,13 +224,15 @@ class CaptureReader(FrameReader):
         refused: dict[str, str],
         clock: Clock,
     ) -> None:
+        """Raises RobotConfigError for a `device` that may be another camera tomorrow; opens nothing."""
         super().__init__(name, self._open_camera, reading, clock=clock)
-        self.device, self.asked, self.allow_index, self.refused = device, asked, allow_index, refused
+        self.device, self.asked, self.refused = device, asked, refused
+        self._path = stable_path(device, allow_index)
         self.camera: dict[str, Any] = {}
 
     def _open_camera(self) -> CaptureStream:
         """Also called by the thread, when the stream was lost: settings are written and read back again."""
-        stream = CaptureStream(stable_path(self.device, self.allow_index), self.asked, self.clock)
+        stream = CaptureStream(self._path, self.asked, self.clock)
         self.refused.clear()
         self.refused.update(stream.refused)
         self.camera = {"device": self.device, **stream.settings}
@@ -257,12 +259,13 @@ def open_capture(device: str) -> Any:
 
 
 def stable_path(device: str, allow_index: bool) -> str:
-    """The path to open for a `device` from a rig's file. Raises RobotConfigError for one that may be another camera
-    tomorrow, unless `allow_index`."""
-    if not _NUMBERED.fullmatch(device):
-        return device
-    if allow_index:
-        return f"/dev/video{device}" if device.isdigit() else device
+    """The path to open for a `device` from a rig's file. Raises RobotConfigError for one that is no path, or that may
+    be another camera tomorrow, unless `allow_index`."""
+    path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
+    if not os.path.isabs(path):
+        raise RobotConfigError(f"a camera must be named by its whole path, got {device!r}.{_known()}")
+    if allow_index or not _NUMBERED.fullmatch(os.path.normpath(path)):
+        return path
     known = _known() or " This system makes no such names: set allow_index = true if only one camera is ever plugged in"
     raise RobotConfigError(
         "a camera must be named by what stays the same, a path in /dev/v4l/by-id, "
@@ -272,4 +275,5 @@ def stable_path(device: str, allow_index: bool) -> str:
 
 def _known() -> str:
     names = discover.camera_names(discover.DEV)
-    return f" Connected: {', '.join(names)}" if names else ""
+    note = discover.note_on(names)
+    return f" Connected: {', '.join(names)}{note and f' ({note})'}" if names else ""

@@ -14,7 +14,7 @@ import numpy as np
 from robot.devices import Clock, TactileSensor
 from robot.drivers.frames import ReaderSettings
 from robot.drivers.opencv_stream import LEAVE, CaptureReader, CaptureSettings
-from robot.drivers.rectify import Rectifier, in_rgb, make_rectifier
+from robot.drivers.rectify import in_rgb, make_rectifier
 from robot.readings import Frame
 
 
@@ -78,13 +78,14 @@ class OpencvTactile(TactileSensor):
         allow_index: bool = False,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Raises RobotConfigError for a setting out of range; touches no device."""
+        """Raises RobotConfigError for a setting out of range or a calibration file that is none; touches no device."""
         super().__init__(f"gel {finger}", finger, clock=clock)
         preset = PRESETS[self.PRESET]
+        size_is_left = not (width or height)
         self.device, self.allow_index = device, allow_index
         self._asked = CaptureSettings(
-            width=width or preset.width,
-            height=height or preset.height,
+            width=preset.width if size_is_left else width,
+            height=preset.height if size_is_left else height,
             fps=fps or preset.fps,
             fourcc=fourcc or preset.fourcc,
             auto_exposure=auto_exposure,
@@ -96,11 +97,8 @@ class OpencvTactile(TactileSensor):
             led=tuple(led) or preset.led,
         )
         self._reading = ReaderSettings(keep=keep, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
-        self._cutting = (calibration, tuple(crop), tuple(output_px), preset.crop)
-        if not calibration:
-            make_rectifier(*self._cutting)  # what is wrong is said before anything is connected
+        self._rectifier = make_rectifier(calibration, crop, output_px, preset.crop)
         self._quarter_turns = preset.quarter_turns
-        self._rectifier = Rectifier()
         self._reader = self._make_reader()
         self._picture_px: list[int] = []
 
@@ -126,7 +124,6 @@ class OpencvTactile(TactileSensor):
         )
 
     def _connect(self) -> None:
-        self._rectifier = make_rectifier(*self._cutting)
         self._reader = self._make_reader()
         self._reader.start()
         height, width = self._read().pixels.shape[:2]  # a calibration for another size is found here

@@ -58,7 +58,8 @@ class Rectifier:
             _check_corners(self.corners_px, self.image_px)
 
     def apply(self, picture: Picture) -> Picture:
-        """(H, W, 3) to the gel alone. Raises DeviceError for a picture of another size than the calibration's."""
+        """(H, W, 3) uint8 to the gel alone. Raises DeviceError for a picture of another kind or size."""
+        check_colours(picture)
         size = (picture.shape[1], picture.shape[0])
         if self.image_px and size != self.image_px:
             raise DeviceError(
@@ -99,8 +100,21 @@ def _resized(picture: Picture, size: tuple[int, ...]) -> Picture:
     return np.asarray(cv2.resize(picture, size, interpolation=way), dtype=np.uint8)
 
 
+def check_colours(picture: npt.NDArray[Any]) -> None:
+    """Raise DeviceError for what is not (H, W, 3) uint8."""
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or not picture.size:
+        raise DeviceError(
+            f"a camera must give pictures H x W x 3 uint8, got {picture.shape} {picture.dtype}; set a fourcc with "
+            'colours, as "MJPG"'
+        )
+
+
 def in_rgb(picture: Picture) -> Picture:
-    """OpenCV's BGR to RGB, contiguous: 0.1 ms for 896 x 672 pixels, where turning the axis and copying takes 6 ms."""
+    """OpenCV's BGR to RGB, contiguous: 0.1 ms for 896 x 672 pixels, where turning the axis and copying takes 6 ms.
+
+    Raises DeviceError for what has not three colours.
+    """
+    check_colours(picture)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
