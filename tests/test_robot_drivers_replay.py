@@ -1,6 +1,7 @@
 """Films, folders of pictures and recordings as devices."""
 
 import json
+import math
 
 import cv2
 import numpy as np
@@ -102,6 +103,31 @@ def test_the_picture_nearest_to_a_time_is_found_and_none_of_the_future(make, clo
         ]
 
 
+@pytest.mark.parametrize("fps", [1.0, 0.5])
+def test_pictures_that_stand_for_long_are_never_too_old(folder, clock, fps):
+    """At half a picture a second each is shown twenty times, every tenth of a second."""
+    with ImagesSensor(finger="a", path=str(folder), fps=fps, clock=clock) as gel:
+        for later, expected in ((0.0, 20), (0.99, 20), (1.05, 60), (1.95, 60), (5.51, 220), (6.05, 20)):
+            clock.now_s = 50.0 + later / fps
+            frame = gel.read(0.11)
+            assert level(frame) == expected
+        assert level(gel.read(99.0, near_s=50.0 + 1.5 / fps)) == 60
+
+
+def test_a_slow_film_that_is_not_to_begin_again_ends_after_its_last_picture(folder, clock):
+    with ImagesSensor(finger="a", path=str(folder), fps=2.0, loop=False, clock=clock) as gel:
+        clock.now_s += 2.95
+        assert level(gel.read()) == 220
+        clock.now_s += 0.1
+        with pytest.raises(DeviceError, match=r"its 6 pictures lasted 3 s"):
+            gel.read()
+
+
+def test_a_calibration_file_that_is_none_is_named_before_connecting(make, tmp_path):
+    with pytest.raises(RobotConfigError, match=r"calibration file .*none\.json cannot be read"):
+        make(calibration=str(tmp_path / "none.json"))
+
+
 def test_connecting_again_begins_again(make, clock):
     gel = make()
     for _ in range(2):
@@ -179,7 +205,7 @@ def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
         ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
-@pytest.mark.parametrize("fps", [-1.0, float("nan"), 2000.0])
+@pytest.mark.parametrize("fps", [-1.0, float("nan"), 2000.0, 1e-3, 5e-324, float("inf")])
 def test_a_rate_out_of_range_is_refused(fps):
     with pytest.raises(RobotConfigError, match="fps"):
         VideoSensor(finger="a", path="film.avi", fps=fps)
@@ -270,12 +296,36 @@ def test_the_cameras_of_a_recording_are_replayed_with_intrinsics_from_the_rigs_f
     assert first.intrinsics.fy == 11.0
 
 
-def test_intrinsics_are_given_whole_or_not_at_all(pairs):
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"fx": 10.0},
+        {"fx": -500.0},
+        {"fx": 0.0},
+        {"cx": 3.0, "cy": 3.0},
+        LENS | {"fx": -500.0},
+        LENS | {"fy": 1e9},
+        LENS | {"cx": math.inf},
+        LENS | {"cy": math.nan},
+    ],
+)
+def test_intrinsics_are_given_whole_and_in_range_or_not_at_all(pairs, lens):
     with pytest.raises(RobotConfigError, match="fx, fy, cx and cy must be given together"):
-        camera(pairs, fx=10.0)
+        camera(pairs, **lens)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"fx": 1}', '{"fx": 1, "fy": 1, "cx": "0", "cy": 0}', '{"fx": NaN}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '{"fx": 1}',
+        '{"fx": 1, "fy": 1, "cx": "0", "cy": 0}',
+        '{"fx": NaN}',
+        json.dumps(LENS | {"fx": -500.0}),
+        json.dumps(LENS | {"cy": 10**400}),
+    ],
+)
 def test_intrinsics_that_are_none_are_refused_by_their_file(pairs, text):
     (pairs / "intrinsics.json").write_text(text)
     with pytest.raises(DeviceError, match=r"intrinsics\.json.* must"):

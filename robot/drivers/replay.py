@@ -1,7 +1,9 @@
 """Films and folders of pictures as gel sensors, and pictures with depth as a camera: to repeat, rehearse and test.
 
-A sensor counts its pictures by the clock, from when it was connected: picture n is the newest from n / fps on. Nothing
-runs between two reads. A camera goes one picture further each time it is read, however long that takes.
+A sensor counts its pictures by the clock, from when it was connected: picture n is the newest from n / fps on. Below
+LEAST_HZ pictures a second each is shown several times, each time as a new one, as a camera would see it on a screen:
+else a slow film would be a sensor whose pictures are too old. Nothing runs between two reads. A camera goes one picture
+further each time it is read, however long that takes.
 """
 
 import contextlib
@@ -19,18 +21,27 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, TactileSensor
-from robot.drivers.rectify import Rectifier, in_rgb, make_rectifier
+from robot.drivers.rectify import in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording import INFO_FILE, parse_object, read_recording
 
 _KEPT = 8
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+LEAST_HZ = 10.0
+"""So often a sensor shows a picture at least: 0.1 s is well below the age at which one is refused."""
+
+_FPS = (0.01, 1000.0)
+_MOST_PX = 1e6
+LEFT_OUT = math.nan
 INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
 
 
 class _PacedSensor(TactileSensor):
-    """Shows picture n of `_count` from n / fps seconds after connecting, again from the start where it loops."""
+    """Shows picture n of `_count` from n / fps seconds after connecting, again from the start where it loops.
+
+    `_repeats`: how often each is shown, at the `_rate_hz` that comes of it.
+    """
 
     def __init__(
         self,
@@ -45,15 +56,13 @@ class _PacedSensor(TactileSensor):
         clock: Clock,
     ) -> None:
         super().__init__(f"gel {finger}", finger, clock=clock)
-        if not 0 <= fps <= 1000:
-            raise RobotConfigError(f"fps must be from 0 (as in the file) to 1000, got {fps}")
+        if fps != 0 and not _FPS[0] <= fps <= _FPS[1]:
+            raise RobotConfigError(f"fps must be from {_FPS[0]:g} to {_FPS[1]:g}, or 0 for the file's, got {fps}")
         self.path, self.fps, self.loop = Path(path), fps, loop
         self._asked_fps = fps
-        self._cutting = (calibration, tuple(crop), tuple(output_px))
-        if not calibration:
-            make_rectifier(*self._cutting)
-        self._rectifier = Rectifier()
+        self._rectifier = make_rectifier(calibration, crop, output_px)
         self._count, self._start_s = 0, 0.0
+        self._repeats, self._rate_hz = 1, fps
         self._decoded: OrderedDict[int, npt.NDArray[np.uint8]] = OrderedDict()
 
     @abstractmethod
@@ -65,11 +74,15 @@ class _PacedSensor(TactileSensor):
         """Picture `number`, BGR. Raises DeviceError."""
 
     def _connect(self) -> None:
-        self._rectifier = make_rectifier(*self._cutting)
         self._count, rate = self._open()
         self.fps = self._asked_fps or rate
-        if self._count < 1 or not 0 < self.fps < math.inf:
-            raise DeviceError(f"{self.path} must hold pictures and say how many a second, got {self._count}, {rate:g}")
+        if self._count < 1 or not _FPS[0] <= self.fps <= _FPS[1]:
+            raise DeviceError(
+                f"{self.path} must hold pictures and say how many a second, got {self._count}, {rate:g}; if only the "
+                "rate is wrong, set fps"
+            )
+        self._repeats = max(1, math.ceil(LEAST_HZ / self.fps))
+        self._rate_hz = self._repeats * self.fps
         self._picture(0)
         self._start_s = self.clock()
 
@@ -83,19 +96,20 @@ class _PacedSensor(TactileSensor):
         return self._frame(self._now())
 
     def _read_near(self, time_s: float) -> Frame:
-        return self._frame(min(self._now(), max(0, round((time_s - self._start_s) * self.fps))))
+        return self._frame(min(self._now(), max(0, round((time_s - self._start_s) * self._rate_hz))))
 
     def _now(self) -> int:
-        number = math.floor((self.clock() - self._start_s) * self.fps)
-        if number >= self._count and not self.loop:
+        """How many pictures were shown before the one of now, repeated ones counted each time."""
+        shown = math.floor((self.clock() - self._start_s) * self._rate_hz)
+        if shown >= self._count * self._repeats and not self.loop:
             raise DeviceError(
                 f"{self.path} ended: its {self._count} pictures lasted {self._count / self.fps:.3g} s; "
                 "set loop = true to see it again and again"
             )
-        return number
+        return shown
 
-    def _frame(self, number: int) -> Frame:
-        return Frame(self._picture(number % self._count), self._start_s + number / self.fps)
+    def _frame(self, shown: int) -> Frame:
+        return Frame(self._picture(shown // self._repeats % self._count), self._start_s + shown / self._rate_hz)
 
     def _picture(self, number: int) -> npt.NDArray[np.uint8]:
         if number not in self._decoded:
@@ -207,19 +221,16 @@ class ReplayCamera(Camera):
         *,
         path: str,
         extrinsics: npt.ArrayLike,
-        fx: float = 0.0,
-        fy: float = 0.0,
-        cx: float = math.nan,
-        cy: float = math.nan,
+        fx: float = LEFT_OUT,
+        fy: float = LEFT_OUT,
+        cx: float = LEFT_OUT,
+        cy: float = LEFT_OUT,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Raises RobotConfigError for some, but not all, of fx, fy, cx and cy; opens nothing."""
+        """Raises RobotConfigError for fx, fy, cx and cy that are not all given, or out of range; opens nothing."""
         super().__init__("replay camera", extrinsics, clock=clock)
-        given = [fx > 0, fy > 0, math.isfinite(cx), math.isfinite(cy)]
-        if any(given) and not all(given):
-            raise RobotConfigError(f"fx, fy, cx and cy must be given together, got {fx}, {fy}, {cx}, {cy}")
         self.path = Path(path)
-        self._given = Intrinsics(fx, fy, cx, cy) if all(given) else None
+        self._given = _given(fx, fy, cx, cy)
         self._intrinsics: Intrinsics | None = None
         self._pairs: list[_Pair] = []
         self._next = 0
@@ -253,6 +264,22 @@ class ReplayCamera(Camera):
         return RGBD(colour, depth_m, self._intrinsics, self.clock())
 
 
+def _given(*lens: float) -> Intrinsics | None:
+    """fx, fy, cx and cy of a rig's file; None where all are left out. Raises RobotConfigError."""
+    if all(map(math.isnan, lens)):
+        return None
+    if not _is_lens(*lens):
+        raise RobotConfigError(
+            "fx, fy, cx and cy must be given together, in pixels up to a million, fx and fy above 0, got "
+            + ", ".join(f"{each:g}" for each in lens)
+        )
+    return Intrinsics(*lens)
+
+
+def _is_lens(fx: float, fy: float, cx: float, cy: float) -> bool:
+    return min(fx, fy) > 0 and all(abs(each) <= _MOST_PX for each in (fx, fy, cx, cy))  # the latter refuses NaN
+
+
 def _recorded_pairs(folder: Path) -> list[_Pair]:
     try:
         grasps = read_recording(folder).grasps
@@ -275,11 +302,14 @@ def _intrinsics(path: Path) -> Intrinsics | None:
         found: Mapping[str, Any] = parse_object(path.read_bytes())
     except RecordingError as error:
         raise DeviceError(f"{path}: {error}") from error
-    names = {"fx", "fy", "cx", "cy"}
-    numbers = {name: float(value) for name, value in found.items() if type(value) in (int, float)}
-    if set(found) != names or set(numbers) != names:
-        raise DeviceError(f"{path} must hold numbers fx, fy, cx and cy in pixels and nothing else, got {found}")
-    return Intrinsics(**numbers)
+    names = ("fx", "fy", "cx", "cy")
+    lens: list[Any] = [value for name in names if type(value := found.get(name)) in (int, float)]
+    if len(found) != 4 or len(lens) != 4 or not _is_lens(*lens):
+        raise DeviceError(
+            f"{path} must hold fx, fy, cx and cy in pixels up to a million, fx and fy above 0, and nothing else, "
+            f"got {found}"
+        )
+    return Intrinsics(*map(float, lens))
 
 
 def _depth_m(path: Path) -> npt.NDArray[np.float32]:
