@@ -29,7 +29,13 @@ COLUMNS = tuple(f"{frame}_{axis}_mm" for frame in ("camera", "rig") for axis in 
 LEAST_SPREAD = 0.02
 """Points count as on one line (plane) when they stray from it by less than this share of their extent: at 300 mm
 that is 6 mm, below which errors of 5 mm in the points turn the camera at will."""
+SUSPECT_MM = 20.0
+"""Points further off than this in the mean are warned of: twice what the paper's rig had left out."""
 _SUSPECT_SHARE, _SUSPECT_MM = 0.6, 1.0
+_LEAST_MM = 5.0
+_ENOUGH = 6
+_THOUSAND = (500.0, 2000.0)
+"""Extents whose quotient lies here are in mm and in metres: noise and a wrong depth scale do not halve or double."""
 _FAR_MM = 1e6
 _FUTURE = timedelta(days=1)
 
@@ -71,14 +77,23 @@ class HandEye:
 
     @property
     def warning(self) -> str | None:
-        """What is suspicious: that stretching space explains left-out points much better than moving the camera."""
+        """What is suspicious, with its likely cause: another unit, a mirrored axis, a camera that measures wrong (as
+        stretching space explains left-out points much better than moving the camera), or wrong pairs."""
         rigid, affine = self.rigid_errors, self.affine_errors
+        if causes := [*_unit_causes(self.camera_mm, self.rig_mm), *_mirror_causes(self)]:
+            return f"{_off(rigid)}: {'; '.join(causes)}"
         enough = min(_SUSPECT_SHARE * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM)
-        if affine is None or affine.loo_mean_mm > enough:
+        if affine is not None and affine.loo_mean_mm <= enough:
+            return (
+                f"left-out points are {affine.loo_mean_mm:.1f} mm off by an affine map and {rigid.loo_mean_mm:.1f} mm "
+                "by a rigid one: the camera's intrinsics or depth scale are suspect; calibrate them, then take the "
+                "points again"
+            )
+        if max(rigid.mean_mm, rigid.loo_mean_mm) <= SUSPECT_MM:
             return None
         return (
-            f"left-out points are {affine.loo_mean_mm:.1f} mm off by an affine map and {rigid.loo_mean_mm:.1f} mm by a "
-            "rigid one: the camera's intrinsics or depth scale are suspect; calibrate them, then take the points again"
+            f"{_off(rigid)}, which is more than {SUSPECT_MM:g}: are camera points paired with the wrong rig points, or "
+            "single points mistaken? Look at each pair"
         )
 
     def age_days(self, now: datetime | None = None) -> float:
@@ -225,6 +240,39 @@ def _document(found: HandEye) -> Mapping[str, Any]:
         [{"camera_mm": camera, "rig_mm": rig} for camera, rig in pairs],
     )
     return dict(zip(_KEYS, values, strict=True))
+
+
+def _off(errors: Errors) -> str:
+    return f"points are {errors.mean_mm:.1f} mm off by the rigid map, and {errors.loo_mean_mm:.1f} mm when left out"
+
+
+def _unit_causes(camera: Points, rig: Points) -> list[str]:
+    if max(_extent(rig), _extent(camera)) < _LEAST_MM:
+        return ["all points seem to be in metres, they must be in mm"]
+    share = _extent(rig) / _extent(camera)
+    low, high = _THOUSAND
+    named = (("camera", low <= share <= high), ("rig", low <= 1 / share <= high))
+    return [f"the {name} points seem to be in metres, they must be in mm" for name, is_so in named if is_so]
+
+
+def _mirror_causes(found: HandEye) -> list[str]:
+    """Whether a mirrored camera, of whatever unit, fits much better, or the affine map mirrors. Points on a plane do
+    not tell, and of the corners of a tetrahedron two confused ones look the same."""
+    rig, scaled = found.rig_mm, found.camera_mm * (_extent(found.rig_mm) / _extent(found.camera_mm))
+    plain, mirrored = (
+        float(np.linalg.norm(apply_map(fit_rigid(points, rig), points) - rig, axis=1).mean())
+        for points in (scaled, scaled * [1.0, 1.0, -1.0])
+    )
+    explains = plain > 2 * mirrored + _SUSPECT_MM
+    if not explains and (found.affine is None or np.linalg.det(found.affine[:3, :3]) > 0):
+        return []
+    other = "" if explains and len(rig) >= _ENOUGH else ", or camera points are paired with the wrong rig points"
+    return [f"one axis seems to be mirrored, or two swapped (x right, y down, z forward; the rig's z up){other}"]
+
+
+def _extent(points: Points) -> float:
+    """Root of the mean squared distance from the mean; above 0, as points on a line are refused."""
+    return float(np.sqrt(np.square(points - points.mean(0)).sum(1).mean()))
 
 
 def _points(name: str, points: npt.ArrayLike) -> Points:

@@ -120,6 +120,89 @@ def _off(matrix, camera, rig):
     return np.linalg.norm(hand_eye.apply_map(matrix, camera) - rig, axis=1)
 
 
+def pairs(count, seed, noise_mm=3.0):
+    """Points of a rig of 300 mm and where a right camera, 700 mm away, sees them."""
+    rng = np.random.default_rng(seed)
+    chosen = [0, 3, 5, 6] if count == 4 else range(count)  # four corners that span the cube
+    camera = 300 * cube(1.0)[chosen] + [-150.0, -150.0, 550.0]
+    return camera, camera @ rotation(seed).T + [10.0, 20.0, 700.0] + rng.normal(0, noise_mm, camera.shape)
+
+
+@pytest.mark.parametrize("count", [4, 5, 9])
+@pytest.mark.parametrize("seed", range(5))
+def test_metres_for_millimetres_are_named_however_few_the_points(count, seed):
+    camera, rig = pairs(count, seed)
+    assert fit_hand_eye(camera, rig).warning is None
+    found = fit_hand_eye(camera / 1000, rig)
+    assert found.rigid_errors.mean_mm > 100
+    assert "the camera points seem to be in metres" in found.warning
+    assert "the rig points seem to be in metres" in fit_hand_eye(camera, rig / 1000).warning
+    assert "all points seem to be in metres" in fit_hand_eye(camera / 1000, rig / 1000).warning
+    assert "mirrored" not in found.warning
+
+
+@pytest.mark.parametrize("count", [4, 5, 9])
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("wrong", [[1, 1, -1], [1, -1, 1], [-1, -1, -1]])
+def test_a_mirrored_axis_is_named_however_few_the_points(count, seed, wrong):
+    camera, rig = pairs(count, seed)
+    found = fit_hand_eye(camera * wrong, rig)
+    assert found.rigid_errors.mean_mm > 20
+    assert "one axis seems to be mirrored" in found.warning
+    assert "metres" not in found.warning
+    if found.affine is not None:
+        assert np.linalg.det(found.affine[:3, :3]) < 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_mirrored_axis_is_named_where_the_points_are_thin_along_it(seed):
+    """60 mm of depth under 5 mm of noise: being mirrored costs some 20 mm."""
+    camera, rig = pairs(9, seed, noise_mm=5.0)
+    thin = camera * [1, 1, 0.2]
+    rig = thin @ rotation(seed).T + (rig - camera @ rotation(seed).T)
+    assert fit_hand_eye(thin, rig).warning is None
+    assert "mirrored" in fit_hand_eye(thin * [1, 1, -1], rig).warning
+
+
+def test_both_at_once_and_swapped_axes_are_named():
+    camera, rig = pairs(9, 0)
+    both = fit_hand_eye(camera * [1e-3, 1e-3, -1e-3], rig).warning
+    assert "metres" in both
+    assert "mirrored" in both
+    assert "or two swapped" in fit_hand_eye(camera[:, [1, 0, 2]], rig).warning
+
+
+@pytest.mark.parametrize("count", [4, 9])
+def test_wrong_pairs_are_named_where_nothing_else_explains_the_error(count):
+    camera, rig = pairs(count, 0)
+    swapped = rig.copy()
+    swapped[[0, 3]] = rig[[3, 0]]
+    found = fit_hand_eye(camera, swapped)
+    assert found.rigid_errors.mean_mm > 20
+    assert "paired with the wrong rig points" in found.warning
+
+
+def test_a_left_out_error_alone_is_warned_of_too():
+    """One point is 90 mm off: four of five pairs agree."""
+    camera, rig = pairs(9, 1, noise_mm=0.0)
+    rig[8] += [0.0, 90.0, 0.0]
+    found = fit_hand_eye(camera, rig)
+    limit = (found.rigid_errors.mean_mm + found.rigid_errors.loo_mean_mm) / 2
+    assert found.rigid_errors.mean_mm < limit < found.rigid_errors.loo_mean_mm
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hand_eye, "SUSPECT_MM", limit)
+        assert "single points mistaken" in found.warning
+        patch.setattr(hand_eye, "SUSPECT_MM", 1.1 * found.rigid_errors.loo_mean_mm)
+        assert found.warning is None
+
+
+def test_points_on_a_plane_are_never_called_mirrored():
+    camera, rig = pairs(9, 2)
+    camera[:, 2] = 700.0
+    flat = camera @ rotation(2).T + np.random.default_rng(0).normal(0, 3.0, rig.shape)
+    assert fit_hand_eye(camera * [1, 1, -1], flat).warning is None
+
+
 LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
 
 
