@@ -120,10 +120,12 @@ class WSG50(Gripper):
         self._set_up()
 
     def _close(self) -> None:
-        if not self._link.is_open:
+        """Announced is only the end of a line to jaws that stand: unannounced it makes the gripper FAST STOP (TCP)."""
+        if not (self._link.has_echoed or self._motions.unsettled):  # closed, or nobody there: nothing was begun
+            self._link.close()
             return
         try:
-            failure = first_failure([self._setup.stop_if_it_moves, self._motions.quiet, self._announce])
+            failure = first_failure([self._stand]) or first_failure([self._motions.quiet, self._announce])
         finally:
             self._link.close()
         if failure:
@@ -148,6 +150,8 @@ class WSG50(Gripper):
                 raise
 
     def _stop(self) -> None:
+        if not self._link.is_open:
+            self._setup.open_again()
         for left in reversed(range(self._wanted.reconnect_tries)):
             try:
                 self._motions.stop()
@@ -162,7 +166,6 @@ class WSG50(Gripper):
         return self._as_state(read(self._link))
 
     def _open(self, opening_mm: float) -> GripperState:
-        self._check("opening", opening_mm, *self._setup.openings, "mm")
         reading = self._ready()
         if reading.grasping in _CLOSED_ON:
             reading = self._release(max(opening_mm, self._further(reading)))
@@ -171,7 +174,6 @@ class WSG50(Gripper):
         return self._as_state(reading)
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
-        self._check("speed", speed_mm_s, self._setup.limits.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         reading = self._ready()
         if reading.grasping in _CLOSED_ON:
             self._release(self._further(reading))
@@ -239,10 +241,18 @@ class WSG50(Gripper):
     def _take_limits(self) -> None:
         """What the gripper can do, below the ceilings."""
         limits, share = self._setup.limits, self._wanted.finger_share
-        self.stroke_mm = self._setup.openings[1]
+        self.min_opening_mm, self.stroke_mm = self._setup.openings
         self.min_force_n = on_finger(limits.min_force_n, share)
         self.max_force_n = min(self._wanted.max_force_n, on_finger(limits.max_force_n, share))
+        self.min_speed_mm_s = limits.min_speed_mm_s
         self.max_speed_mm_s = min(self._wanted.max_speed_mm_s, limits.max_speed_mm_s)
+
+    def _stand(self) -> None:
+        """Stop what moves, also where a motion was begun and the line was lost: a serial one tells the jaws nothing."""
+        if self._link.is_open:
+            self._setup.stop_if_it_moves(self._stop)
+        else:
+            self._stop()
 
     def _announce(self) -> None:
         self._link.tell(commands.disconnect())

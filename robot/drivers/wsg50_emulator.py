@@ -1,6 +1,6 @@
 """An emulated WSG-50 on a real port, TCP or pseudo-terminal, with faults on the line.
 
-    python -m robot.drivers.wsg50_emulator --tcp 1000 --object-mm 40 [--faults 0.02 --seed 0]
+    python -m robot.drivers.wsg50_emulator --tcp 10000 --object-mm 40 [--faults 0.02 --seed 0]
     python -m robot.drivers.wsg50_emulator --pty
 
 or in a program:
@@ -11,6 +11,7 @@ or in a program:
 
 import argparse
 import contextlib
+import logging
 import os
 import select
 import socket
@@ -23,12 +24,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from robot.drivers.wsg50_codec import Frame, decode, encode
-from robot.drivers.wsg50_emulated import UPDATES, Emulator
+from robot.drivers.wsg50_codec import PREAMBLE, Frame, decode, encode
+from robot.drivers.wsg50_emulated import Emulator
+from robot.drivers.wsg50_emulated_numbers import UPDATES
 from robot.drivers.wsg50_faults import Faults
 
 __all__ = ["Emulator", "Faults", "main", "serve_pty", "serve_tcp"]
 
+_log = logging.getLogger(__name__)
 _TICK_S = 0.001
 _CHUNK = 4096
 
@@ -144,11 +147,15 @@ def _serve(
     wait_for_client: Callable[[threading.Event], _Line | None],
     stop: threading.Event,
 ) -> None:
-    """Client after client."""
+    """Client after client, whatever one of them has sent."""
     while (line := wait_for_client(stop)) is not None:
         emulator.connected()
-        with contextlib.suppress(OSError, _Cut):
+        try:
             _Session(emulator, faults, line).run(stop)
+        except (OSError, _Cut):
+            pass  # the client has gone
+        except Exception:
+            _log.exception("the emulated gripper failed on what a client sent; the next client is served")
         line.close()
         if isinstance(line, _Socket):
             emulator.disconnected()
@@ -177,15 +184,21 @@ class _Session:
         if not data:
             raise _Cut
         self._arrived += data
-        for command in _frames(self._arrived):
-            for piece in self.faults.on(command):
+        for noise, command in _frames(self._arrived):
+            self._take(noise)
+            for piece in self.faults.on(command) if command else ():
                 time.sleep(piece.pause_s)
                 if piece.data is None:
                     raise _Cut
-                self._heard += piece.data
-                for heard in _frames(self._heard):
-                    for answer in self.emulator.receive(heard):
-                        self._say(answer)
+                self._take(piece.data)
+
+    def _take(self, data: bytes) -> None:
+        """What is left of what was sent, after its faults."""
+        self._heard += data
+        for noise, command in _frames(self._heard):
+            answers = [answer for each in _damaged(noise) for answer in self.emulator.receive_damaged(each)]
+            for answer in answers + (self.emulator.receive(command) if command else []):
+                self._say(answer)
 
     def _say(self, frame: Frame) -> None:
         for piece in self.faults.on(frame):
@@ -198,14 +211,21 @@ class _Session:
         self.line.write(encode(frame))
 
 
-def _frames(buffer: bytearray) -> Iterator[Frame]:
-    """Take the whole frames out of a buffer."""
+def _frames(buffer: bytearray) -> Iterator[tuple[bytes, Frame | None]]:
+    """Take the whole frames out of a buffer, each with the noise before it; at last the noise behind them."""
     while True:
         used, frame = decode(buffer)
+        noise = bytes(buffer[: used - len(encode(frame))] if frame else buffer[:used])
         del buffer[:used]
+        yield noise, frame
         if frame is None:
             return
-        yield frame
+
+
+def _damaged(noise: bytes) -> Iterator[int]:
+    """Ids of the frames that have begun in noise."""
+    for begun in noise.split(PREAMBLE)[1:]:
+        yield from begun.lstrip(PREAMBLE)[:1]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -226,6 +246,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with serving as address:
             print(address, flush=True)
             threading.Event().wait()
+    except OSError as error:
+        parser.error(f"it must be served somewhere, and cannot be: {error.strerror}; try another port, --tcp 0 for any")
     except KeyboardInterrupt:
         print(f"faults: {faults.counts}", file=sys.stderr)
 

@@ -5,18 +5,19 @@ comes late bears the same id as the one that is waited for. So after anything ha
 before the next command is sent the gripper is made to echo a token that nobody has used: it answers in the order in
 which it is asked, so whatever comes before the echo is old and is dropped.
 
-Reading is done by whoever waits: updates are only wanted while something is waited for.
+Reading is done by whoever waits: updates are only wanted while something is waited for. A wait ends at its deadline
+whatever still comes.
 """
 
 import itertools
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from robot.drivers import wsg50_commands as commands
-from robot.drivers.wsg50_codec import Frame, WireError, decode, encode
+from robot.drivers.wsg50_codec import MAX_PAYLOAD, Frame, WireError, decode, encode
 from robot.drivers.wsg50_commands import Command, Status, name_of
 from robot.drivers.wsg50_port import LinkLost, Port
 from robot.errors import DeviceError
@@ -26,9 +27,19 @@ _TRIES = 3
 _GAP_SHARE = 0.25
 """Share of the time-out after which a frame that has begun is given up: the rest of it is not coming."""
 
+_PADDING = bytes(MAX_PAYLOAD + 8)
+"""Ends any frame that the gripper may still be waiting for the rest of, and can begin none."""
+
+_MOST_AT_ONCE = 1 << 16
+"""Bytes taken in by a look at what has come: more than gathers while this program is held up for some seconds."""
+
 
 class NoReply(DeviceError):
-    """The gripper did not answer in time; whether it heard the command is not known."""
+    """The gripper did not answer in time, or heard a damaged command; whether it heard it is not known."""
+
+
+class NoEcho(NoReply):
+    """Nobody is there: asking again is of no use."""
 
 
 class CommandFailed(DeviceError):
@@ -51,6 +62,8 @@ class Link:
         self.name, self.baud, self.stop_bits, self.timeout_s = port, baud, stop_bits, timeout_s
         self.counts: Counter[str] = Counter()
         self.updates: dict[int, tuple[bytes, float]] = {}
+        self.has_echoed = False
+        """Whether a gripper has answered over the port that is open now."""
         self._port: Port | None = None
         self._buffer = bytearray()
         self._last_byte_s = 0.0
@@ -72,7 +85,7 @@ class Link:
 
     def close(self) -> None:
         """Close the port, if it is open; never raises."""
-        port, self._port = self._port, None
+        port, self._port, self.has_echoed = self._port, None, False
         if port is not None:
             port.close()
 
@@ -90,6 +103,8 @@ class Link:
         for _ in range(_TRIES - 1):
             try:
                 return parse(self.call(frame))
+            except NoEcho:
+                raise
             except (NoReply, WireError):
                 self.counts["asked again"] += 1
                 self._in_doubt = True
@@ -105,8 +120,7 @@ class Link:
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
         """Status of the next reply to this command, PENDING too, or None after `timeout_s`. Notes updates."""
-        deadline = time.monotonic() + timeout_s
-        while frame := self._receive(deadline):
+        for frame in self._frames(timeout_s):
             if self._note(frame, command_id) and (reply := self._reply(frame)):
                 return reply[0]
         return None
@@ -121,14 +135,20 @@ class Link:
 
     def sync(self) -> None:
         """Have a fresh token echoed, and drop whatever comes before it."""
-        for _ in range(_TRIES):
+        for number in range(_TRIES):
+            if number:
+                self.pad()
             token = next(self._tokens).to_bytes(8, "little")
             self._write(commands.loop(token))
             if self._echoed(Frame(Command.LOOP, bytes(2) + token)):
-                self._in_doubt = False
+                self._in_doubt, self.has_echoed = False, True
                 return
             self.counts["no echo"] += 1
-        raise NoReply(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
+        raise NoEcho(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
+
+    def pad(self) -> None:
+        """Free the gripper of a frame whose damaged length swallows what it is told next: before saying it again."""
+        self._guarded(lambda port: port.write(_PADDING))
 
     def doubt(self) -> None:
         """Have the line cleared before the next command."""
@@ -136,13 +156,11 @@ class Link:
 
     def pump(self, seconds: float) -> None:
         """Note what comes within `seconds`; 0 for what has come."""
-        deadline = time.monotonic() + seconds
-        while frame := self._receive(deadline):
+        for frame in self._frames(seconds):
             self._note(frame, None)
 
     def _echoed(self, echo: Frame) -> bool:
-        deadline = time.monotonic() + self.timeout_s
-        while frame := self._receive(deadline):
+        for frame in self._frames(self.timeout_s):
             if frame == echo:
                 return True
             self._note(frame, None)
@@ -150,12 +168,13 @@ class Link:
 
     def _result(self, command_id: int) -> bytes:
         """Parameters of the last reply to the command begun last."""
-        deadline = time.monotonic() + self.timeout_s
-        while frame := self._receive(deadline):
+        for frame in self._frames(self.timeout_s):
             reply = self._reply(frame) if self._note(frame, command_id) else None
             if reply is None or reply[0] is Status.CMD_PENDING:
                 continue
             self._in_doubt = False
+            if reply[0] is Status.CHECKSUM_ERROR:
+                raise NoReply(f"the gripper must hear {name_of(command_id)} undamaged, and did not (CHECKSUM_ERROR)")
             if reply[0] is not Status.SUCCESS:
                 raise CommandFailed(command_id, reply[0])
             return reply[1]
@@ -178,25 +197,36 @@ class Link:
             self.counts["no status"] += 1
             return None
 
-    def _receive(self, deadline: float) -> Frame | None:
-        """The next frame, or None at the deadline. A frame that stops half-way is given up."""
-        while True:
-            used, frame = decode(self._buffer)
-            del self._buffer[:used]
-            if frame is not None:
-                return frame
-            given_up_s = self._last_byte_s + _GAP_SHARE * self.timeout_s if self._buffer else deadline
-            if self._fill(min(deadline, given_up_s)):
-                continue
-            if self._buffer and time.monotonic() >= given_up_s:
-                self.counts["given up"] += 1
-                del self._buffer[:1]
-            elif time.monotonic() >= deadline:
-                return None
+    def _frames(self, seconds: float) -> Iterator[Frame]:
+        """What comes within `seconds`, and then what has come by then. A frame that stops half-way is given up."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if frame := self._decoded():
+                yield frame
+            else:
+                self._wait(deadline)
+        most = len(self._buffer) + _MOST_AT_ONCE
+        while len(self._buffer) < most and self._fill(0.0):
+            pass
+        while frame := self._decoded():
+            yield frame
 
-    def _fill(self, deadline: float) -> bool:
-        """Take in bytes; False where none come before the deadline."""
-        data = self._guarded(lambda port: port.read(deadline - time.monotonic()))
+    def _decoded(self) -> Frame | None:
+        used, frame = decode(self._buffer)
+        del self._buffer[:used]
+        return frame
+
+    def _wait(self, deadline: float) -> None:
+        """Take in bytes as soon as they come, or give up a frame whose rest does not."""
+        given_up_s = self._last_byte_s + _GAP_SHARE * self.timeout_s if self._buffer else deadline
+        came = self._fill(min(deadline, given_up_s) - time.monotonic())
+        if not came and self._buffer and time.monotonic() >= given_up_s:
+            self.counts["given up"] += 1
+            del self._buffer[:1]
+
+    def _fill(self, seconds: float) -> bool:
+        """Take in bytes; False where none come within `seconds`."""
+        data = self._guarded(lambda port: port.read(seconds))
         if data:
             self._buffer += data
             self._last_byte_s = time.monotonic()

@@ -18,16 +18,23 @@ from robot.drivers.wsg50_link import CommandFailed, Link, NoReply
 from robot.errors import DeviceError
 
 _log = logging.getLogger(__name__)
-_WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.SPEED, Command.FORCE)
+_WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE)
+UPDATE_BYTES = 25
+"""Of an update of each: 10 around a payload, and status and value, 6 and 3."""
+
 _MOVING = {GraspingState.GRASPING, GraspingState.RELEASING, GraspingState.POSITIONING}
 _FAULTS = (
-    SystemState.TEMPERATURE_FAULT
+    SystemState.TEMPERATURE_WARNING
+    | SystemState.TEMPERATURE_FAULT
     | SystemState.POWER_FAULT
     | SystemState.CURRENT_FAULT
     | SystemState.FINGER_FAULT
     | SystemState.COMMAND_FAILURE
     | SystemState.SCRIPT_FAILURE
 )
+_MAY_BE_SENT_AGAIN = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
+"""Answers to a motion that the gripper, standing, has not done: it was not heard."""
+
 _POLL_S = 0.01
 
 
@@ -81,6 +88,16 @@ class Motions:
 
     def __init__(self, link: Link, *, max_age_s: float, period_ms: int) -> None:
         self.link, self.max_age_s, self.period_ms = link, max_age_s, period_ms
+        self.unsettled = False
+        """Whether a motion was begun after which the jaws were not yet seen to stand."""
+        self.kept = SystemState(0)
+        """What all updates of the last motion had in common."""
+
+    def read(self) -> Reading:
+        """Ask for all of a Reading, and note whether the jaws stand. Raises DeviceError."""
+        reading = read(self.link)
+        self.unsettled = self.unsettled and reading.moves
+        return reading
 
     def run(self, frame: Frame, seconds: float, done: Done) -> Reading:
         """Send a motion, wait until it has ended, for `seconds` at most, and return what the gripper says then.
@@ -93,7 +110,7 @@ class Motions:
             reading = self._standing(deadline)
             if done(reading, status):
                 return reading
-            if reading.system & SystemState.FAST_STOP or status not in (None, Status.SUCCESS) or last_try:
+            if reading.system & SystemState.FAST_STOP or status not in _MAY_BE_SENT_AGAIN or last_try:
                 break
             self.link.counts["sent again"] += 1
         answer = "nothing" if status is None else status.name
@@ -130,12 +147,14 @@ class Motions:
             except NoReply:
                 if number == len(frames):
                     raise
+                self.link.pad()
 
     def _watch(self, frame: Frame, deadline: float) -> Status | None:
         """Send the motion and return its last answer, or None where the gripper stands and has not answered."""
         link = self.link
         for command in _WATCHED:
             link.tell(commands.update(command, self.period_ms))
+        self.unsettled, self.kept = True, ~SystemState(0)
         link.begin(frame)
         stands_since = time.monotonic()
         while True:
@@ -144,7 +163,7 @@ class Motions:
             if status not in (None, Status.CMD_PENDING):
                 break
             self._check_age(now)
-            if status is Status.CMD_PENDING or self._moves():
+            if self._moves() or status is Status.CMD_PENDING:
                 stands_since = now
             if now - stands_since > link.timeout_s:
                 break
@@ -173,12 +192,13 @@ class Motions:
         raise error
 
     def _moves(self) -> bool:
-        """Whether the last updates say that it moves."""
+        """Whether the last updates say that it moves. Notes them in `kept`."""
         try:
             system = commands.system_state(self.link.updates[Command.SYSTEM_STATE][0])
             grasping = commands.grasping_state(self.link.updates[Command.GRASPING_STATE][0])
         except WireError:
             return True  # not known: look again
+        self.kept &= system
         return bool(system & SystemState.MOVING) or grasping in _MOVING
 
     def _standing(self, deadline: float) -> Reading:
@@ -190,6 +210,6 @@ class Motions:
 
     def _last_reading(self, deadline: float) -> Reading:
         """What the gripper says when it stands, or at the deadline."""
-        while (reading := read(self.link)).moves and time.monotonic() < deadline:
+        while (reading := self.read()).moves and time.monotonic() < deadline:
             self.link.pump(_POLL_S)
         return reading

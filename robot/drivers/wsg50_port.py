@@ -27,8 +27,16 @@ class Port:
         self.name = name
         try:
             self._serial: Any = serial.serial_for_url(
-                name, baudrate=baud, stopbits=stop_bits, timeout=0, write_timeout=write_timeout_s, exclusive=True
+                name,
+                do_not_open=True,
+                baudrate=baud,
+                stopbits=stop_bits,
+                timeout=0,
+                write_timeout=write_timeout_s,
+                exclusive=True,
             )
+            self._serial.reset_input_buffer = lambda: None  # pyserial's does not end while a socket's peer sends
+            self._serial.open()
         except Exception as error:  # pyserial lets termios.error, ValueError and others out
             raise LinkLost(f"the gripper's port {name} cannot be opened: {_words(error)}") from error
 

@@ -2,17 +2,18 @@
 
 import logging
 import math
+import struct
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from robot.drivers import wsg50_commands as commands
 from robot.drivers.wsg50_codec import Frame
-from robot.drivers.wsg50_commands import Command, Limits, Status, SystemState
+from robot.drivers.wsg50_commands import Command, GraspingState, Limits, Status, SystemState
 from robot.drivers.wsg50_force import of_gripper, on_finger
 from robot.drivers.wsg50_link import CommandFailed, Link
-from robot.drivers.wsg50_motion import Motions, Reading, causes, read
+from robot.drivers.wsg50_motion import UPDATE_BYTES, Motions, Reading, causes, read
 from robot.drivers.wsg50_port import LinkLost
 from robot.errors import DeviceError, RobotConfigError
 
@@ -35,6 +36,9 @@ _RANGES = {
     "max_speed_mm_s": (1e-3, 1e4),
     "max_state_age_s": (1e-3, 60),
 }
+
+_ROUNDING = 1e-6
+"""How much harder than asked a gripper may clamp, relatively: less than numbers of 32 bits are off."""
 
 TYPICAL = Limits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
 """Of a WSG-50-110, until the gripper has said its own."""
@@ -66,7 +70,11 @@ class Settings:
     max_state_age_s: float
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        for field in fields(self):
+            if not _is_a(field.type, getattr(self, field.name)):
+                kind = getattr(field.type, "__name__", field.type)
+                raise RobotConfigError(f"{field.name} must be a {kind}, got {getattr(self, field.name)!r}")
         for name, (least, most) in _RANGES.items():
             if not least <= getattr(self, name) <= most:
                 raise RobotConfigError(f"{name} must be from {least:g} to {most:g}, got {getattr(self, name)!r}")
@@ -77,6 +85,16 @@ class Settings:
         soft = tuple(self.soft_limits_mm)
         if soft and (len(soft) != 2 or not 0 <= soft[0] < soft[1] < math.inf):
             raise RobotConfigError(f"soft_limits_mm must be the least and greatest opening, or empty; got {soft}")
+        self._check_rate()
+
+    def _check_rate(self) -> None:
+        """A serial line that is full of updates has no room for answers. A byte has 8 data bits and a start bit."""
+        bits_s = UPDATE_BYTES * (9 + self.stop_bits) * 1000 / self.update_ms
+        if not self.port.startswith("socket://") and bits_s > 0.5 * self.baud:
+            raise RobotConfigError(
+                f"baud must be at least {2 * bits_s:g} for updates every {self.update_ms} ms, which then fill half of "
+                f"the line; got {self.baud}"
+            )
 
 
 class Setup:
@@ -95,7 +113,7 @@ class Setup:
         """All of it, over an open line. Homes where the reference is lost."""
         self.limits = self.link.ask(commands.ask(Command.LIMITS), commands.limits)
         self._check_ceilings()
-        self.stop_if_it_moves()
+        self.stop_if_it_moves(self.motions.stop)
         self._end_fast_stop()
         if not self._system_state() & SystemState.REFERENCED:
             _log.warning("%s does not know its reference: homing, the jaws move", self.name)
@@ -126,18 +144,28 @@ class Setup:
             time.sleep(self.settings.reconnect_s)
 
     def home(self) -> Reading:
-        """Find the reference."""
+        """Find the reference. That it is there proves homing if it was not before, or not while it moved."""
         frame = commands.home(_DIRECTIONS[self.settings.home_direction])
-        return self.motions.run(frame, self.settings.homing_timeout_s, _is_homed)
+        before = self._system_state()
 
-    def stop_if_it_moves(self) -> None:
+        def done(reading: Reading, status: Status | None) -> bool:
+            proven = status is Status.SUCCESS or not SystemState.REFERENCED & before & self.motions.kept
+            return proven and bool(reading.system & SystemState.REFERENCED)
+
+        return self.motions.run(frame, self.settings.homing_timeout_s, done)
+
+    def stop_if_it_moves(self, stop: Callable[[], None]) -> None:
         """Standing jaws are left as they are: STOP would drop what they hold."""
         try:
-            moves = read(self.link).moves
+            moves = self.motions.read().moves
+        except LinkLost:
+            if not self.motions.unsettled:
+                raise
+            moves = True
         except DeviceError:
             moves = True  # not known
         if moves:
-            self.motions.stop()
+            stop()
 
     def check_stands(self) -> None:
         """Settings that change while it moves raise a FAST STOP."""
@@ -147,14 +175,19 @@ class Setup:
     def set_force(self, force_n: float) -> None:
         """Set the force limit and read it back; a gripper that would clamp harder than asked is not used."""
         share = self.settings.finger_share
-        wanted = of_gripper(force_n, share)
+        wanted, ceiling = self._limit_for(force_n), self._limit_for(self.settings.max_force_n)
         self.link.tell(commands.set_force_limit(wanted))
         has = self.link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number)
         self._note("force_n", force_n, on_finger(has, share))
-        if has > 1.01 * wanted:
+        if has > min(wanted * (1 + _ROUNDING), ceiling):
             raise DeviceError(
                 f"{self.name}: the force limit must be {wanted:g} N, the gripper has {has:g} N; it is not told to grasp"
             )
+
+    def _limit_for(self, force_n: float) -> float:
+        """The gripper's count for a force on each finger, as a number of 32 bits that is not above it."""
+        wanted = of_gripper(force_n, self.settings.finger_share)
+        return max(_float32_at_most(wanted), self.limits.min_force_n)
 
     def set_acceleration(self, acceleration_mm_s2: float) -> float:
         """Set the acceleration; returns what the gripper has then."""
@@ -169,6 +202,8 @@ class Setup:
         """Set the openings that no motion leaves, or clear them where `asked` is empty; returns what it has then."""
         for each in asked:
             self._require("soft_limits_mm", each, 0.0, self.limits.stroke_mm)
+        if asked:
+            self._check_grasp_width(asked[1])
         self.link.tell(commands.set_soft_limits(*asked) if asked else commands.ask(Command.CLEAR_SOFT_LIMITS))
         return self._learn_openings(asked)
 
@@ -218,14 +253,19 @@ class Setup:
 
     def _apply(self) -> None:
         settings = self.settings
-        self.set_force(on_finger(self.limits.min_force_n, settings.finger_share))
+        holds = self.motions.read().grasping is GraspingState.HOLDING
+        if not holds:  # else what is held would be held with less, and be dropped
+            self.set_force(on_finger(self.limits.min_force_n, settings.finger_share))
         if settings.acceleration_mm_s2:
             self.set_acceleration(settings.acceleration_mm_s2)
         if settings.soft_limits_mm:
             self.set_soft_limits(settings.soft_limits_mm)
         else:
             self._learn_openings(())
-        if settings.tare:
+        self.refused.pop("tare", None)
+        if settings.tare and holds:
+            self.refused["tare"] = "asked true, but something is held; open it, then call tare()"
+        elif settings.tare:
             self._tare()
 
     def _tare(self) -> None:
@@ -248,7 +288,15 @@ class Setup:
             self.refused["soft_limits_mm"] = f"asked {tuple(asked)}, has {has}"
         least, greatest = has or (0.0, self.limits.stroke_mm)
         self.openings = max(0.0, least), min(greatest, self.limits.stroke_mm)
+        self._check_grasp_width(self.openings[1])
         return has
+
+    def _check_grasp_width(self, greatest_mm: float) -> None:
+        if self.settings.grasp_width_mm > greatest_mm:
+            raise DeviceError(
+                f"{self.name}: grasp_width_mm must be at most the greatest opening, {greatest_mm:g} mm, got "
+                f"{self.settings.grasp_width_mm:g}; set it lower, or the soft limits wider"
+            )
 
     def _require(self, name: str, value: float, least: float, most: float) -> None:
         if not least <= value <= most:
@@ -271,8 +319,19 @@ def first_failure(steps: Sequence[Callable[[], None]]) -> DeviceError | None:
     return failure
 
 
-def _is_homed(reading: Reading, status: Status | None) -> bool:
-    return bool(reading.system & SystemState.REFERENCED) and status is Status.SUCCESS
+def _is_a(kind: Any, value: object) -> bool:
+    """Whether a setting is of the type it is declared with; a whole number is a float, true is none."""
+    if kind == Sequence[float]:
+        return isinstance(value, Sequence) and all(_is_a(float, each) for each in value)
+    return isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
+
+
+def _float32_at_most(value: float) -> float:
+    """The greatest number of 32 bits up to `value` (> 0)."""
+    packed = struct.pack("<f", value)
+    if struct.unpack("<f", packed)[0] > value:
+        packed = struct.pack("<I", struct.unpack("<I", packed)[0] - 1)  # bits of positive numbers count like them
+    return float(struct.unpack("<f", packed)[0])
 
 
 def _near(asked: float, has: float) -> bool:

@@ -1,0 +1,73 @@
+"""A WSG-50's driver on an emulated gripper, for tests: lines that damage the frames they are told to."""
+
+import contextlib
+import time
+from unittest.mock import patch
+
+import pytest
+from serial.urlhandler import protocol_socket
+
+from robot.drivers.wsg50 import WSG50
+from robot.drivers.wsg50_codec import Frame, encode
+from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
+from robot.drivers.wsg50_faults import Piece
+from robot.errors import DeviceError
+
+SERVE = {"tcp": serve_tcp, "pty": serve_pty}
+QUICK = {"timeout_s": 0.3, "reconnect_s": 0.01, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}
+HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE, TARE = 0x20, 0x21, 0x22, 0x23, 0x24, 0x25, 0x26, 0x38
+
+
+PORTS = pytest.mark.parametrize("port", SERVE)
+
+
+class Script(Faults):
+    """Does to the frames named by (id, number of the frame with this id) what it is told: the counting starts when
+    told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
+    none comes before it."""
+
+    def __init__(self):
+        super().__init__()
+        self.plan, self.seen = {}, {}
+
+    def tell(self, plan):
+        self.plan, self.seen = plan, {}
+
+    def on(self, frame):
+        self.seen[frame.id] = self.seen.get(frame.id, 0) + 1
+        kind = self.plan.get((frame.id, self.seen[frame.id])) or self.plan.get(frame.id)
+        plain = encode(frame)
+        if kind == "long":  # claims 255 bytes: what comes next is taken for them
+            return [Piece(plain[:4] + b"\xff\x00" + plain[6:])]
+        if kind == "bad sum":
+            return [Piece(plain[:-1] + bytes([plain[-1] ^ 0xFF]))]
+        if kind == "after a result":
+            return [Piece(encode(Frame(frame.id, bytes(2))) + plain)]
+        return list(self._damaged(kind, frame, plain) if kind else [Piece(plain)])
+
+
+def quick_close():
+    """pyserial waits 0.3 s after closing a socket."""
+    return patch.object(protocol_socket, "time", type("NoWait", (), {"sleep": staticmethod(lambda _: None)}))
+
+
+@contextlib.contextmanager
+def bench(port="tcp", faults=None, connect=True, emulator=None, **settings):
+    """A driver, connected or not, and its emulated gripper."""
+    emulator = emulator or Emulator(referenced=True, speed_up=20.0)
+    with SERVE[port](emulator, faults) as address, quick_close():
+        gripper = WSG50(port=address, **QUICK | settings)
+        if connect:
+            gripper.connect()
+        try:
+            yield gripper, emulator
+        finally:
+            with contextlib.suppress(DeviceError):
+                gripper.close()
+
+
+def until(condition, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
