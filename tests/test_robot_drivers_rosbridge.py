@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.drivers import rosbridge
-from robot.drivers.rosbridge import Arrival, RosbridgeLink, decode, encode, rate_of
+from robot.drivers.rosbridge import RosbridgeLink, decode, encode
 from robot.drivers.rosbridge_emulator import Emulator, Faults, serve
 from robot.errors import DeviceError
 
@@ -168,13 +168,6 @@ def test_messages_of_a_topic_are_kept_with_their_times():
         assert link.wait_for("/t", since_s=before) == history[-1]
         with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
             link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
-
-
-def test_a_rate_is_that_of_the_gaps_between_messages():
-    arrivals = [Arrival({}, time_s) for time_s in (1.0, 1.5, 2.0, 3.0)]
-    assert rate_of(arrivals) == 1.5
-    assert rate_of(arrivals[:1]) is None
-    assert rate_of([Arrival({}, 1.0)] * 3) is None
 
 
 def test_a_connection_that_breaks_ends_every_wait_at_once():

@@ -336,10 +336,8 @@ def test_commands_never_step_further_than_speed_allows_in_two_ticks_even_after_a
 def test_settings_are_read_back_and_what_is_not_taken_is_noted():
     with connected(speed_ratio=0.2) as (emulator, arm):
         assert emulator.model.speed_ratio == 0.2
-        wait_until(lambda: arm.settings()["joint_states_hz"] is not None)
-        found = arm.settings()
-        assert (found["speed_ratio"], found["command_timeout_s"], found["enabled"]) == (0.2, 0.2, True)
-        assert found["joint_states_hz"] > 1
+        found = {"url": arm.settings()["url"], "tip": "right_hand", "speed_ratio": 0.2, "command_timeout_s": 0.2}
+        assert arm.settings() == found  # and nothing that is measured: it would be another each time
         assert arm.refused == {}
     emulator = Emulator()
     emulator.silent.add(LIMB + "set_speed_ratio")
@@ -390,7 +388,7 @@ def test_a_collision_that_lasts_needs_a_person():
     with connected() as (emulator, arm):
         emulator.model.collided = True
         wait_until(lambda: arm._collided_since(0.0))
-        with pytest.raises(DeviceError, match="still reports a collision"):
+        with pytest.raises(DeviceError, match="recovery is refused: the robot reports a collision"):
             arm.recover()
         with pytest.raises(DeviceError, match="reports a collision"):
             arm.move_to(FAR, 50.0)
@@ -401,11 +399,12 @@ def test_a_collision_that_lasts_needs_a_person():
     ("topic", "message", "age_s"),
     [
         ("/robot/joint_states", "joint state must be at most", 0.5),
-        ("/robot/state", "an emergency stop would not be seen", 5.0),
+        ("/robot/state", r"at most 1 s old.* an emergency stop would not be seen", 1.0),
+        (LIMB + "collision_detection_state", r"at most 1 s old.* a collision would not be seen", 1.0),
     ],
 )
 def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkeypatch):
-    monkeypatch.setattr("robot.drivers.sawyer._ROBOT_STATE_AGE_S", 0.5)
+    monkeypatch.setattr("robot.drivers.sawyer._SLOW_STATE_AGE_S", 0.5)
     with connected(max_state_age_s=age_s) as (emulator, arm):
         with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
             arm.move_to(FAR, 20.0)
@@ -416,6 +415,51 @@ def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkey
         emulator.silent.clear()
         arm.recover()
         assert offset(arm.pose(), FAR)[0] > 50
+
+
+def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
+    emulator = Emulator()
+    emulator.silent.add(messages.COLLISION[0])
+    with caplog.at_level(logging.WARNING), connected(emulator, timeout_s=0.5) as (_, arm):
+        assert arm.refused == {"collision state": "nothing comes: collisions are not seen"}
+        assert "collisions are not seen" in caplog.text
+        arm.move_to(HOME, 200.0)
+        arm.recover()
+        emulator.silent.clear()
+        arm.close()
+        arm.connect()
+        assert arm.refused == {}
+
+
+def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatch):
+    monkeypatch.setattr("robot.drivers.sawyer._SLOW_STATE_AGE_S", 0.1)
+    monkeypatch.setattr("robot.drivers.sawyer._BACK_OFF_S", 0.001)
+    with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
+        emulator.silent.add(messages.COLLISION[0])
+        wait_until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
+        for _ in range(2):
+            with pytest.raises(DeviceError, match=r"no message on .*collision_detection_state"):
+                arm.recover()
+            with pytest.raises(DeviceError):
+                arm.move_to(FAR, 50.0)
+        assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
+        emulator.silent.clear()
+        arm.recover()
+        assert arm.refused == {}
+
+
+def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():
+    now = [0.0]
+    state = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
+    for allowed_s, limit_s in ((0.5, 2.0), (3.0, 3.0)):
+        arm = arm_at("ws://127.0.0.1:9090", clock=lambda: now[0], max_state_age_s=allowed_s)
+        arm._link = SimpleNamespace(history=lambda _: [Arrival(state, 0.0)], check=lambda: None)
+        now[0] = limit_s - 0.01
+        assert arm._robot_state().enabled
+        now[0] = limit_s + 0.01
+        for look, words in ((arm._robot_state, "emergency stop"), (arm._collisions, "collision")):
+            with pytest.raises(DeviceError, match=f"at most {limit_s:g} s old.*{words} would not be seen"):
+                look()
 
 
 def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):

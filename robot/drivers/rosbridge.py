@@ -18,7 +18,7 @@ import socket
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -58,13 +58,6 @@ def decode(text: str | bytes) -> Message | None:
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
-
-
-def rate_of(arrivals: Sequence[Arrival]) -> float | None:
-    """Messages a second; None for fewer than two."""
-    if len(arrivals) < 2 or arrivals[-1].time_s <= arrivals[0].time_s:
-        return None
-    return round((len(arrivals) - 1) / (arrivals[-1].time_s - arrivals[0].time_s), 1)
 
 
 class RosbridgeLink:

@@ -6,9 +6,11 @@ second, along a schedule that keeps the hand at the asked speed at most and ever
 program put to sleep goes on from where it was. Above that stands the robot's own speed ratio. Position mode passes by
 the robot's collision avoidance (not detection): the workspace must be free.
 
-At every step the joint state must be fresh, the robot enabled, no collision reported and the arm near its commands;
-else the arm holds where it is. When no more commands come (the program or the network died) the robot itself ends the
-motion after `command_timeout_s`. An emergency stop is never reset here.
+At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
+near its commands; else the arm holds where it is. /robot/state and the collision state come more slowly: they may be as
+old as that, or 2 s. A robot that reports no collision state when it is connected can be used, and `refused` says that
+its collisions are not seen; one that has reported it must go on. When no more commands come (the program or the network
+died) the robot itself ends the motion after `command_timeout_s`. An emergency stop is never reset here.
 """
 
 import contextlib
@@ -23,22 +25,24 @@ import numpy as np
 from robot.devices import Arm, Clock
 from robot.drivers import sawyer_messages as messages
 from robot.drivers import straight_line
-from robot.drivers.rosbridge import RosbridgeLink, rate_of
+from robot.drivers.rosbridge import Arrival, RosbridgeLink
 from robot.drivers.sawyer_messages import Joints, Mount
+from robot.drivers.sawyer_state import newest_joints, stands
 from robot.drivers.straight_line import Schedule, way_points
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
 
 _LOG = logging.getLogger(__name__)
 _READ = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
-_ROBOT_STATE_AGE_S = 2.0
-"""/robot/state is slower than the joints; it must still come."""
+_SLOW_STATE_AGE_S = 2.0
+"""/robot/state and the collision state are slower than the joints; they must still come."""
+_COLLISIONS = "collision state"
 _MOST_LAG_RAD = 0.35
 """An arm this far behind its commands is blocked; half a second of lag at 0.5 rad/s is 0.25."""
 _MOST_TURN_RAD = 0.5
 """Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
-_STILL_RAD, _STILL_S, _STOP_S = 1e-3, 0.1, 2.0
-"""An arm stands when no joint has moved by more in so long; one that was told to hold must stand after _STOP_S."""
+_STOP_S = 2.0
+"""An arm that was told to hold must stand after so long."""
 _BACK_OFF_S = 0.25
 _MARGIN_MM = 20.0
 """So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
@@ -50,7 +54,7 @@ class Sawyer(Arm):
     base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: from the origin of `tip` along its z
     axis to the point between the fingertips; tool_yaw_deg: from the tip's x axis about z to where finger a closes to.
     enable: whether the motors may be enabled from here (never while an emergency stop holds). max_state_age_s: joint
-    states older than this stop the arm.
+    states older than this stop the arm; the robot's and the collision state where older than this and than 2 s.
     """
 
     def __init__(
@@ -110,24 +114,37 @@ class Sawyer(Arm):
         self._arrival_rad, self._settle_s = arrival_rad, settle_s
         self._command_timeout_s, self._timeout_s = command_timeout_s, timeout_s
         self._ik_retries, self._reconnect_tries = ik_retries, reconnect_tries
-        self._under_way = False
+        self._under_way = self._sees_collisions = False
         self._link = self._new_link()
 
     def _new_link(self) -> RosbridgeLink:
         return RosbridgeLink(self._url, timeout_s=self._timeout_s, clock=self.clock)
 
     def _connect(self) -> None:
+        self._sees_collisions = False
         self._join()
+        self._look_for_collisions()
         self._make_ready()
 
+    def _look_for_collisions(self) -> None:
+        """Note it where nothing comes that would report one: a person may do without, and must know."""
+        self.refused.pop(_COLLISIONS, None)
+        try:
+            self._link.wait_for(messages.COLLISION[0])
+            self._sees_collisions = True
+        except DeviceError:
+            self._link.check()
+            self.refused[_COLLISIONS] = "nothing comes: collisions are not seen"
+            _LOG.warning("%s: nothing comes on %s: collisions are not seen", self.name, messages.COLLISION[0])
+
     def _join(self) -> None:
-        """A new link on which every state has come once."""
+        """A new link on which every state has come once; that of collisions, where it came when connecting."""
         self._link = self._new_link()
         self._link.open()
         for topic, kind in (*_READ, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
         self._link.advertise(*messages.JOINT_COMMAND)
-        for topic, _ in (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES):
+        for topic, _ in _READ if self._sees_collisions else _READ[:-1]:
             self._link.wait_for(topic)
         self._set("speed_ratio", messages.SPEED_RATIO, self._speed_ratio)
         self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._command_timeout_s)
@@ -169,16 +186,11 @@ class Sawyer(Arm):
             self._link.close()
 
     def _settings(self) -> dict[str, Any]:
-        state = self._robot_state()
-        arrivals = self._link.history(messages.JOINT_STATES[0])
         return {
             "url": self._url,
             "tip": self._tip,
             "speed_ratio": self._read_back(messages.SPEED_RATIO),
             "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
-            "enabled": state.enabled,
-            "stopped": state.stopped,
-            "joint_states_hz": rate_of(arrivals),
         }
 
     def _read_back(self, topic: tuple[str, str]) -> float | None:
@@ -191,13 +203,12 @@ class Sawyer(Arm):
             self._link.check()
             self._fresh_joints()
             self._robot_state()
+            self._collisions()
         except DeviceError as error:
             _LOG.warning("%s: %s; connecting again", self.name, error)
             self._rejoin()
         if self._collided_since(-math.inf, newest=True):
-            raise DeviceError(
-                f"{self.name}: the arm still reports a collision: look what it touches and free it by hand"
-            )
+            raise DeviceError(f"{self.name}: recovery is refused: {messages.COLLIDED}")
         self._make_ready()
 
     def _rejoin(self) -> None:
@@ -223,7 +234,7 @@ class Sawyer(Arm):
         began = self.clock()
         self._check_free()
         if self._collided_since(began, newest=True):
-            raise self._collision()
+            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
         start = self._fresh_joints()
         poses = way_points(self._inside(self._pose()), pose)
         joints = self._solve(poses, start)
@@ -304,15 +315,7 @@ class Sawyer(Arm):
             time.sleep(self._tick_s)
 
     def _stands(self, since_s: float) -> bool:
-        """Whether the joint states of the last _STILL_S, none from before `since_s`, are of an arm that stands."""
-        now = self.clock()
-        recent = [
-            joints
-            for arrival in self._link.history(messages.JOINT_STATES[0])
-            if arrival.time_s >= max(since_s, now - _STILL_S)
-            and (joints := messages.joints_of(arrival.message)) is not None
-        ]
-        return now - since_s >= _STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < _STILL_RAD
+        return stands(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
         """The joints now. Raises DeviceError where anything says that the arm must not go on."""
@@ -320,7 +323,7 @@ class Sawyer(Arm):
         joints = self._fresh_joints()
         self._check_free()
         if self._collided_since(began):
-            raise self._collision()
+            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
         if (lag := float(np.abs(joints - commanded).max())) > _MOST_LAG_RAD:
             raise DeviceError(
                 f"{self.name}: the arm must follow within {_MOST_LAG_RAD} rad, a joint is {lag:.2f} behind; look what "
@@ -343,36 +346,39 @@ class Sawyer(Arm):
         self._link.publish(messages.JOINT_COMMAND[0], messages.joint_command(joints))
 
     def _fresh_joints(self) -> Joints:
-        """The newest joints. A message repeated with its old time stamp is as old as its first copy."""
-        arrivals = self._link.history(messages.JOINT_STATES[0])
-        found, since = None, -math.inf
-        for arrival in reversed(arrivals):
-            if found is None:
-                found = messages.joints_of(arrival.message)
-                stamp = messages.stamp_of(arrival.message)
-                since = arrival.time_s
-            elif stamp is not None and messages.stamp_of(arrival.message) == stamp:
-                since = arrival.time_s
-            else:
-                break
-        if found is None or self.clock() - since > self._max_state_age_s:
-            self._link.check()
-            age = "never came" if found is None else f"is {self.clock() - since:.2f} s old"
-            raise DeviceError(
-                f"{self.name}: the joint state must be at most {self._max_state_age_s:g} s old, it {age}; without new "
-                f"commands the robot ends its motion after {self._command_timeout_s:g} s by itself"
-            )
-        return found
+        """The newest joints. Raises DeviceError for what is too old, a message repeated with its old stamp too."""
+        found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
+        if found is not None:
+            joints, since_s = found
+            if (age_s := self.clock() - since_s) <= self._max_state_age_s:
+                return joints
+        self._link.check()
+        age = "never came" if found is None else f"is {age_s:.2f} s old"
+        raise DeviceError(
+            f"{self.name}: the joint state must be at most {self._max_state_age_s:g} s old, it {age}; without new "
+            f"commands the robot ends its motion after {self._command_timeout_s:g} s by itself"
+        )
 
     def _robot_state(self) -> messages.RobotState:
         arrivals = self._link.history(messages.ROBOT_STATE[0])
-        if not arrivals or self.clock() - arrivals[-1].time_s > _ROBOT_STATE_AGE_S:
+        self._check_comes(messages.ROBOT_STATE[0], arrivals, "an emergency stop")
+        return messages.robot_state(arrivals[-1].message)
+
+    def _collisions(self) -> Sequence[Arrival]:
+        """What came of the collision state; nothing only where nothing came when connecting either."""
+        arrivals = self._link.history(messages.COLLISION[0])
+        if arrivals or self._sees_collisions:
+            self._check_comes(messages.COLLISION[0], arrivals, "a collision")
+        return arrivals
+
+    def _check_comes(self, topic: str, arrivals: Sequence[Arrival], unseen: str) -> None:
+        limit_s = max(self._max_state_age_s, _SLOW_STATE_AGE_S)
+        if not arrivals or self.clock() - arrivals[-1].time_s > limit_s:
             self._link.check()
             raise DeviceError(
-                f"{self.name}: {messages.ROBOT_STATE[0]} must be at most {_ROBOT_STATE_AGE_S:g} s old, no newer one "
-                "came; without it an emergency stop would not be seen"
+                f"{self.name}: {topic} must be at most {limit_s:g} s old, no newer one came; without it {unseen} would "
+                "not be seen"
             )
-        return messages.robot_state(arrivals[-1].message)
 
     def _check_free(self) -> None:
         if obstacle := self._robot_state().obstacle:
@@ -380,15 +386,9 @@ class Sawyer(Arm):
 
     def _collided_since(self, began: float, *, newest: bool = False) -> bool:
         """Whether any message after `began`, or with `newest` the last one, reports a collision."""
-        arrivals = self._link.history(messages.COLLISION[0])
+        arrivals = self._collisions()
         asked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
         return any(messages.collided(arrival.message) for arrival in asked)
-
-    def _collision(self) -> DeviceError:
-        return DeviceError(
-            f"{self.name}: the robot reports a collision, the arm holds: look what it touches and free it by hand "
-            "before you go on"
-        )
 
 
 def _require(name: str, value: float, low: float, high: float) -> None:

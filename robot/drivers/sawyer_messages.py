@@ -37,6 +37,7 @@ IK_FAILURES = {
     -2: "the arm would collide with itself",
     -3: "the robot has no such tip",
 }
+COLLIDED = "the robot reports a collision, the arm holds: look what it touches and free it by hand before you go on"
 _BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop still holds"}
 _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
 _MOST_LEAN_RAD = math.radians(10.0)
