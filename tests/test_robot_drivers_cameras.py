@@ -1,5 +1,6 @@
 """Cameras over the table: RealSense and Kinect 2 over stand-ins for their packages, and a plain USB camera."""
 
+import json
 import math
 import sys
 
@@ -144,10 +145,34 @@ def test_a_realsense_without_depth_in_its_picture_is_an_error(install):
         eye.read(depth=False)
 
 
-@pytest.mark.parametrize("setting", [{"width": 0}, {"fps": 0}, {"warmup_frames": -1}, {"timeout_s": math.nan}])
+WAITS = [{"warmup_frames": -1}, {"warmup_frames": 10**9}, {"timeout_s": math.nan}, {"timeout_s": 1e5}]
+
+
+@pytest.mark.parametrize("setting", [{"width": 0}, {"height": 10**20}, {"fps": 0}, *WAITS])
 def test_settings_of_a_realsense_out_of_range_are_refused(setting):
-    with pytest.raises(RobotConfigError):
+    with pytest.raises(RobotConfigError, match=next(iter(setting))):
         realsense(**setting)
+
+
+@pytest.mark.parametrize("setting", WAITS)
+def test_waits_of_a_kinect_out_of_range_are_refused(setting):
+    with pytest.raises(RobotConfigError, match=next(iter(setting))):
+        kinect(**setting)
+
+
+def test_numbers_that_a_realsense_makes_up_are_an_error_and_never_reach_the_settings(install):
+    rs = install(FakeRealSense(distortion=(math.nan,) * 5))
+    with pytest.raises(DeviceError, match="distortion coefficients must be finite numbers"):
+        realsense().connect()
+    assert rs.stopped == 1
+
+
+def test_settings_of_depth_cameras_are_plain_finite_json(install):
+    install(FakeRealSense(distortion=(1.0, 0.0, 0.0, 0.0, 0.0)))
+    install(FakeFreenect2())
+    for make in (realsense, kinect):
+        with make() as eye:
+            json.dumps(eye.settings(), allow_nan=False)
 
 
 # Kinect 2 ---------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Clock
 from robot.drivers.discover import as_text
-from robot.drivers.vendor import start_again, vendor_errors
+from robot.drivers.vendor import check_waits, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -51,8 +51,7 @@ class Kinect2(Camera):
         super().__init__("kinect2", extrinsics, clock=clock)
         if pipeline not in ("auto", *PIPELINES):
             raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {pipeline!r}")
-        if warmup_frames < 0 or not 0 < timeout_s < 1e6:
-            raise RobotConfigError("warmup_frames must be 0 or more, and timeout_s above 0")
+        check_waits(warmup_frames, timeout_s)
         self.serial, self.pipeline, self.upside_down = serial, pipeline, upside_down
         self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
         self._package: Any = None

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock
-from robot.drivers.vendor import start_again, vendor_errors
+from robot.drivers.vendor import check_waits, finite, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -40,8 +40,12 @@ class RealSense(Camera):
     ) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("realsense", extrinsics, clock=clock)
-        if min(width, height, fps) < 1 or warmup_frames < 0 or not 0 < timeout_s < 1e6:
-            raise RobotConfigError("width, height, fps and timeout_s must be above 0, and warmup_frames 0 or more")
+        if not (1 <= min(width, height) <= max(width, height) <= 20_000 and 1 <= fps <= 1000):
+            raise RobotConfigError(
+                "width and height must be from 1 to 20000 pixels and fps from 1 to 1000, "
+                f"got {width} x {height} at {fps}"
+            )
+        check_waits(warmup_frames, timeout_s)
         self.serial, self.width, self.height, self.fps = serial, width, height, fps
         self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
         self._pipeline: Any = None
@@ -83,9 +87,10 @@ class RealSense(Camera):
         """Scale of depth, intrinsics, and how to undo distortion."""
         video = profile.get_stream(rs.stream.color).as_video_stream_profile()
         lens = video.get_intrinsics()
-        self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        depth = profile.get_device().first_depth_sensor()
+        (self._scale_m,) = finite("a RealSense's depth scale", [depth.get_depth_scale()])
         self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
-        coefficients = [float(each) for each in lens.coeffs]
+        coefficients = finite("a RealSense's distortion coefficients", lens.coeffs)
         self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
         self._has = {
             "serial": serial,

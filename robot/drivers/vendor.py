@@ -1,9 +1,29 @@
-"""What drivers over a maker's package share: its exceptions, and starting again."""
+"""What drivers over a maker's package share: its exceptions, its numbers, waiting, and starting again."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 
-from robot.errors import DeviceError
+from robot.drivers.frames import MOST_S
+from robot.errors import DeviceError, RobotConfigError
+
+_MOST_WARMUP = 1000
+
+
+def check_waits(warmup_frames: int, timeout_s: float) -> None:
+    """Raise RobotConfigError for waits that never end or that the system cannot make."""
+    if not 0 <= warmup_frames <= _MOST_WARMUP:
+        raise RobotConfigError(f"warmup_frames must be from 0 to {_MOST_WARMUP}, got {warmup_frames}")
+    if not 1e-3 <= timeout_s <= MOST_S:  # also refuses NaN
+        raise RobotConfigError(f"timeout_s must be from 0.001 to {MOST_S:g} s, got {timeout_s}")
+
+
+def finite(what: str, numbers: Iterable[float]) -> list[float]:
+    """What a camera says of itself. Raises DeviceError for NaN or infinity."""
+    found = [float(each) for each in numbers]
+    if not all(map(math.isfinite, found)):
+        raise DeviceError(f"{what} must be finite numbers, got {found}; plug the camera in again")
+    return found
 
 
 @contextlib.contextmanager
