@@ -1,17 +1,11 @@
 """The emulated WSG-50, by bytes written here by hand: what it says, how it moves, how it fails."""
 
-import os
-import select
-import socket
 import struct
-import subprocess
-import sys
-import time
 
 import pytest
 
 from robot.drivers.wsg50_codec import Frame, decode, encode
-from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
+from robot.drivers.wsg50_emulator import Emulator, Faults
 from robot.drivers.wsg50_faults import KINDS
 from robot.drivers.wsg50_mechanics import Mechanics
 from robot.errors import RobotConfigError
@@ -233,6 +227,28 @@ def test_updates_come_by_themselves_until_told_to_end():
     assert hand.wait(0.2) == []
 
 
+def test_an_answer_that_fits_no_frame_is_a_range_error():
+    hand = Hand()
+    assert hand.tell(0x06, bytes(254)) == (0, bytes(254))
+    assert [hand.tell(0x06, bytes(size)) for size in (255, 256)] == [(28, b"")] * 2
+    assert hand.tell(0x51, bytes(255)) == (0, b"")
+    assert hand.tell(0x52) == (28, b"")
+
+
+def test_counts_stop_at_what_their_bytes_can_say():
+    hand = Hand()
+    hand.emulator._counts = [70000, 70000, 65536]
+    assert hand.tell(0x42, b"\x00") == (0, struct.pack("<IHH", 70000, 65535, 65535))
+
+
+def test_a_command_is_answered_as_told_once_and_not_done():
+    hand = Hand(opening_mm=100.0)
+    hand.emulator.next_status = {GRASP: 20}
+    assert hand.to(GRASP, 0.0) == 20
+    assert hand.value(0x43) == 100.0
+    assert hand.to(GRASP, 0.0) == 18
+
+
 def test_a_client_that_goes_without_a_word_leaves_a_fast_stop():
     hand = Hand()
     hand.emulator.connected()
@@ -278,60 +294,3 @@ def test_faults_come_at_their_rate_and_the_same_from_the_same_seed():
 def test_faults_that_cannot_be_are_refused(settings):
     with pytest.raises(RobotConfigError):
         Faults(**settings)
-
-
-def read_until(read, want, seconds=5.0):
-    got, deadline = b"", time.monotonic() + seconds
-    while want not in got and time.monotonic() < deadline:
-        got += read()
-    return got
-
-
-def test_it_speaks_the_printed_bytes_over_tcp():
-    with serve_tcp(Emulator()) as url:
-        host, port = url.removeprefix("socket://").split(":")
-        with socket.create_connection((host, int(port)), timeout=5) as client:
-            client.sendall(bytes_of("stop"))
-            want = encode(Frame(STOP, b"\0\0"))
-            assert read_until(lambda: client.recv(100), want) == want
-
-
-def test_it_speaks_the_printed_bytes_over_a_terminal():
-    with serve_pty(Emulator()) as path:
-        terminal = os.open(path, os.O_RDWR | os.O_NOCTTY)
-        try:
-            os.write(terminal, bytes_of("get force limit"))
-            want = encode(Frame(0x33, b"\0\0" + struct.pack("<f", 40)))
-            assert read_until(lambda: os.read(terminal, 100), want) == want
-        finally:
-            os.close(terminal)
-
-
-def test_a_line_that_is_cut_can_be_taken_up_again():
-    faults = Faults(1.0, ["disconnect"])
-    emulator = Emulator()
-    with serve_tcp(emulator, faults) as url:
-        host, port = url.removeprefix("socket://").split(":")
-        with socket.create_connection((host, int(port)), timeout=5) as client:
-            client.sendall(bytes_of("stop"))
-            assert client.recv(100) == b""
-        faults.rate = 0.0
-        with socket.create_connection((host, int(port)), timeout=5) as client:
-            client.sendall(bytes_of("stop"))
-            assert client.recv(100)
-        assert emulator.in_fast_stop
-
-
-@pytest.mark.parametrize("port", [["--tcp", "0"], ["--pty"]])
-def test_it_runs_as_a_program_and_says_where(port):
-    program = [sys.executable, "-m", "robot.drivers.wsg50_emulator", *port, "--object-mm", "40"]
-    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert select.select([process.stdout], [], [], 30)[0]
-            line = process.stdout.readline()
-            assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
-        finally:
-            process.send_signal(2)
-        _, errors = process.communicate(timeout=30)
-    assert process.returncode == 0
-    assert "faults: {" in errors

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -11,11 +12,13 @@ from contextlib import closing
 import pytest
 
 from robot.drivers import wsg50_commands as commands
+from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_codec import Frame, decode, encode
 from robot.drivers.wsg50_commands import Command, Status
-from robot.drivers.wsg50_link import CommandFailed, Link, NoReply
+from robot.drivers.wsg50_link import CommandFailed, Link, NoEcho, NoReply
 from robot.drivers.wsg50_port import LinkLost, Port
 from robot.errors import DeviceError
+from tests.wsg50_bench import until
 from tests.wsg50_frames import bytes_of
 
 OK = bytes(2)
@@ -64,6 +67,54 @@ class Peer:
         self.server.shutdown(socket.SHUT_RDWR)
         self.server.close()
         self.thread.join()
+
+
+class Flood(Peer):
+    """Sends the same over and over, and listens to nothing until told to end."""
+
+    def __init__(self, data):
+        self.data, self.ended = data, threading.Event()
+        super().__init__(None)
+
+    def run(self):
+        client, _ = self.server.accept()
+        client.settimeout(0.01)
+        with client:
+            while not self.ended.is_set():
+                try:
+                    client.send(self.data)
+                except TimeoutError:
+                    continue
+                except OSError:
+                    return
+
+    def __exit__(self, *_):
+        self.ended.set()
+        self.thread.join()
+        self.server.close()
+
+
+UPDATE = encode(Frame(Command.SYSTEM_STATE, OK + bytes(4)))
+FLOODS = pytest.mark.parametrize(
+    "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
+)
+
+
+def ends(call, seconds=20.0):
+    """What a call raises or returns, in a thread of its own: a call that does not end fails the test."""
+    ended = []
+
+    def run():
+        try:
+            ended.append(call())
+        except DeviceError as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert ended, f"not ended in {seconds} s"
+    return ended[0]
 
 
 def reply(frame, parameters=b"", status=0):
@@ -139,6 +190,63 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
         assert time.monotonic() - started < 5
         assert peer.heard.count(Command.INFO) == 3
         assert link.counts["asked again"] == 2
+
+
+@FLOODS
+def test_every_wait_ends_though_the_other_side_never_falls_silent(data):
+    with Flood(data) as peer:
+        link = Link(peer.url, timeout_s=0.05)
+        ends(link.open)
+        assert link.is_open
+        assert ends(lambda: link.pump(0.05)) is None
+        assert ends(lambda: link.pump(0.0)) is None
+        assert ends(lambda: link.poll(Command.HOME, 0.05)) is None
+        assert isinstance(ends(link.sync), NoEcho)
+        assert isinstance(ends(lambda: link.urgent(commands.stop())), NoReply)
+        assert isinstance(ends(lambda: link.tell(commands.stop())), NoEcho)
+        link.close()
+
+
+@FLOODS
+def test_connecting_ends_though_the_other_side_never_falls_silent(data):
+    with Flood(data) as peer:
+        gripper = WSG50(port=peer.url, timeout_s=0.05)
+        assert "is it on, and connected" in str(ends(gripper.connect))
+        assert not gripper.is_connected
+
+
+def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
+    updates = b"".join(encode(Frame(Command.OPENING, OK + struct.pack("<f", each))) for each in range(800))
+
+    def answer(frame):
+        return echoing(frame) or reply(frame) + updates
+
+    with Peer(answer) as peer, linked(peer) as link:
+        link.tell(commands.stop())
+        time.sleep(0.2)
+        link.pump(0.0)
+        assert commands.number(link.updates[Command.OPENING][0]) == 799.0
+
+
+def test_a_command_that_was_heard_damaged_is_asked_again():
+    statuses = [11, 0]
+
+    def answer(frame):
+        return echoing(frame) or reply(frame, status=statuses.pop(0))
+
+    with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
+        link.tell(commands.stop())
+        assert peer.heard.count(Command.STOP) == 2
+        assert link.counts == {"asked again": 1}
+
+
+def test_where_nobody_echoes_nothing_is_asked_again():
+    with Peer(lambda frame: b"") as peer, linked(peer, timeout_s=0.05) as link:
+        with pytest.raises(NoEcho):
+            link.tell(commands.stop())
+        until(lambda: len(peer.heard) == 3)
+        time.sleep(0.1)
+        assert peer.heard == [Command.LOOP] * 3
 
 
 def test_a_gripper_that_echoes_nothing_is_not_there():
