@@ -2,8 +2,9 @@
 
 Points are (N, 3) in mm, camera frame as in robot.devices. The rigid map is what `Camera.extrinsics` takes. The affine
 one is reported beside it: a camera whose intrinsics and depth scale are right needs no stretching, so an affine fit
-that predicts left-out points much better says that they are wrong. (The nine points of the paper's authors: affine 2.7
-mm in sample and 4.7 left out, rigid 8.7 and 10.2.)
+that predicts left-out points much better says that they are wrong. What else makes points fit badly, the unit, a
+mirrored axis or wrong pairs, is warned of too. (The nine points of the paper's authors: affine 2.7 mm in sample and 4.7
+left out, rigid 8.7 and 10.2.)
 """
 
 import csv
@@ -33,7 +34,9 @@ SUSPECT_MM = 20.0
 """Points further off than this in the mean are warned of: twice what the paper's rig had left out."""
 _SUSPECT_SHARE, _SUSPECT_MM = 0.6, 1.0
 _LEAST_MM = 5.0
+"""Points of so small an extent are in metres: nobody calibrates within a few mm."""
 _ENOUGH = 6
+"""Of fewer points some order of them may look like their mirror image."""
 _THOUSAND = (500.0, 2000.0)
 """Extents whose quotient lies here are in mm and in metres: noise and a wrong depth scale do not halve or double."""
 _FAR_MM = 1e6

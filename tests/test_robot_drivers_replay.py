@@ -153,7 +153,7 @@ def test_pictures_are_cut_and_resized_like_those_of_a_camera(make):
 
 def test_what_is_replayed_is_said(make):
     with make() as gel:
-        found = gel.settings()
+        found = json.loads(json.dumps(gel.settings(), allow_nan=False))
     assert (found["pictures"], found["fps"], found["loop"]) == (6, 10.0, True)
 
 
