@@ -103,14 +103,16 @@ def _check_rig(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     """Where the camera stands, from points known in its frame and in the rig's."""
-    from robot.hand_eye import fit_hand_eye, read_pairs
+    from robot.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
     found = fit_hand_eye(*read_pairs(arguments.points))
-    found.save(arguments.out)
     for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
         say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")
     if found.warning:
         say(f"warning: {found.warning}")
+    if found.rigid_errors.loo_mean_mm > SUSPECT_MM:
+        raise RetrievalError(f"nothing was written: an arm cannot be steered by points {SUSPECT_MM:g} mm off and more")
+    found.save(arguments.out)
     say(f"{arguments.out}: written from {len(found.rig_mm)} points; name it as hand_eye under [camera]")
 
 

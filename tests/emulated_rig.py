@@ -59,7 +59,7 @@ class World:
         self.rng, self.counts = np.random.default_rng([7, seed]), Counter()
         self.emulator = Emulator(speed_up=SPEED_UP, referenced=True)
         self.line = Faults(rate / FRAMES, seed=seed)
-        self.arm_faults = None
+        self.arm_faults, self.left_moving = None, 0
         self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
 
     def fault(self, device, *kinds):
@@ -139,6 +139,33 @@ class TrackedSawyer(Sawyer):
         return reached
 
 
+class WatchedWSG50(WSG50):
+    """The gripper's driver; the world counts how often one of its calls ends, well or badly, with jaws that move."""
+
+    def __init__(self, world, **settings):
+        super().__init__(**settings)
+        self.world = world
+
+    def open(self, opening_mm):
+        with self._watched():
+            return super().open(opening_mm)
+
+    def grasp(self, force_n, speed_mm_s=80.0):
+        with self._watched():
+            return super().grasp(force_n, speed_mm_s)
+
+    def close(self):
+        with self._watched():
+            super().close()
+
+    @contextlib.contextmanager
+    def _watched(self):
+        try:
+            yield
+        finally:
+            self.world.left_moving += self.world.emulator.moves
+
+
 @contextlib.contextmanager
 def _at_once(world):
     yield EmulatedArm(world)
@@ -215,11 +242,11 @@ class EmulatedRig(Rig):
     """The rig. Objects are cylinders by name, placed at random for each attempt; now and then one slips."""
 
     def __init__(self, url, world, gels, arm, **gripper):
-        self.world, self.gels, self.closed_unasked = world, gels, 0
+        self.world, self.gels = world, gels
         quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         super().__init__(
             arm,
-            WSG50(port=url, **quick | gripper),
+            WatchedWSG50(world, port=url, **quick | gripper),
             {
                 finger: OpencvTactile(finger=finger, device=gel_path(finger), warmup_s=0.0, timeout_s=1.0, frozen_s=0.2)
                 for finger in gels
@@ -234,7 +261,6 @@ class EmulatedRig(Rig):
         rng = np.random.default_rng([2, world.seed, name, number])
         radius, height = np.random.default_rng([1, name]).uniform((18, 60), (40, 140))
         x, y = rng.uniform(-20, 20, 2)
-        self.closed_unasked += world.emulator.is_closing  # what was before has failed or ended
         world.solid = views.Upright(float(radius), float(height), float(x), float(y))
         world.slips, world.noise = bool(rng.uniform() < 0.1), int(rng.integers(2**31))
         world.hand_at(world.pose)
@@ -268,36 +294,34 @@ class Outcome:
     grasps: int
     attempts: int
     stops: list[str]
-    faults: dict[str, int]
-    left_closing: int
+    faults: Counter
+    left_moving: int
+    left_holding: int
 
     def lines(self):
         yield f"{self.grasps} whole grasps of {self.attempts} attempts; stopped {len(self.stops)} times"
         yield from (f"  stopped: {reason}" for reason in self.stops)
-        yield f"jaws left closing: {self.left_closing} times"
+        yield f"jaws left moving: {self.left_moving} times; left closed on something: {self.left_holding} times"
         yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
 
 
 def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", arm="at once", objects=5):
     """Collect `grasps` accepted ones with faults at every device; begun again, as a person would, where it stops."""
-    stops, left_closing, faults = [], 0, Counter()
+    found = Outcome(0, 0, [], Counter(), 0, 0)
     names = [f"can-{number}" for number in range(objects)]
-    while True:
-        with emulated_rig(seed + len(stops), port=port, arm=arm, rate=rate) as rig:
+    given = {"objects": names, "seed": seed, "settings": CollectSettings(grasps // objects)}
+    while not found.grasps:
+        with emulated_rig(seed + len(found.stops), port=port, arm=arm, rate=rate) as rig:
             try:
-                wanted = CollectSettings(grasps // objects)
-                tallies = collect(lambda: rig, out, objects=names, seed=seed, settings=wanted)
-                return Outcome(
-                    sum(tally.accepted for tally in tallies),
-                    sum(tally.attempts for tally in tallies),
-                    stops,
-                    dict(faults + Counter(rig.world.all_counts)),
-                    left_closing + rig.closed_unasked + rig.world.emulator.is_closing,
-                )
+                tallies = collect(lambda rig=rig: rig, out, **given)
+                found.grasps = sum(tally.accepted for tally in tallies)
+                found.attempts = sum(tally.attempts for tally in tallies)
             except DeviceError as error:
-                stops.append(str(error))
-                left_closing += rig.closed_unasked + rig.world.emulator.is_closing
-                faults += Counter(rig.world.all_counts)
+                found.stops.append(str(error))
+            found.left_moving += rig.world.left_moving
+            found.left_holding += rig.world.emulator.grasping == HOLDING
+            found.faults += Counter(rig.world.all_counts)
+    return found
 
 
 def broken_images(folder):

@@ -3,10 +3,18 @@
 `python -m tests.emulated_rig --grasps 500 --out faulty/` does it at length.
 """
 
+import signal
+import threading
+import time
+
 import pytest
 
+from robot.collect import CollectSettings, collect
+from robot.drivers.wsg50 import WSG50
+from robot.drivers.wsg50_motion import Motions
+from robot.errors import DeviceError
 from robot.recording import read_recording
-from tests.emulated_rig import broken_images, collect_among_faults, emulated_rig
+from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
 from tests.fake_video import own_threads
 
 
@@ -14,7 +22,7 @@ from tests.fake_video import own_threads
 def test_a_collection_among_faults_holds_whole_grasps_and_never_leaves_the_jaws_closing(tmp_path, port):
     found = collect_among_faults(tmp_path / "r", 10, rate=0.05, seed=2, port=port)
     assert found.grasps == 10
-    assert found.left_closing == 0
+    assert (found.left_moving, found.left_holding) == (0, 0)
     assert sum(found.faults.values()) > 10
     assert broken_images(tmp_path / "r") == []
     assert len(read_recording(tmp_path / "r").grasps) >= 10
@@ -23,9 +31,6 @@ def test_a_collection_among_faults_holds_whole_grasps_and_never_leaves_the_jaws_
 
 
 def test_where_a_device_stays_away_the_collection_stops_with_the_reason_and_the_jaws_open(tmp_path):
-    from robot.collect import CollectSettings, collect
-    from robot.errors import DeviceError
-
     with emulated_rig(1) as rig:
         real = rig.arm._move_to
 
@@ -40,3 +45,29 @@ def test_where_a_device_stays_away_the_collection_stops_with_the_reason_and_the_
         assert not rig.world.emulator.moves
         assert rig.world.emulator.opening_mm == pytest.approx(110.0, abs=0.5)
         assert read_recording(tmp_path / "r").grasps == ()
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_jaws_that_a_failed_call_leaves_moving_are_seen(stops, monkeypatch):
+    """The count of these collections can tell: without its stop, the driver is found out."""
+    if not stops:
+        monkeypatch.setattr(WSG50, "_stop", lambda self: None)
+        monkeypatch.setattr(Motions, "stop", lambda self: None)
+    with emulated_rig(1) as rig, rig:
+        emulator = rig.world.emulator
+        emulator.speed_up = 1.0  # closing takes seconds
+        begun = threading.Thread(target=interrupt_when, args=(lambda: emulator.is_closing,))
+        begun.start()
+        with pytest.raises(KeyboardInterrupt):
+            rig.gripper.grasp(10.0, 10.0)
+        begun.join()
+        assert rig.world.left_moving == (0 if stops else 1)
+        emulator.speed_up = SPEED_UP
+
+
+def interrupt_when(true):
+    """Ctrl-C, as soon as something is so."""
+    deadline = time.monotonic() + 10
+    while not true() and time.monotonic() < deadline:
+        time.sleep(0.002)
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)

@@ -78,6 +78,18 @@ def test_a_calibration_is_fitted_told_and_written(here, capsys):
     assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
 
 
+def test_a_calibration_by_which_no_arm_can_be_steered_is_not_written(here, capsys):
+    lines = POINTS.splitlines()
+    rows = [[float(value) for value in line.split(",")] for line in lines[1:]]
+    in_metres = [",".join(map(str, [each / 1000 for each in row[:3]] + row[3:])) for row in rows]
+    (here / "points.csv").write_text("\n".join([lines[0], *in_metres]))
+    assert main(["rig", "calibrate", "points.csv"]) == 1
+    said = capsys.readouterr().err
+    assert "metre" in said
+    assert "nothing was written" in said
+    assert not (here / "hand_eye.json").exists()
+
+
 def test_a_file_without_points_is_wrong_use(here, capsys):
     (here / "points.csv").write_text("a,b\n1,2\n")
     assert main(["rig", "calibrate", "points.csv"]) == 2
