@@ -1,6 +1,7 @@
 """The line to a WSG-50: deadlines, replies told apart, old ones dropped, ports that go away."""
 
 import os
+import select
 import socket
 import struct
 import subprocess
@@ -10,8 +11,10 @@ import time
 from contextlib import closing
 
 import pytest
+from serial.urlhandler import protocol_socket
 
 from robot.drivers import wsg50_commands as commands
+from robot.drivers import wsg50_link
 from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_codec import Frame, decode, encode
 from robot.drivers.wsg50_commands import Command, Status
@@ -69,29 +72,21 @@ class Peer:
         self.thread.join()
 
 
-class Flood(Peer):
-    """Sends the same over and over, and listens to nothing until told to end."""
+class Endless:
+    """Stands for a port whose other side sends the same over and over, faster than anybody reads."""
 
     def __init__(self, data):
-        self.data, self.ended = data, threading.Event()
-        super().__init__(None)
+        self.data = data
 
-    def run(self):
-        client, _ = self.server.accept()
-        client.settimeout(0.01)
-        with client:
-            while not self.ended.is_set():
-                try:
-                    client.send(self.data)
-                except TimeoutError:
-                    continue
-                except OSError:
-                    return
+    def __call__(self, name, **_):
+        return self
 
-    def __exit__(self, *_):
-        self.ended.set()
-        self.thread.join()
-        self.server.close()
+    def read(self, timeout_s):
+        return self.data
+
+    def write(self, data): ...
+
+    def close(self): ...
 
 
 UPDATE = encode(Frame(Command.SYSTEM_STATE, OK + bytes(4)))
@@ -193,26 +188,45 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
 
 
 @FLOODS
-def test_every_wait_ends_though_the_other_side_never_falls_silent(data):
-    with Flood(data) as peer:
-        link = Link(peer.url, timeout_s=0.05)
-        ends(link.open)
-        assert link.is_open
-        assert ends(lambda: link.pump(0.05)) is None
-        assert ends(lambda: link.pump(0.0)) is None
-        assert ends(lambda: link.poll(Command.HOME, 0.05)) is None
-        assert isinstance(ends(link.sync), NoEcho)
-        assert isinstance(ends(lambda: link.urgent(commands.stop())), NoReply)
-        assert isinstance(ends(lambda: link.tell(commands.stop())), NoEcho)
-        link.close()
+@pytest.mark.parametrize(
+    ("wait", "end"),
+    [
+        (lambda link: link.pump(0.05), None),
+        (lambda link: link.pump(0.0), None),
+        (lambda link: link.poll(Command.HOME, 0.05), None),
+        (lambda link: link.sync(), NoEcho),
+        (lambda link: link.urgent(commands.stop()), NoReply),
+        (lambda link: link.tell(commands.stop()), NoEcho),
+    ],
+)
+def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
+    monkeypatch.setattr(wsg50_link, "Port", Endless(data))
+    link = Link("a port", timeout_s=0.05)
+    link.open()
+    ended = ends(lambda: wait(link))
+    assert ended is None if end is None else isinstance(ended, end)
 
 
 @FLOODS
-def test_connecting_ends_though_the_other_side_never_falls_silent(data):
-    with Flood(data) as peer:
-        gripper = WSG50(port=peer.url, timeout_s=0.05)
-        assert "is it on, and connected" in str(ends(gripper.connect))
-        assert not gripper.is_connected
+def test_connecting_ends_though_the_other_side_never_falls_silent(data, monkeypatch):
+    monkeypatch.setattr(wsg50_link, "Port", Endless(data))
+    gripper = WSG50(port="a port", timeout_s=0.05)
+    assert "is it on, and connected" in str(ends(gripper.connect))
+    assert not gripper.is_connected
+
+
+def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end():
+    """pyserial reads on opening until nothing comes; here something comes whenever it looks."""
+    pending = [b"x"] * 100
+    with Peer(echoing) as peer, pytest.MonkeyPatch.context() as patch:
+        real = select.select
+
+        def always(read, write, other, timeout=None):
+            return (read, write, other) if pending and pending.pop() else real(read, write, other, timeout)
+
+        patch.setattr(protocol_socket.select, "select", always)
+        Port(peer.url, baud=9600, stop_bits=1, write_timeout_s=1.0).close()
+        assert len(pending) > 90
 
 
 def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
