@@ -624,6 +624,18 @@ def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
             arm.close()
 
 
+def test_motors_stay_off_where_connecting_must_let_nothing_move():
+    emulator = Emulator()
+    emulator.model.enabled = False
+    with serve(emulator) as url:
+        arm = arm_at(url, enable=True)
+        arm.may_move = False
+        with pytest.raises(DeviceError, match="is not enabled"):
+            arm.connect()
+        arm.close()
+    assert not emulator.model.enabled
+
+
 def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
     emulator = Emulator()
     emulator.model.enabled = False

@@ -170,6 +170,16 @@ def test_a_serial_line_must_have_room_beside_the_updates(baud, stop_bits, ms, fi
         WSG50(port="/dev/ttyUSB0", **settings)
 
 
+def test_it_does_not_home_where_connecting_must_move_nothing():
+    emulator = Emulator(referenced=False, speed_up=20.0)
+    with bench(emulator=emulator, connect=False) as (gripper, _):
+        gripper.may_move = False
+        with pytest.raises(DeviceError, match="does not know its reference, and may not be moved now"):
+            gripper.connect()
+    assert HOME not in emulator.heard
+    assert emulator.opening_mm == 50.0
+
+
 @PORTS
 def test_it_homes_on_connecting_where_the_reference_is_lost(port, caplog):
     with bench(port, emulator=Emulator(speed_up=20.0)) as (gripper, emulator):

@@ -167,7 +167,7 @@ class Sawyer(Arm):
     def _make_ready(self) -> None:
         """Enable the motors where that is all that is missing and allowed. Raises DeviceError."""
         state = self._robot_state()
-        if self._enable and not (state.enabled or state.stopped or state.error):
+        if self._enable and self.may_move and not (state.enabled or state.stopped or state.error):
             _LOG.warning("%s: the motors are being enabled", self.name)
             self._link.advertise(*messages.ENABLE)
             self._link.publish(messages.ENABLE[0], {"data": True})

@@ -235,7 +235,7 @@ class WSG50(Gripper):
     # How.
 
     def _set_up(self) -> None:
-        self._setup.run()
+        self._setup.run(may_home=self.may_move)
         self._take_limits()
 
     def _take_limits(self) -> None:

@@ -109,13 +109,15 @@ class Setup:
         self.motions = Motions(self.link, max_age_s=settings.max_state_age_s, period_ms=settings.update_ms)
         self.limits, self.openings = TYPICAL, (0.0, TYPICAL.stroke_mm)
 
-    def run(self) -> None:
-        """All of it, over an open line. Homes where the reference is lost."""
+    def run(self, may_home: bool) -> None:
+        """All of it, over an open line. Homes where the reference is lost, or raises DeviceError where it may not."""
         self.limits = self.link.ask(commands.ask(Command.LIMITS), commands.limits)
         self._check_ceilings()
         self.stop_if_it_moves(self.motions.stop)
         self._end_fast_stop()
         if not self._system_state() & SystemState.REFERENCED:
+            if not may_home:
+                raise DeviceError(f"{self.name} does not know its reference, and may not be moved now to find it")
             _log.warning("%s does not know its reference: homing, the jaws move", self.name)
             self.home()
         self._apply()
