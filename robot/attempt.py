@@ -185,11 +185,13 @@ class Attempter:
         return _OUTCOME_OF[status]
 
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
-        """Let go: of a held object on the table, at a random place and turned at random."""
+        """Let go: of a held object on the table, at a random place and turned at random, or where it was given."""
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
         x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
         yaw = float(rng.uniform(0.0, math.pi))
+        if rig.given is not None:
+            x, y, yaw = plan.pose.x_mm, plan.pose.y_mm, plan.pose.yaw_rad
         if held:
             z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))
             rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.travel_mm_s)

@@ -84,13 +84,15 @@ class Rig:
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Have this object on the table for attempt `number`: asks a person when the object changes.
+        """Have this object on the table for attempt `number`: asks a person when the object changes, and for each attempt
+        where it must stand at a given place, for a grasp that slipped has moved it.
 
         Raises RobotConfigError where nobody can answer.
         """
-        if object_id != self._on_table:
+        if object_id != self._on_table or self.given is not None:
+            place = "on the table" if self.given is None else f"at x {self.given.x_mm:g}, y {self.given.y_mm:g} mm"
             try:
-                self.ask(f"Put {object_id} on the table, alone, and press Enter.")
+                self.ask(f"Put {object_id} {place}, alone, and press Enter.")
             except EOFError as error:
                 raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
             self._on_table = object_id

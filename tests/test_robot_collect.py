@@ -12,11 +12,13 @@ from robot.attempt import Attempter, depth_in_mm
 from robot.attempt_log import acceptance, read_attempts
 from robot.attempt_settings import AttemptSettings
 from robot.collect import CollectSettings, Progress, collect, name_of
+from robot.cylinder import CylinderFit
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
 from robot.gates import ContactAreaGate
 from robot.grasp import GraspSettings
 from robot.readings import RGBD
 from robot.recording import RecordingWriter, read_recording
+from robot.rig import Rig
 from tests.fake_rig import FakeArm, FakeRig
 
 NAMES = ("round-0", "thin-1", "round-2")
@@ -237,6 +239,34 @@ def test_what_begins_low_goes_straight_up_or_down(faults, monkeypatch):
         low = [(here, there) for here, there in moves if here.z_mm < rig.world.solid.height + 10]
     assert len(low) >= 3
     assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
+
+
+def test_where_the_place_is_given_no_depth_is_asked_for_and_the_object_is_put_back_there():
+    rig = FakeRig(3)
+    with rig:
+        rig.prepare("round-0", 0)
+        solid = rig.world.solid
+        rig.given = CylinderFit(
+            solid.x, solid.y, solid.height, solid.radius, 1.0, "given", (solid.radius, solid.radius)
+        )
+        attempt = Attempter(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
+    assert attempt.fit["method"] == "given"
+    assert "camera" in rig.world.calls
+    assert "depth" not in rig.world.calls
+    put = rig.world.pose
+    assert (put.x_mm, put.y_mm, put.yaw_rad) == (
+        attempt.fields["pose"][0],
+        *(attempt.fields["pose"][i] for i in (1, 3)),
+    )
+
+
+def test_a_person_is_asked_to_put_the_object_back_before_each_attempt_at_a_given_place():
+    asked = []
+    rig = FakeRig(3)
+    rig.ask, rig.given = asked.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
+    for number in range(2):
+        Rig.prepare(rig, "mug", number)
+    assert asked == ["Put mug at x 5, y -2.5 mm, alone, and press Enter."] * 2
 
 
 def test_a_person_is_not_asked_to_rise_first(monkeypatch):
