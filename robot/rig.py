@@ -84,8 +84,8 @@ class Rig:
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Have this object on the table for attempt `number`: asks a person when the object changes, and each time where
-        it must stand at a given place, for a grasp that slipped has moved it.
+        """Have this object on the table for attempt `number`: asks a person when the object changes, and each time
+        where it must stand at a given place, for a grasp that slipped has moved it.
 
         Raises RobotConfigError where nobody can answer.
         """
