@@ -5,12 +5,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from retrieval.config import Config, MatcherConfig, TrainingConfig
 from retrieval.images import Preprocessing
 from tests import synthetic
 
 torch.set_num_threads(2)
+
+# Timing decides no test: not how long an example takes, and not how long the first one is drawn on a new machine.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
+
 
 TINY = Config(
     MatcherConfig(tower="small", tower_output="pooled", hidden=32, standardise=True, embedding_dim=16),
