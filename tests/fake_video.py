@@ -232,16 +232,6 @@ class FakeFreenect2:
         return SimpleNamespace(array=array, asarray=as_type.__getitem__)
 
 
-def until(holds):
-    """Wait until something that a thread does has happened, ten seconds at most."""
-    event = threading.Event()
-    for _ in range(5000):
-        if holds():
-            return
-        event.wait(0.002)
-    raise AssertionError("it did not happen")
-
-
 def own_threads():
     """Threads that read cameras."""
     return [thread for thread in threading.enumerate() if thread.name.startswith("frames of")]

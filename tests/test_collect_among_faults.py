@@ -5,7 +5,6 @@
 
 import signal
 import threading
-import time
 
 import pytest
 
@@ -16,6 +15,7 @@ from robot.errors import DeviceError
 from robot.recording import read_recording
 from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
 from tests.fake_video import own_threads
+from tests.waiting import until
 
 
 @pytest.mark.parametrize("port", ["tcp", "pty"])
@@ -67,7 +67,5 @@ def test_jaws_that_a_failed_call_leaves_moving_are_seen(stops, monkeypatch):
 
 def interrupt_when(true):
     """Ctrl-C, as soon as something is so."""
-    deadline = time.monotonic() + 10
-    while not true() and time.monotonic() < deadline:
-        time.sleep(0.002)
+    until(true)
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)

@@ -41,7 +41,7 @@ def test_naive_float32_sums_change_with_the_order_of_the_components():
     assert not np.array_equal(naive, shuffled)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(dim=st.integers(1, 600), seed=st.integers(0, 10**6), scale=st.sampled_from([0.999, 1.0, 1.001]))
 def test_the_gridded_sum_is_exact_and_near_the_true_one(dim, seed, scale):
     left, right = unit(1, dim, seed)[0] * np.float32(scale), unit(1, dim, seed + 1)[0]

@@ -419,7 +419,7 @@ CHANGES = st.lists(st.dictionaries(st.integers(0, 11), st.integers(0, 4), min_si
 
 
 @pytest.mark.parametrize("kind", ["exact", "flat", "hnsw", "ivf_flat"])
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(states=CHANGES)
 def test_any_changes_of_a_catalogue_end_in_what_a_fresh_build_gives(tmp_path_factory, kind, states):
     folder, contents = tmp_path_factory.mktemp("index"), unit(5, seed=4)

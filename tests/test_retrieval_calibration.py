@@ -226,7 +226,7 @@ finite_logits = st.floats(-FLOAT32_MAX, FLOAT32_MAX, width=32)
 pair_lists = st.lists(st.tuples(finite_logits, st.integers(0, 1)), min_size=1, max_size=20)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(pairs=pair_lists, one=finite_logits, two=finite_logits)
 def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
     logits, labels = zip(*pairs, (one, 0), (two, 1), strict=True)
@@ -360,7 +360,7 @@ def auc_by_loops(logits, labels):
 few_values = st.sampled_from([-1e30, -1.0, 0.0, 1e-30, 1.0, 2.0])
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     pairs=st.lists(st.tuples(few_values, st.integers(0, 1)), max_size=30),
     one=few_values,

@@ -147,7 +147,7 @@ def parts_of(split):
     return {"train": split.train, "validation": split.validation, "test": split.test}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=st.lists(st.integers(1, 3), min_size=6, max_size=40), seed=seeds)
 def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
     grasps = grasps_of(*counts)
@@ -157,7 +157,7 @@ def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
     assert min(map(len, parts_of(split).values())) >= 2
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(count=st.integers(6, 120), seed=seeds, validation=st.floats(0, 0.35), test=st.floats(0, 0.35))
 def test_shares_are_met_to_half_an_object_or_the_least_of_two(count, seed, validation, test):
     split = make_split(grasps_of(*[1] * count), validation=validation, test=test, seed=seed)
@@ -176,7 +176,7 @@ def test_the_papers_shares_of_98_objects_are_18_and_10():
 linked = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 7)), min_size=1, max_size=20)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(links=linked, seed=seeds)
 def test_objects_that_share_a_sequence_however_indirectly_stay_together(links, seed):
     """The oracle joins one pair of objects at a time until nothing changes."""
@@ -278,7 +278,7 @@ def test_the_seed_of_a_split_is_a_whole_number(seed):
 # Pairs -----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=counts, seed=seeds, step=st.integers(0, 10**6), touches=st.integers(1, 7), share=st.booleans())
 def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, seed, step, touches, share):
     grasps = grasps_of(*counts)
@@ -294,7 +294,7 @@ def test_every_touch_has_four_photos_of_its_object_and_four_of_others(counts, se
         assert all(photo in own for _, _, photo, _, _ in mine)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=counts, seed=seeds, positives=st.integers(1, 5), negatives=st.integers(1, 5), share=st.booleans())
 def test_other_numbers_of_photos_are_drawn_as_asked(counts, seed, positives, negatives, share):
     grasps = grasps_of(*counts)
@@ -310,7 +310,7 @@ def _labels_by_touch(batch):
     return found
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=counts, seed=seeds, touches=st.integers(1, 9), share=st.booleans())
 def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used(counts, seed, touches, share):
     batch = PairSampler(grasps_of(*counts), seed=seed, share_photos=share).batch(0, touches)
@@ -321,7 +321,7 @@ def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used
     assert [names[i] for i in batch.touch_objects] == [item.object_id for item in batch.grasps]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=counts, seed=seeds, touches=st.integers(1, 7))
 def test_at_any_moment_every_object_has_been_used_equally_often(counts, seed, touches):
     sampler, used = PairSampler(grasps_of(*counts), seed=seed), Counter(range(len(counts)))
@@ -332,7 +332,7 @@ def test_at_any_moment_every_object_has_been_used_equally_often(counts, seed, to
             assert max(used.values()) - min(used.values()) <= 1
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(counts=counts, seed=seeds)
 def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, seed):
     sampler, objects = PairSampler(grasps_of(*counts), seed=seed), len(counts)
@@ -343,7 +343,7 @@ def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, 
             assert len(set(mine[start : start + count])) == count
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=seeds, steps=st.permutations(range(5)))
 def test_a_batch_depends_on_seed_and_step_and_not_on_what_was_asked_before(seed, steps):
     grasps = grasps_of(3, 1, 4, 2)

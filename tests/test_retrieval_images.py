@@ -419,7 +419,7 @@ def check_only_image_errors(data):
     assert rgb.max() <= 1
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     prefix=st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF....WEBP"]),
     rest=st.binary(max_size=200),
@@ -428,7 +428,7 @@ def test_random_bytes_are_an_image_error_or_a_picture(prefix, rest):
     check_only_image_errors(prefix + rest)
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=600)
 @given(
     name=st.sampled_from(sorted(sample_files())),
     flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7)), min_size=1, max_size=6),
@@ -440,7 +440,7 @@ def test_flipped_bits_are_an_image_error_or_a_picture(name, flips):
     check_only_image_errors(bytes(data))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     name=st.sampled_from(sorted(sample_files())),
     place=st.integers(0, 63),

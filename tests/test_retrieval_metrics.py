@@ -24,7 +24,7 @@ def curve_by_enumeration(true_score, others, k):
     return found / cases
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 3), st.lists(st.integers(0, 3), min_size=3, max_size=5), st.integers(1, 4))
 def test_the_curve_is_what_every_draw_and_every_order_of_equals_gives(true_score, others, k):
     np.testing.assert_allclose(

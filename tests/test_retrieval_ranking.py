@@ -90,7 +90,7 @@ def test_naively_an_average_precision_of_equals_from_its_first_and_last_order_is
     assert abs(sum(ends) / 2 - expected) > 0.01
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=6))
 def test_equals_count_by_the_mean_over_every_order(items):
     scores, relevant = zip(*items, strict=True)
@@ -146,7 +146,7 @@ def test_a_query_with_nothing_to_find_is_refused_and_named():
             function(scores, relevant, shown)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 5), st.sampled_from([0.0, 7.5, -1e30]))
 def test_chance_is_what_a_constant_scorer_gets(count, right, hidden, value):
     relevant = np.zeros((1, count + hidden), dtype=bool)

@@ -18,6 +18,7 @@ from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.test_robot_collect import files
 from tests.test_robot_recording_crash import Failing
+from tests.waiting import until
 
 ROOT = Path(__file__).parents[1]
 NAMES = ["round-0", "thin-1", "wide-2", "round-3"]
@@ -213,23 +214,16 @@ def test_workers_leave_with_their_parent(tmp_path, end):
     parent = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
     try:
         log = tmp_path / "r" / "attempts.jsonl"
-        wait_for(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3)
+        until(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, limit_s=60.0)
         workers = children(parent.pid)
         assert len(workers) >= 2
         for each in end:
             parent.send_signal(each)
             time.sleep(0.1)
         said = parent.communicate(timeout=60)[1]
-        wait_for(lambda: not any(map(is_running, workers)))
+        until(lambda: not any(map(is_running, workers)), limit_s=60.0)
     finally:
         parent.kill()
     if signal.SIGINT in end:
         assert "KeyboardInterrupt" in said
     assert read_recording(tmp_path / "r").grasps
-
-
-def wait_for(condition, seconds=60.0):
-    start = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start < seconds, "waited too long"
-        time.sleep(0.05)

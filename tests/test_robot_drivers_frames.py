@@ -12,7 +12,8 @@ from robot.drivers import frames
 from robot.drivers.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
-from tests.fake_video import own_threads, until
+from tests.fake_video import own_threads
+from tests.waiting import until
 
 SETTINGS = ReaderSettings(warmup_s=0.0, timeout_s=5.0, frozen_s=2.0, backoff_s=(1e-3, 4e-3))
 ENOUGH_S = 10.0

@@ -14,7 +14,8 @@ from robot.drivers import discover, opencv_stream
 from robot.drivers.opencv_stream import CaptureSettings, CaptureStream, stable_path
 from robot.drivers.opencv_tactile import PRESETS, Digit, GelSight, GelSightMini, OpencvTactile
 from robot.errors import DeviceError, RobotConfigError
-from tests.fake_video import FakeCamera, own_threads, until
+from tests.fake_video import FakeCamera, own_threads
+from tests.waiting import until
 
 QUICK = {"warmup_s": 0.0, "timeout_s": 10.0}
 

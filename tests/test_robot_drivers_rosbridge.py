@@ -73,14 +73,14 @@ def reply_to(operation, **changes):
     return {"op": "service_response", "id": operation["id"], "values": {"x": 1}, "result": True} | changes
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.dictionaries(st.text(), PLAIN, max_size=3), st.text())
 def test_what_is_encoded_is_decoded(fields, name):
     operation = fields | {"op": name}
     assert decode(encode(operation)) == operation
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.text() | st.binary() | PLAIN.map(lambda value: json.dumps(value)))
 def test_decoding_anything_gives_an_operation_or_nothing(text):
     found = decode(text)

@@ -26,6 +26,7 @@ from robot.drivers.sawyer_model import READY, SawyerModel, forward, inverse
 from robot.drivers.straight_line import Schedule, way_points
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
+from tests.waiting import until
 
 WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 MOUNT = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
@@ -47,20 +48,13 @@ def connected(emulator=None, **changes):
         yield emulator, arm
 
 
-def wait_until(true, limit_s=10.0):
-    deadline = time.monotonic() + limit_s
-    while not true():
-        assert time.monotonic() < deadline, "what was waited for did not happen"
-        time.sleep(0.002)
-
-
 @contextlib.contextmanager
 def while_it_moves(emulator, act):
     """Do something to the robot once 15 more commands have come."""
     before = len(emulator.commands)
 
     def run():
-        wait_until(lambda: len(emulator.commands) > before + 15)
+        until(lambda: len(emulator.commands) > before + 15)
         act()
 
     thread = threading.Thread(target=run)
@@ -118,7 +112,7 @@ def test_a_hand_that_leans_is_refused(lean_deg):
             mount.pose_of(tip)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(-150, 150), st.floats(-150, 150), st.floats(0, 300), st.floats(-1.5, 1.5))
 def test_the_made_up_arm_is_honest(x, y, z, yaw):
     tip = Mount((500.0, 0.0, -100.0), math.pi, 150.0, 0.0).tip_of(Pose(x, y, z, yaw))
@@ -227,7 +221,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("reader", sorted(READERS))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(message=st.dictionaries(st.sampled_from(["name", "names", "position", "joints", "result_type"]), ANY))
 def test_a_message_of_any_content_is_read_or_is_a_device_error(reader, message):
     with contextlib.suppress(DeviceError):
@@ -312,7 +306,7 @@ def test_it_goes_where_it_is_told_as_the_robot_itself_measures_it():
         x, y, z = forward(emulator.model.joints)[0]
         assert (x, y, z) == pytest.approx((0.480, 0.030, 0.140), abs=1e-3)  # base turned by 180 deg: 500 - 20, 30
         assert offset(arm.pose(), target) < (1.0, 0.02)
-        wait_until(lambda: stands(emulator))
+        until(lambda: stands(emulator))
 
 
 def test_commands_never_step_further_than_speed_allows_in_two_ticks_even_after_a_nap():
@@ -357,7 +351,7 @@ def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
         assert emulator.model.stopped
         assert offset(arm.pose(), FAR)[0] > 50
         emulator.release_estop()
-        wait_until(lambda: arm._robot_state().obstacle is None)
+        until(lambda: arm._robot_state().obstacle is None)
         arm.recover()
         target = Pose(0, 0, arm.pose().z_mm + 5, 0)
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
@@ -368,9 +362,7 @@ def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
         emulator.model.collided = True
         published = len(arm._link.history(LIMB + "collision_detection_state"))
         history = lambda: arm._link.history(LIMB + "collision_detection_state")  # noqa: E731
-        wait_until(
-            lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99
-        )
+        until(lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99)
         emulator.model.collided = False
 
     with connected() as (emulator, arm):
@@ -387,7 +379,7 @@ def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
 def test_a_collision_that_lasts_needs_a_person():
     with connected() as (emulator, arm):
         emulator.model.collided = True
-        wait_until(lambda: arm._collided_since(0.0))
+        until(lambda: arm._collided_since(0.0))
         with pytest.raises(DeviceError, match="recovery is refused: the robot reports a collision"):
             arm.recover()
         with pytest.raises(DeviceError, match="reports a collision"):
@@ -409,7 +401,7 @@ def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkey
         with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
             arm.move_to(FAR, 20.0)
         count = len(emulator.commands)
-        wait_until(lambda: stands(emulator))  # the robot's own time-out
+        until(lambda: stands(emulator))  # the robot's own time-out
         assert len(emulator.commands) == count
         assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
         emulator.silent.clear()
@@ -436,7 +428,7 @@ def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatc
     monkeypatch.setattr("robot.drivers.sawyer._BACK_OFF_S", 0.001)
     with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
         emulator.silent.add(messages.COLLISION[0])
-        wait_until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
+        until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
         for _ in range(2):
             with pytest.raises(DeviceError, match=r"no message on .*collision_detection_state"):
                 arm.recover()
@@ -469,7 +461,7 @@ def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
         assert "and while sawyer was stopped" in caught.value.__notes__[0]
         with pytest.raises(DeviceError, match="is gone"):
             arm.stop()
-        wait_until(lambda: stands(emulator))
+        until(lambda: stands(emulator))
         with caplog.at_level(logging.WARNING):
             arm.recover()
         assert "connecting again" in caplog.text
@@ -483,7 +475,7 @@ def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
         arm = arm_at(robot.enter_context(serve(Emulator())), reconnect_tries=3, timeout_s=5.0)
         arm.connect()
         robot.close()
-        wait_until(lambda: not arm._link.is_open)
+        until(lambda: not arm._link.is_open)
         with caplog.at_level(logging.WARNING), pytest.raises(DeviceError, match="rosbridge must answer at"):
             arm.recover()
         assert caplog.text.count("try ") == 3
@@ -506,13 +498,14 @@ def test_ctrl_c_leaves_the_arm_standing():
         with pytest.raises(KeyboardInterrupt):
             arm.move_to(FAR, 50.0)
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        wait_until(lambda: stands(emulator))
+        until(lambda: stands(emulator))
         assert offset(arm.pose(), FAR)[0] > 50
 
 
 PROGRAM = """
 from robot.drivers.sawyer import Sawyer
 from robot.readings import Box, Pose
+from tests.waiting import until
 box = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
 with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
@@ -526,7 +519,7 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
         code = PROGRAM.replace("PORT", url.rpartition(":")[2])
         with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as process:
             try:
-                wait_until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 30.0)
+                until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 30.0)
                 process.send_signal(signal.SIGINT)
                 errors = process.communicate(timeout=30)[1]
             finally:
@@ -534,14 +527,14 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
         assert "KeyboardInterrupt" in errors
         assert "and while" not in errors
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        wait_until(lambda: stands(emulator))
+        until(lambda: stands(emulator))
 
 
 def test_closing_from_another_thread_ends_a_motion():
     with connected() as (emulator, arm):
         with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is gone"):
             arm.move_to(FAR, 20.0)
-        wait_until(lambda: stands(emulator))
+        until(lambda: stands(emulator))
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.05
         assert not arm.is_connected
 
@@ -690,7 +683,7 @@ def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds,
                 outcomes["done"] += 1
             except DeviceError:
                 outcomes["failed"] += 1
-                wait_until(lambda: stands(emulator))
+                until(lambda: stands(emulator))
                 arm.recover()
     with capsys.disabled():
         print(f"\n10 motions: {dict(outcomes)}; faults: {dict(sorted(faults.counts.items()))}")

@@ -10,7 +10,8 @@ from robot.drivers.wsg50_emulator import Emulator, Faults
 from robot.drivers.wsg50_faults import KINDS, Piece
 from robot.drivers.wsg50_port import LinkLost
 from robot.errors import DeviceError
-from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench, until
+from tests.waiting import until
+from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench
 
 
 @PORTS

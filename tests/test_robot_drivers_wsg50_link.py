@@ -21,7 +21,7 @@ from robot.drivers.wsg50_commands import Command, Status
 from robot.drivers.wsg50_link import CommandFailed, Link, NoEcho, NoReply
 from robot.drivers.wsg50_port import LinkLost, Port
 from robot.errors import DeviceError
-from tests.wsg50_bench import until
+from tests.waiting import until
 from tests.wsg50_frames import bytes_of
 
 OK = bytes(2)

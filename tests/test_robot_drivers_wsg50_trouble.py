@@ -14,7 +14,8 @@ from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_commands import Status
 from robot.drivers.wsg50_emulator import Emulator
 from robot.errors import DeviceError
-from tests.wsg50_bench import ACK, FAST_STOP, GRASP, HOME, PORTS, QUICK, STOP, TARE, Script, bench, until
+from tests.waiting import until
+from tests.wsg50_bench import ACK, FAST_STOP, GRASP, HOME, PORTS, QUICK, STOP, TARE, Script, bench
 
 
 @PORTS

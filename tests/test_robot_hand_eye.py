@@ -43,7 +43,7 @@ def test_a_quarter_turn_about_z_by_hand():
     np.testing.assert_allclose(found.affine, expected, rtol=0, atol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 10_000), st.floats(-1e5, 1e5))
 def test_a_planted_rigid_map_comes_back_however_far_its_origin(seed, far):
     rng = np.random.default_rng(seed)

@@ -135,7 +135,7 @@ def test_recording_json_has_defaults_and_keeps_other_keys(tmp_path):
     assert read_recording(tmp_path).grasps == ()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.text(st.characters(categories=["L", "N", "P"]), min_size=1),
     st.floats(allow_nan=False, allow_infinity=False),

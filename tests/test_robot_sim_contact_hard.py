@@ -98,7 +98,7 @@ def test_every_depth_is_reached(name, depth):
         assert max(conditions(hard_gaps()[name], layer, contact, True)) <= 1e-5
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_any_small_map_is_solved(data):
     shape = data.draw(st.tuples(st.integers(1, 7), st.integers(1, 7)))

@@ -1,7 +1,6 @@
 """A WSG-50's driver on an emulated gripper, for tests: lines that damage the frames they are told to."""
 
 import contextlib
-import time
 from unittest.mock import patch
 
 import pytest
@@ -64,10 +63,3 @@ def bench(port="tcp", faults=None, connect=True, emulator=None, **settings):
         finally:
             with contextlib.suppress(DeviceError):
                 gripper.close()
-
-
-def until(condition, seconds=10.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
