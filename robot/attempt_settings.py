@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from robot.errors import RobotConfigError
 from robot.grasp import GraspSettings
+from robot.settings import check_range
 
 OUTPUTS = ("depth", "before", "after")
 """What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
@@ -36,13 +37,8 @@ class AttemptSettings:
         if unknown := sorted(set(self.outputs) - set(OUTPUTS)):
             raise RobotConfigError(f"outputs must be of {', '.join(OUTPUTS)}; got {unknown[0]!r}")
         for name in ("travel_mm_s", "approach_mm_s", "closing_mm_s"):
-            self._require(name, 1e-3, math.inf)
+            check_range(name, getattr(self, name), 1e-3, math.inf)
         for name in ("settle_s", "hold_s", "release_mm", "retries"):
-            self._require(name, 0.0, 1e6)
-        self._require("table_share", 0.0, 1.0)
-        self._require("jpeg_quality", 0, 100)
-
-    def _require(self, name: str, least: float, most: float) -> None:
-        value = getattr(self, name)
-        if not least <= value <= most or math.isinf(value):
-            raise RobotConfigError(f"{name} must be from {least:g} to {most:g}, got {value}")
+            check_range(name, getattr(self, name), 0.0, 1e6)
+        check_range("table_share", self.table_share, 0.0, 1.0)
+        check_range("jpeg_quality", self.jpeg_quality, 0, 100)

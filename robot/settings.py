@@ -1,6 +1,7 @@
 """Plain settings, as TOML gives them, to the keywords of a class: checked by their names and annotated types."""
 
 import inspect
+import math
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
@@ -54,6 +55,12 @@ def check_type(name: str, hint: Any, value: object) -> None:
         words = " or ".join(_PLAIN[option][1] for option in options if option in _PLAIN)
     if not good:
         raise RobotConfigError(f"{name} must be {words}, got {value!r}")
+
+
+def check_range(name: str, value: float, least: float, most: float, unit: str = "") -> None:
+    """Raise RobotConfigError unless a setting is a finite number from `least` to `most`."""
+    if not least <= value <= most or math.isinf(value):  # also refuses NaN
+        raise RobotConfigError(f"{name} must be from {least:g} to {most:g}{unit and ' '}{unit}, got {value!r}")
 
 
 def _check_finite(name: str, value: object) -> None:

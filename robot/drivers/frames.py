@@ -19,8 +19,9 @@ from typing import Protocol
 import numpy as np
 
 from robot.devices import Clock
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError
 from robot.readings import Frame
+from robot.settings import check_range
 
 log = logging.getLogger(__name__)
 MOST_S = 600.0
@@ -58,11 +59,9 @@ class ReaderSettings:
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        if not 1 <= self.keep <= 1000:
-            raise RobotConfigError(f"keep must be from 1 to 1000 pictures, got {self.keep}")
+        check_range("keep", self.keep, 1, 1000, "pictures")
         for name, least in (("warmup_s", 0.0), ("timeout_s", 1e-3), ("frozen_s", 1e-3)):
-            if not least <= getattr(self, name) <= MOST_S:  # also refuses NaN
-                raise RobotConfigError(f"{name} must be from {least:g} to {MOST_S:g} s, got {getattr(self, name)}")
+            check_range(name, getattr(self, name), least, MOST_S, "s")
 
 
 class FrameReader:

@@ -12,12 +12,13 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 
-from robot.devices import Clock
+from robot.devices import Clock, Device
 from robot.drivers import discover
 from robot.drivers.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
@@ -242,6 +243,22 @@ class CaptureReader(FrameReader):
         """A lost stream is opened again without being asked: have it be now, and wait for a picture."""
         self.hurry()
         self.after(self.clock())
+
+
+def reader_maker(
+    owner: Device, device: str, asked: CaptureSettings, reading: ReaderSettings, *, allow_index: bool
+) -> Callable[[], CaptureReader]:
+    """Makes readers of one camera for its `owner`, who needs a new one for each connection."""
+    return partial(
+        CaptureReader,
+        owner.name,
+        device,
+        asked,
+        reading,
+        allow_index=allow_index,
+        refused=owner.refused,
+        clock=owner.clock,
+    )
 
 
 def _words(value: Any) -> str:

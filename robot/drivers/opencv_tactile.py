@@ -13,7 +13,7 @@ import numpy as np
 
 from robot.devices import Clock, TactileSensor
 from robot.drivers.frames import ReaderSettings
-from robot.drivers.opencv_stream import LEAVE, CaptureReader, CaptureSettings
+from robot.drivers.opencv_stream import LEAVE, CaptureSettings, reader_maker
 from robot.drivers.rectify import in_rgb, make_rectifier
 from robot.readings import Frame
 
@@ -82,8 +82,8 @@ class OpencvTactile(TactileSensor):
         super().__init__(f"gel {finger}", finger, clock=clock)
         preset = PRESETS[self.PRESET]
         size_is_left = not (width or height)
-        self.device, self.allow_index = device, allow_index
-        self._asked = CaptureSettings(
+        self.device = device
+        asked = CaptureSettings(
             width=preset.width if size_is_left else width,
             height=preset.height if size_is_left else height,
             fps=fps or preset.fps,
@@ -96,9 +96,10 @@ class OpencvTactile(TactileSensor):
             buffer=buffer,
             led=tuple(led) or preset.led,
         )
-        self._reading = ReaderSettings(keep=keep, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
+        reading = ReaderSettings(keep=keep, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
         self._rectifier = make_rectifier(calibration, crop, output_px, preset.crop)
         self._quarter_turns = preset.quarter_turns
+        self._make_reader = reader_maker(self, device, asked, reading, allow_index=allow_index)
         self._reader = self._make_reader()
         self._picture_px: list[int] = []
 
@@ -111,17 +112,6 @@ class OpencvTactile(TactileSensor):
     def lost(self) -> int:
         """How often the stream was lost and opened again since it was connected."""
         return self._reader.lost
-
-    def _make_reader(self) -> CaptureReader:
-        return CaptureReader(
-            self.name,
-            self.device,
-            self._asked,
-            self._reading,
-            allow_index=self.allow_index,
-            refused=self.refused,
-            clock=self.clock,
-        )
 
     def _connect(self) -> None:
         self._reader = self._make_reader()

@@ -48,13 +48,14 @@ class _PacedSensor(TactileSensor):
         *,
         finger: str,
         path: str,
-        fps: float,
-        loop: bool,
-        crop: Sequence[float],
-        calibration: str,
-        output_px: Sequence[int],
-        clock: Clock,
+        fps: float = 0.0,
+        loop: bool = True,
+        crop: Sequence[float] = (),
+        calibration: str = "",
+        output_px: Sequence[int] = (),
+        clock: Clock = time.monotonic,
     ) -> None:
+        """Raises RobotConfigError for a setting out of range; opens nothing."""
         super().__init__(f"gel {finger}", finger, clock=clock)
         if fps != 0 and not _FPS[0] <= fps <= _FPS[1]:
             raise RobotConfigError(f"fps must be from {_FPS[0]:g} to {_FPS[1]:g}, or 0 for the file's, got {fps}")
@@ -122,23 +123,8 @@ class _PacedSensor(TactileSensor):
 class VideoSensor(_PacedSensor):
     """A film file as a sensor. fps: 0 for the file's own."""
 
-    def __init__(
-        self,
-        *,
-        finger: str,
-        path: str,
-        fps: float = 0.0,
-        loop: bool = True,
-        crop: Sequence[float] = (),
-        calibration: str = "",
-        output_px: Sequence[int] = (),
-        clock: Clock = time.monotonic,
-    ) -> None:
-        """Raises RobotConfigError for a setting out of range; opens nothing."""
-        cutting: dict[str, Any] = {"crop": crop, "calibration": calibration, "output_px": output_px}
-        super().__init__(finger=finger, path=path, fps=fps, loop=loop, clock=clock, **cutting)
-        self._film: Any = None
-        self._next = 0
+    _film: Any = None
+    _next = 0
 
     def _open(self) -> tuple[int, float]:
         self._rewind()

@@ -31,6 +31,7 @@ from robot.drivers.sawyer_state import newest_joints, stands
 from robot.drivers.straight_line import Schedule, way_points
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
+from robot.settings import check_range
 
 _LOG = logging.getLogger(__name__)
 _READ = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
@@ -102,7 +103,7 @@ class Sawyer(Arm):
             ("reconnect_tries", reconnect_tries, 1, 20),
             ("max_state_age_s", max_state_age_s, 0.02, 5),
         ):
-            _require(name, value, low, high)
+            check_range(name, value, low, high)
         if len(base_xyz_mm) != 3 or not all(abs(value) <= 1e4 for value in base_xyz_mm):
             raise RobotConfigError(f"base_xyz_mm must be x, y and z in mm, each within 10 m, got {base_xyz_mm}")
         x, y, z = (float(value) for value in base_xyz_mm)
@@ -389,8 +390,3 @@ class Sawyer(Arm):
         arrivals = self._collisions()
         asked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
         return any(messages.collided(arrival.message) for arrival in asked)
-
-
-def _require(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:  # also refuses NaN
-        raise RobotConfigError(f"{name} must be from {low:g} to {high:g}, got {value!r}")

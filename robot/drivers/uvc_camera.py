@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Clock
 from robot.drivers.frames import ReaderSettings
-from robot.drivers.opencv_stream import LEAVE, CaptureReader, CaptureSettings
+from robot.drivers.opencv_stream import LEAVE, CaptureSettings, reader_maker
 from robot.drivers.rectify import in_rgb
 from robot.readings import RGBD
 
@@ -41,23 +41,13 @@ class UvcCamera(Camera):
     ) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("usb camera", extrinsics, clock=clock)
-        self.device, self.allow_index, self.upside_down = device, allow_index, upside_down
-        self._asked = CaptureSettings(
+        self.upside_down = upside_down
+        asked = CaptureSettings(
             width, height, fps, fourcc, auto_exposure, exposure_ms, auto_white_balance, white_balance_k, gain
         )
-        self._reading = ReaderSettings(keep=1, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
+        reading = ReaderSettings(keep=1, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
+        self._make_reader = reader_maker(self, device, asked, reading, allow_index=allow_index)
         self._reader = self._make_reader()
-
-    def _make_reader(self) -> CaptureReader:
-        return CaptureReader(
-            self.name,
-            self.device,
-            self._asked,
-            self._reading,
-            allow_index=self.allow_index,
-            refused=self.refused,
-            clock=self.clock,
-        )
 
     def _connect(self) -> None:
         self._reader = self._make_reader()

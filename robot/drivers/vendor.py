@@ -5,17 +5,16 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 
 from robot.drivers.frames import MOST_S
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError
+from robot.settings import check_range
 
 _MOST_WARMUP = 1000
 
 
 def check_waits(warmup_frames: int, timeout_s: float) -> None:
     """Raise RobotConfigError for waits that never end or that the system cannot make."""
-    if not 0 <= warmup_frames <= _MOST_WARMUP:
-        raise RobotConfigError(f"warmup_frames must be from 0 to {_MOST_WARMUP}, got {warmup_frames}")
-    if not 1e-3 <= timeout_s <= MOST_S:  # also refuses NaN
-        raise RobotConfigError(f"timeout_s must be from 0.001 to {MOST_S:g} s, got {timeout_s}")
+    check_range("warmup_frames", warmup_frames, 0, _MOST_WARMUP)
+    check_range("timeout_s", timeout_s, 1e-3, MOST_S, "s")
 
 
 def finite(what: str, numbers: Iterable[float]) -> list[float]:

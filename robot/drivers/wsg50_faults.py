@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from robot.drivers.wsg50_codec import Frame, WireError, encode
 from robot.errors import RobotConfigError
+from robot.settings import check_range
 
 KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")
 
@@ -33,8 +34,7 @@ class Faults:
     ) -> None:
         if unknown := sorted(set(kinds) - set(KINDS)):
             raise RobotConfigError(f"faults must be of {', '.join(KINDS)}; got {unknown[0]!r}")
-        if not 0 <= rate <= 1:
-            raise RobotConfigError(f"the rate of faults must be from 0 to 1, got {rate}")
+        check_range("the rate of faults", rate, 0, 1)
         self.rate, self.kinds, self.delay_s = rate, tuple(kinds), delay_s
         self.counts = dict.fromkeys(self.kinds, 0)
         self._random = random.Random(seed)

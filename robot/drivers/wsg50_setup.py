@@ -16,6 +16,7 @@ from robot.drivers.wsg50_link import CommandFailed, Link
 from robot.drivers.wsg50_motion import UPDATE_BYTES, Motions, Reading, causes, read
 from robot.drivers.wsg50_port import LinkLost
 from robot.errors import DeviceError, RobotConfigError
+from robot.settings import check_range
 
 _log = logging.getLogger(__name__)
 _DIRECTIONS = {"default": 0, "out": 1, "in": 2}
@@ -76,8 +77,7 @@ class Settings:
                 kind = getattr(field.type, "__name__", field.type)
                 raise RobotConfigError(f"{field.name} must be a {kind}, got {getattr(self, field.name)!r}")
         for name, (least, most) in _RANGES.items():
-            if not least <= getattr(self, name) <= most:
-                raise RobotConfigError(f"{name} must be from {least:g} to {most:g}, got {getattr(self, name)!r}")
+            check_range(name, getattr(self, name), least, most)
         if self.max_state_age_s < 2e-3 * self.update_ms:
             raise RobotConfigError(f"max_state_age_s must span two updates of {self.update_ms} ms")
         if self.home_direction not in _DIRECTIONS:

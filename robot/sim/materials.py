@@ -9,7 +9,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from robot.errors import RobotConfigError, UnknownName
+from robot.errors import UnknownName
+from robot.settings import check_range
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,7 @@ class Material:
             "roughness": (0.0, 1.0),
         }
         for field, (low, high) in limits.items():
-            if not low <= getattr(self, field) <= high:
-                raise RobotConfigError(f"{field} must be from {low:g} to {high:g}, got {getattr(self, field)!r}")
+            check_range(field, getattr(self, field), low, high)
 
 
 _TABLE = (

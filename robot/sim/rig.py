@@ -18,6 +18,7 @@ from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from robot.recorded_grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
+from robot.settings import check_range
 from robot.sim.camera import Camera, Placement
 from robot.sim.gel import draw_sensor
 from robot.sim.gel_marks import Markers
@@ -103,8 +104,7 @@ class SimRig(Rig):
     ) -> None:
         check_seed(seed)
         _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
-        if not 1 <= gels <= 1000:
-            raise RobotConfigError(f"gels must be from 1 to 1000 pairs, got {gels}")
+        check_range("gels", gels, 1, 1000, "pairs")
         self._seed, self._families, self._meshes = seed, tuple(sorted(families)), meshes
         self._shadow = shadow
         self._hand = Hand(grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
