@@ -109,6 +109,13 @@ def _add_train(commands: Any) -> None:
 def _add_build_index(commands: Any) -> None:
     parser = _command(commands, "build-index", "Make a folder of photos searchable.")
     parser.add_argument("catalogue", type=Path, help="folder: <object>/<photo> or <object>.<ext>")
+    parser.add_argument(
+        "--objects-from",
+        metavar="RULE",
+        help="what names a photo's object: folder (the first one, else the file), stem (the file's name without its "
+        "number), or a pattern such as {split}/{object}/{photo} or {object}_{view}.jpg (default: as the index has it, "
+        "else folder)",
+    )
     parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
     parser.add_argument("--out", type=Path, default=Path("index"), help="index folder (default: index)")
     parser.add_argument("--kind", help="candidate index (default: exact, unless a bound asks for more); see the README")

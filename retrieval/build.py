@@ -13,14 +13,18 @@ import torch  # before faiss, which the index imports: both bring OpenMP
 
 from indexes import load_kind
 from indexes.choice import choose_kind, require_buildable
-from indexes.errors import CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
 from indexes.generation import Generation
+from indexes.manifest import read_manifest
 from indexes.spool import Block
 from indexes.store import IndexStore
 from indexes.writing import RECALL_QUERIES, Chosen, Laid
-from retrieval.catalogue import SkippedPhoto, list_catalogue
+from retrieval.build_report import BuildReport
+from retrieval.catalogue import Catalogue, list_catalogue
 from retrieval.checkpoint import Checkpoint
 from retrieval.embed import Embedder, Part
+from retrieval.errors import BadInput
+from retrieval.naming import FOLDER, Naming, doubts, per_object
 from retrieval.operating import (
     Asked,
     Bench,
@@ -36,77 +40,12 @@ from retrieval.operating import (
 from retrieval.stored import fingerprint
 from retrieval.version import __version__
 
-SHOWN = 20
-
-
-@dataclass(frozen=True)
-class BuildReport:
-    """What a build did.
-
-    written: False where nothing had changed, so that the generation stayed as it was. skipped: photos that could not
-    be read; ignored: files that are no photos by name; notes: remarks on metadata. candidates: the operating point as
-    the manifest has it (`retrieval.operating`), None where the checkpoint has nothing to measure one with.
-    half_error: largest rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
-    """
-
-    index: str
-    generation: str
-    written: bool
-    model: str
-    photos: int
-    objects: int
-    embedded: int
-    reused: int
-    removed: int
-    skipped: list[SkippedPhoto]
-    ignored: list[str]
-    notes: list[str]
-    kind: str
-    reason: str
-    recall: Any
-    candidates: dict[str, Any] | None
-    half_error: float
-    seconds: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
-
-    def _measured(self) -> str:
-        if not self.recall["queries"]:
-            return ""  # exact by construction
-        return f" Recall@{self.recall['at']} against exact search: {self.recall['value']:.3f}, measured on this index."
-
-    def lines(self) -> Iterator[str]:
-        """The report for people."""
-        rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
-        yield (
-            f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
-            f"{self.embedded} embedded, {self.reused} unchanged, {self.removed} removed{rate}"
-        )
-        if not self.written:
-            yield "nothing changed, by the content of every file: the index stays as it is"
-        yield f"candidate search: {self.kind}. {self.reason}{self._measured()}"
-        yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
-        if self.ignored:
-            yield f"{len(self.ignored)} file(s) ignored, not images by name: {', '.join(self.ignored[:5])}"
-        yield from _some("remark(s)", self.notes)
-        yield from _some("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
-
-
-def _some(what: str, items: Sequence[str]) -> Iterator[str]:
-    if items:
-        yield f"{len(items)} {what}:"
-        yield from (f"  {item}" for item in items[:SHOWN])
-    if len(items) > SHOWN:
-        yield f"  and {len(items) - SHOWN} more (--json lists them all)"
-
-
 def build_index(
     folder: Path,
     checkpoint: Checkpoint,
     out: Path,
     *,
+    objects_from: str | None = None,
     kind: str | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
@@ -114,21 +53,28 @@ def build_index(
 ) -> BuildReport:
     """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
 
+    objects_from: which object a photo shows (`retrieval.naming`); where None, as the index has it, else by folder.
     kind, min_recall, max_ms: what is asked of the search (`retrieval.operating`); where all are None, exact search.
-    Where neither the photos' content nor what is asked for changed, nothing is written. Photos that cannot be read are
-    skipped and reported. Raises DatasetError where none can be, and the errors of `indexes.store.IndexStore.write`,
-    which leave the index as it was.
+    Where neither the photos' content nor their objects nor what is asked for changed, nothing is written. Photos that
+    cannot be read are skipped and reported. Raises BadInput for a rule that is none, DatasetError where no photo can be
+    read, and the errors of `indexes.store.IndexStore.write`, which leave the index as it was. What was embedded until
+    an error, or until the process was killed, is not embedded again by the next build (`indexes.unfinished`).
     """
     asked = Asked(kind, min_recall, max_ms)
-    catalogue = list_catalogue(folder)
+    store = IndexStore(out)
+    named_before = _named_before(store)
+    naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
+    catalogue = list_catalogue(folder, naming)
     if kind is not None:
         require_buildable(kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
-    store = IndexStore(out)
     with store.lock():
         parent, why = _parent(store, checkpoint)
+        if named_before not in (None, naming.text):
+            why = f"Objects are named by {naming.text} now, no longer by {named_before}. {why}".rstrip()
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": str(folder.resolve()),
+            "objects_from": naming.text,
             "asked": asdict(asked),
         }
         made = Embedder(checkpoint, parent)
@@ -139,18 +85,26 @@ def build_index(
             generation = parent if parent is not None and changed is None else job.write(changed or ())
         seconds = time.perf_counter() - start - job.settling_s
     inside = out.resolve()
+    names = sorted(made.objects)
     return BuildReport(
         index=str(out),
         generation=generation.name,
         written=changed is not None,
         model=str(checkpoint.path),
         photos=generation.count,
-        objects=len(made.object_ids),
+        objects=len(names),
+        objects_from=naming.text,
+        per_object=per_object(list(made.objects.values())),
+        examples=_examples(catalogue, names),
+        doubts=doubts(made.objects, naming),
         embedded=made.embedded,
         reused=made.photos - made.embedded,
+        renamed=made.renamed,
+        resumed=made.resumed,
         removed=made.removed,
         skipped=made.skipped,
         ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(inside)],
+        without_photo=sorted(set(catalogue.object_ids) - set(names)),
         notes=list(catalogue.notes),
         kind=generation.manifest.kind,
         reason=" ".join(filter(None, (why, generation.manifest.about["reason"]))),
@@ -159,6 +113,24 @@ def build_index(
         half_error=made.half_error,
         seconds=seconds,
     )
+
+
+def _named_before(store: IndexStore) -> str | None:
+    """The rule that named the objects of the index there, None where there is none that says so."""
+    try:
+        text = read_manifest(store.path / store.current()).about.get("objects_from")
+        return None if text is None else Naming(text).text
+    except (IndexesError, BadInput, TypeError):
+        return None
+
+
+def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str]]:
+    """The first, the middle and the last object, each with its first photo."""
+    wanted = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
+    found: dict[str, str] = {}
+    for photo in catalogue.photos:
+        found.setdefault(photo.object_id, photo.path)
+    return [(name, found[name]) for name in wanted]
 
 
 def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:

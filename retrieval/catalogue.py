@@ -1,12 +1,12 @@
 """A catalogue: a folder of photos to search, with the user's own metadata beside them.
 
     catalog/<object_id>/<photo>     the first folder names the object, however deep the photo lies below it
-    catalog/<object_id>.<ext>       or one photo per object, named by its file
+    catalog/<object_id>.<ext>       or one photo per object, named by its file; other rules: retrieval.naming
     catalog/metadata.jsonl          optional: one JSON object a line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; where both
                                     give a key, the photo's own wins
 
-Names that start with a dot are ignored. A photo's stable id is its path in the catalogue, forward slashes.
+Names that start with a dot are not looked at. A photo's stable id is its path in the catalogue, forward slashes.
 Listing opens no photo; `read_photo` reads one, and one broken file never stops the rest.
 """
 
@@ -20,9 +20,15 @@ from typing import Any, NoReturn
 
 from retrieval.errors import DatasetError, ImageError
 from retrieval.images import EXTENSIONS, decode_rgb, read_bytes
+from retrieval.naming import STEM, Naming
 from retrieval.resize import RgbImage
 
 METADATA_FILE = "metadata.jsonl"
+UNREAD = frozenset(
+    ".apng .arw .bpg .cr2 .cr3 .dng .eps .exr .gif .hdr .ico .j2k .jfif .jp2 .jxl .jxr .nef .orf .pbm .pcx .pgm .pnm "
+    ".ppm .psd .raf .raw .rw2 .svg .tga".split()
+)
+"""Endings of pictures that are not read: their objects may be left without a photo."""
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 
@@ -46,18 +52,22 @@ class SkippedPhoto:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a folder holds: photos by id, files that are no photos by name, what was left out, remarks."""
+    """What a folder holds: photos by id, files that are no photos by name, what was left out, remarks.
+
+    unread: objects of pictures that were left out by their names' endings.
+    """
 
     folder: Path
     photos: tuple[CataloguePhoto, ...]
     ignored: tuple[str, ...] = ()
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
     @property
     def object_ids(self) -> tuple[str, ...]:
-        """The objects, sorted, each once."""
-        return tuple(sorted({photo.object_id for photo in self.photos}))
+        """The objects, sorted, each once; some may have no photo that can be read."""
+        return tuple(sorted({photo.object_id for photo in self.photos} | set(self.unread)))
 
 
 @dataclass(frozen=True)
@@ -73,20 +83,35 @@ class PhotoBytes:
         return decode_rgb(self.data, self.photo.path)
 
 
-def list_catalogue(folder: str | Path) -> Catalogue:
-    """List the photos below `folder`, by id. Raises DatasetError: no folder, no photo, bad metadata."""
-    root = Path(folder)
+def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
+    """List the photos below `folder`, by id. naming: which object each shows; by folder where None.
+
+    Raises DatasetError: no folder, no photo, none that fits the naming, bad metadata.
+    """
+    root, naming = Path(folder), naming or Naming()
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
     walk = _Walk(root)
-    photos = sorted(path for path in walk.files if _is_photo(path))
-    ignored = sorted(path for path in walk.files if not _is_photo(path) and path != METADATA_FILE)
-    if not photos:
-        raise DatasetError(_no_photos(root, ignored, walk.skipped))
-    listed = [CataloguePhoto(path, _object_id(path), path) for path in photos]
-    listed, notes = _with_metadata(listed, root / METADATA_FILE)
-    return Catalogue(root, tuple(listed), tuple(ignored), tuple(walk.skipped), tuple(notes))
+    objects = {path: naming.object_of(path) for path in sorted(walk.files) if _ending(path) in EXTENSIONS | UNREAD}
+    listed = [
+        CataloguePhoto(path, name, path)
+        for path, name in objects.items()
+        if name is not None and _ending(path) in EXTENSIONS
+    ]
+    skipped = [SkippedPhoto(path, reason) for path, name in objects.items() if (reason := _unusable(path, name, naming))]
+    ignored = sorted(set(walk.files) - set(objects) - {METADATA_FILE})
+    skipped = [*walk.skipped, *skipped]
+    if not listed and (unfit := [path for path in objects if _ending(path) in EXTENSIONS]):
+        raise DatasetError(
+            f"no photo in {root} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
+            "Give folder, stem, or a pattern for paths like this one"
+        )
+    if not listed:
+        raise DatasetError(_no_photos(root, ignored, skipped))
+    listed, notes = _with_metadata(listed, root / METADATA_FILE, naming)
+    unread = {name for path, name in objects.items() if name is not None and _ending(path) in UNREAD}
+    return Catalogue(root, tuple(listed), tuple(ignored), tuple(skipped), tuple(notes), tuple(sorted(unread)))
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
@@ -108,13 +133,17 @@ def decode_photo(item: PhotoBytes | SkippedPhoto) -> RgbImage | SkippedPhoto:
         return SkippedPhoto(item.photo.path, error.reason)
 
 
-def _is_photo(path: str) -> bool:
-    return os.path.splitext(path)[1].lower() in EXTENSIONS
+def _ending(path: str) -> str:
+    return os.path.splitext(path)[1].lower()
 
 
-def _object_id(path: str) -> str:
-    first, *below = PurePosixPath(path).parts
-    return first if below else PurePosixPath(first).stem
+def _unusable(path: str, name: str | None, naming: Naming) -> str:
+    """Why a picture is left out by its path; empty for all else."""
+    if _ending(path) in UNREAD:
+        return f"{_ending(path)} pictures are not read: save it as PNG or JPEG"
+    if name is None:
+        return f"does not fit --objects-from {naming.text}" + (": a number alone" if naming.text == STEM else "")
+    return ""
 
 
 def _no_photos(root: Path, ignored: list[str], skipped: list[SkippedPhoto]) -> str:
@@ -185,9 +214,11 @@ def _bad_name(name: str) -> str:
 # The user's own metadata -----------------------------------------------------------------------------------
 
 
-def _with_metadata(photos: list[CataloguePhoto], path: Path) -> tuple[list[CataloguePhoto], list[str]]:
+def _with_metadata(
+    photos: list[CataloguePhoto], path: Path, naming: Naming
+) -> tuple[list[CataloguePhoto], list[str]]:
     """Add what metadata.jsonl says of each photo and its object; remark on lines that fit no photo."""
-    by_object, by_photo = _read_metadata(path)
+    by_object, by_photo = _read_metadata(path, naming)
     listed = []
     for photo in photos:
         metadata = {**by_object.get(photo.object_id, {}), **by_photo.get(photo.path, {})}
@@ -200,7 +231,7 @@ def _with_metadata(photos: list[CataloguePhoto], path: Path) -> tuple[list[Catal
 _Table = dict[str, dict[str, Any]]
 
 
-def _read_metadata(path: Path) -> tuple[_Table, _Table]:
+def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
     """Return (by object_id, by photo path) without the two keys. Raises DatasetError with the line number."""
     by_object: _Table = {}
     by_photo: _Table = {}
@@ -208,7 +239,7 @@ def _read_metadata(path: Path) -> tuple[_Table, _Table]:
         if not line.strip():
             continue
         try:
-            name, is_photo, metadata = _parse_line(line)
+            name, is_photo, metadata = _parse_line(line, naming)
             table = by_photo if is_photo else by_object
             if name in table:
                 raise ValueError(f"{name} has a line already; join the two")
@@ -227,7 +258,7 @@ def _lines(path: Path) -> list[bytes]:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _parse_line(line: bytes) -> tuple[str, bool, dict[str, Any]]:
+def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys). Raises ValueError."""
     row = json.loads(line.decode(), parse_constant=_refuse_number, parse_float=_finite)
     if not isinstance(row, dict):
@@ -241,8 +272,9 @@ def _parse_line(line: bytes) -> tuple[str, bool, dict[str, Any]]:
     if "file_name" not in row:
         return row["object_id"], False, metadata
     path = PurePosixPath(row["file_name"]).as_posix()
-    if row.get("object_id", _object_id(path)) != _object_id(path):
-        raise ValueError(f"{path} lies in object {_object_id(path)}, but the line says {row['object_id']}")
+    name = naming.object_of(path)
+    if row.get("object_id", name) != name:
+        raise ValueError(f"{path} lies in object {name}, but the line says {row['object_id']}")
     return path, True, metadata
 
 

@@ -185,6 +185,7 @@ def run_build_index(arguments: argparse.Namespace) -> None:
         arguments.catalogue,
         load_checkpoint(path),
         arguments.out,
+        objects_from=arguments.objects_from,
         kind=arguments.kind,
         min_recall=arguments.min_recall,
         max_ms=arguments.max_ms,
@@ -194,6 +195,9 @@ def run_build_index(arguments: argparse.Namespace) -> None:
         say(line)
     if arguments.json:
         print_json(report.to_dict())
+    if report.without_photo:
+        count = len(report.without_photo)
+        raise RetrievalError(f"the index is written, but {count} object(s) have no photo that can be read; see above")
 
 
 def run_query(arguments: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ Every thread takes a whole batch from its files to its halves and computes alone
 the towers, as PyTorch's default is, waits for those of its members whose core is decoding a file.
 """
 
+from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -73,8 +74,9 @@ class Embedder:
     def __init__(self, checkpoint: Checkpoint, parent: Generation | None) -> None:
         self.checkpoint, self.parent = checkpoint, parent
         self.skipped: list[SkippedPhoto] = []
-        self.object_ids: set[str] = set()
+        self.objects: Counter[str] = Counter()
         self.photos, self.embedded, self.known, self.half_error = 0, 0, 0, 0.0
+        self.renamed, self.resumed = 0, 0
 
     @property
     def removed(self) -> int:
@@ -139,7 +141,7 @@ class Embedder:
 
     def _count(self, part: Part) -> None:
         self.skipped += part.skipped
-        self.object_ids.update(row["object_id"] for row in part.rows)
+        self.objects.update(row["object_id"] for row in part.rows)
         self.photos += len(part.rows)
         self.embedded += 0 if part.halves is None else len(part.halves)
         self.half_error = max(self.half_error, part.half_error)

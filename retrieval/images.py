@@ -24,16 +24,19 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
+from retrieval.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
 from retrieval.resize import RgbImage, check_rgb, resize
 
-EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+EXTENSIONS = (
+    frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
+)
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 512 * 2**20
 PREPROCESSING_VERSION = 1
 """Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
 
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
-_NO_IMAGE = "not a PNG, JPEG, BMP, TIFF or WebP picture, or its header is damaged or of an unsupported kind"
+_NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"})
 _ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
@@ -123,9 +126,10 @@ def _reason(error: BaseException) -> str:
 
 def _decode(data: bytes, name: str | Path) -> RgbImage:
     _check_pixels(_webp_size(data), name)
+    decoder = decoder_of(data, name)
     with _quiet:
         try:
-            image = Image.open(io.BytesIO(data), formats=_FORMATS)
+            image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
         except Image.DecompressionBombError:
             raise ImageError(name, _too_large("far more")) from None
         with image:

@@ -15,7 +15,7 @@ MAY_TOUCH_ROBOT = {"retrieval/dataset.py", "retrieval/cli.py", "retrieval/rig_co
 STAGES = (
     ("errors", "version", "progress", "interruption", "output"),
     ("binomial",),
-    ("resize", "judge"),
+    ("resize", "judge", "heic", "naming"),
     ("images",),
     ("catalogue", "config", "dataset", "losses"),
     ("check", "towers"),
@@ -30,7 +30,7 @@ STAGES = (
     ("methods",),
     ("ahead",),
     ("embed", "operating"),
-    ("build",),
+    ("build", "build_report"),
     ("search",),
     ("evaluation", "grasp_success"),
     ("hard_cases",),

@@ -12,6 +12,7 @@ from PIL import Image
 from retrieval import catalogue as module
 from retrieval.catalogue import CataloguePhoto, SkippedPhoto, decode_photo, list_catalogue, read_photo
 from retrieval.errors import DatasetError
+from retrieval.naming import Naming
 
 
 def photo(colour=(255, 0, 0)):
@@ -71,7 +72,7 @@ def test_one_object_may_have_a_folder_and_a_file(tmp_path):
     assert list_catalogue(tmp_path).object_ids == ("cup", "mug")
 
 
-@pytest.mark.parametrize("name", ["A.PNG", "A.JpEg", "a.jpg", "a.bmp", "a.TIF", "a.tiff", "a.webp"])
+@pytest.mark.parametrize("name", ["A.PNG", "A.JpEg", "a.jpg", "a.bmp", "a.TIF", "a.tiff", "a.webp", "a.HEIC", "a.avif"])
 def test_the_case_of_an_extension_does_not_matter(tmp_path, name):
     assert found(fill(tmp_path, name)) == {name: name.rsplit(".", 1)[0]}
 
@@ -90,9 +91,9 @@ def test_no_folder_a_file_and_an_empty_folder_are_told_apart(tmp_path):
     with pytest.raises(DatasetError, match="is a file"):
         list_catalogue(tmp_path / "file.png")
     (tmp_path / "empty" / "mug").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"no photo \(\.bmp, .*only 0 other files"):
+    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*only 0 other files"):
         list_catalogue(tmp_path / "empty")
-    with pytest.raises(DatasetError, match=r"only 2 other files such as a\.gif"):
+    with pytest.raises(DatasetError, match=r"only 1 other files such as b\.txt; a\.gif: \.gif pictures are not read"):
         list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
 
 
@@ -114,6 +115,33 @@ def test_a_link_to_a_folder_outside_is_followed_once(tmp_path):
     (skipped,) = list_catalogue(tmp_path / "catalogue").skipped
     assert skipped.path == "same"
     assert "another link has listed" in skipped.reason
+
+
+def test_a_naming_names_objects_and_leaves_out_what_does_not_fit(tmp_path):
+    fill(tmp_path, "train/mug/0.png", "train/mug/1.png", "test/cup/0.png", "cover.png", "train/notes.txt")
+    catalogue = list_catalogue(tmp_path, Naming("{split}/{object}/{photo}"))
+    assert {item.path: item.object_id for item in catalogue.photos} == {
+        "test/cup/0.png": "cup",
+        "train/mug/0.png": "mug",
+        "train/mug/1.png": "mug",
+    }
+    assert catalogue.skipped == (SkippedPhoto("cover.png", "does not fit --objects-from {split}/{object}/{photo}"),)
+    assert catalogue.ignored == ("train/notes.txt",)
+
+
+def test_a_naming_that_no_photo_fits_is_an_error_with_an_example(tmp_path):
+    with pytest.raises(DatasetError, match=r"fits --objects-from stem; the first of 2: cup/0\.png"):
+        list_catalogue(fill(tmp_path, "mug/0.png", "cup/0.png"), Naming("stem"))
+
+
+def test_an_object_of_pictures_that_are_not_read_is_an_object_without_a_photo(tmp_path):
+    catalogue = list_catalogue(fill(tmp_path, "mug/1.png", "cup/1.gif", "cup/2.DNG", "docs/readme.txt"))
+    assert catalogue.object_ids == ("cup", "mug")
+    assert [item.path for item in catalogue.photos] == ["mug/1.png"]
+    assert {item.path: item.reason for item in catalogue.skipped} == {
+        "cup/1.gif": ".gif pictures are not read: save it as PNG or JPEG",
+        "cup/2.DNG": ".dng pictures are not read: save it as PNG or JPEG",
+    }
 
 
 def test_links_that_loop_do_not_hang(tmp_path):
@@ -179,6 +207,15 @@ def test_a_photo_has_the_metadata_of_its_object_and_its_own_wins(tmp_path):
 
 def test_without_metadata_a_photo_has_none(tmp_path):
     assert list_catalogue(fill(tmp_path, "mug/1.png")).photos == (CataloguePhoto("mug/1.png", "mug", "mug/1.png"),)
+
+
+def test_metadata_goes_to_objects_by_the_same_naming(tmp_path):
+    fill(tmp_path, "mug_0.png", "mug_1.png")
+    say(tmp_path, {"object_id": "mug", "price": 5}, {"file_name": "mug_1.png", "object_id": "mug", "colour": "red"})
+    found = {item.path: item.metadata for item in list_catalogue(tmp_path, Naming("stem")).photos}
+    assert found == {"mug_0.png": {"price": 5}, "mug_1.png": {"price": 5, "colour": "red"}}
+    with pytest.raises(DatasetError, match="mug_1.png lies in object mug_1, but the line says mug"):
+        list_catalogue(tmp_path)
 
 
 def test_metadata_of_what_is_not_there_is_a_note_and_no_error(tmp_path):

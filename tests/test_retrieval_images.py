@@ -111,6 +111,7 @@ def sample_files():
         "tiff 16-bit": tiff(noise(9, 7, 3, np.uint16)),
         "webp": saved(smooth, "WEBP"),
         "webp lossless": saved(colour, "WEBP", lossless=True),
+        "avif": saved(smooth, "AVIF"),
     }
 
 

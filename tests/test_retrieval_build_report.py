@@ -1,0 +1,130 @@
+"""What `build-index` understood of a folder of photos, and what it says of it."""
+
+import json
+import shutil
+
+import pytest
+
+from indexes.store import IndexStore
+from retrieval import cli
+from retrieval.build import build_index
+from retrieval.checkpoint import load_checkpoint
+from retrieval.errors import BadInput
+
+
+@pytest.fixture
+def checkpoint(model):
+    return load_checkpoint(model)
+
+
+@pytest.fixture
+def index(tmp_path):
+    return tmp_path / "index"
+
+
+@pytest.fixture
+def photos(catalogue):
+    """Files of eight photos, each of another object."""
+    return sorted(catalogue.glob("*/1.jpg"))
+
+
+def laid_out(folder, photos, *names):
+    """A catalogue of the photos under these names."""
+    for photo, name in zip(photos, names, strict=False):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photo, folder / name)
+    return folder
+
+
+def objects(index):
+    return {row["path"]: row["object_id"] for row in IndexStore(index).open().rows}
+
+
+def test_it_says_how_many_photos_each_object_has_and_shows_three(tmp_path, photos, checkpoint, index):
+    names = ["mug/0.jpg", "mug/1.jpg", "mug/2.jpg", "cup/0.jpg", "cup/1.jpg", "ball.jpg"]
+    report = build_index(laid_out(tmp_path / "own", photos, *names), checkpoint, index, quiet=True)
+    assert (report.objects_from, report.per_object) == ("folder", {"min": 1, "median": 2, "max": 3})
+    assert report.examples == [("ball", "ball.jpg"), ("cup", "cup/0.jpg"), ("mug", "mug/0.jpg")]
+    lines = list(report.lines())
+    assert "3 objects by --objects-from folder; photos of each: 1 / 2 / 3 (min, median, max)" in lines
+    assert "  mug <- mug/0.jpg" in lines
+    assert report.doubts == []
+
+
+def test_a_data_sets_layout_is_warned_of_and_a_pattern_puts_it_right(tmp_path, photos, checkpoint, index):
+    """Every photo below train/ had become a photo of the object "train", silently."""
+    own = laid_out(tmp_path / "own", photos, "train/mug/0.jpg", "train/mug/1.jpg", "train/cup/0.jpg", "test/cup/1.jpg")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert set(objects(index).values()) == {"train", "test"}
+    assert any(line.startswith("warning: test, train are taken for the name of an object") for line in report.lines())
+    report = build_index(own, checkpoint, index, objects_from="{split}/{object}/{photo}", quiet=True)
+    assert set(objects(index).values()) == {"mug", "cup"}
+    assert (report.written, report.embedded, report.doubts) == (True, 0, [])
+
+
+def test_numbered_files_are_warned_of_and_stem_puts_them_right(tmp_path, photos, checkpoint, index):
+    """Every photo had become an object of its own, silently."""
+    own = laid_out(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup-1.jpg", "cup-2.jpg")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert "every object has one photo, and 4 of 4" in report.doubts[0]
+    report = build_index(own, checkpoint, index, objects_from="stem", quiet=True)
+    assert (report.objects, report.doubts) == (2, [])
+
+
+def test_the_index_keeps_the_rule_and_says_when_it_changes(tmp_path, photos, checkpoint, index):
+    own = laid_out(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup_0.jpg")
+    build_index(own, checkpoint, index, objects_from="stem", quiet=True)
+    again = build_index(own, checkpoint, index, quiet=True)
+    assert (again.objects_from, again.objects, again.written) == ("stem", 2, False)
+    changed = build_index(own, checkpoint, index, objects_from="folder", quiet=True)
+    assert (changed.objects, changed.written, changed.embedded) == (3, True, 0)
+    assert changed.reason.startswith("Objects are named by folder now, no longer by stem.")
+    assert IndexStore(index).open().manifest.about["objects_from"] == "folder"
+
+
+def test_another_rule_is_written_though_it_names_all_objects_alike(tmp_path, photos, checkpoint, index):
+    own = laid_out(tmp_path / "own", photos, "mug.jpg", "cup.jpg")
+    build_index(own, checkpoint, index, quiet=True)
+    assert build_index(own, checkpoint, index, objects_from="stem", quiet=True).written
+    assert build_index(own, checkpoint, index, quiet=True).objects_from == "stem"
+
+
+def test_a_rule_that_is_none_is_refused_before_anything_is_made(tmp_path, photos, checkpoint, index):
+    with pytest.raises(BadInput, match="folder, stem, or a pattern"):
+        build_index(laid_out(tmp_path / "own", photos, "mug.jpg"), checkpoint, index, objects_from="name", quiet=True)
+    assert not index.exists()
+
+
+def test_what_is_left_out_is_counted_by_reason_and_whole_in_json(tmp_path, photos, checkpoint, index):
+    own = laid_out(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg")
+    for name in ("a.txt", "b.TXT", "README", "mug/1.gif", "mug/2.gif"):
+        (own / name).write_text("x")
+    (own / "mug" / "3.jpg").write_bytes(b"")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert report.left_out == {
+        "no picture by name (.txt)": 2,
+        ".gif pictures are not read": 2,
+        "no picture by name (without an ending)": 1,
+        "the file is empty": 1,
+    }
+    assert "6 file(s) left out: 2 no picture by name (.txt), 2 .gif" in "\n".join(report.lines())
+    document = json.loads(json.dumps(report.to_dict()))
+    assert (document["left_out"], document["ignored"]) == (report.left_out, ["README", "a.txt", "b.TXT"])
+    assert [item["path"] for item in document["skipped"]] == ["mug/1.gif", "mug/2.gif", "mug/3.jpg"]
+    assert document["without_photo"] == []
+
+
+def test_objects_without_a_readable_photo_are_named_and_the_exit_code_says_so(tmp_path, photos, model, index, capsys):
+    own = laid_out(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg", "cup/1.jpg", "ball/0.jpg")
+    command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
+    (own / "cup" / "0.jpg").write_bytes(b"broken")
+    assert cli.main(command) == 0  # the cup has another photo
+    (own / "cup" / "1.jpg").write_bytes(b"broken")
+    (own / "ball" / "0.jpg").rename(own / "ball" / "0.gif")
+    capsys.readouterr()
+    assert cli.main([*command, "--json"]) == 1
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["without_photo"] == ["ball", "cup"]
+    assert "2 of 3 objects are not in the index, for none of their pictures can be read: ball, cup" in printed.err
+    assert "the index is written, but 2 object(s) have no photo that can be read" in printed.err
+    assert objects(index) == {"mug/0.jpg": "mug"}

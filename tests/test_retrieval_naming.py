@@ -1,0 +1,123 @@
+"""Which object a photo shows, by its path: `build-index --objects-from`, and what looks wrong about the answer."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from retrieval.errors import BadInput
+from retrieval.naming import Naming, doubts, per_object
+
+BY_RULE = {
+    "folder": {
+        "mug/1.jpg": "mug",
+        "train/mug/0.jpg": "train",
+        "mug.jpg": "mug",
+        "mug_0.jpg": "mug_0",
+        "v1.2.tif": "v1.2",
+    },
+    "stem": {
+        "mug_0.jpg": "mug",
+        "mug-12.jpg": "mug",
+        "mug (3).jpg": "mug",
+        "mug7.png": "mug",
+        "train/mug_1.jpg": "mug",
+        "red mug.jpg": "red mug",
+        "mug_left.jpg": "mug_left",
+        "mug_1_2.jpg": "mug_1",
+        "mug/0.jpg": None,
+        "2024.jpg": None,
+    },
+    "{split}/{object}/{photo}": {
+        "train/mug/0.jpg": "mug",
+        "test/red mug/a.b.png": "red mug",
+        "mug/0.jpg": None,
+        "a/b/c/0.jpg": None,
+    },
+    "{object}_{view}.jpg": {
+        "mug_0.jpg": "mug",
+        "red_mug_0.jpg": "red_mug",
+        "mug_0.png": None,
+        "mug.jpg": None,
+        "train/mug_0.jpg": None,
+    },
+    "{split}_{object}_{view}": {"train_red_mug_0.jpg": "red_mug", "a_b_c_d_e.jpg": "b_c_d"},
+    "{object}": {"mug.jpg": "mug", "v1.2.tif": "v1.2", "mug/0.jpg": None},
+    "{object}/{object}_{view}": {"mug/mug_0.jpg": "mug", "mug/cup_0.jpg": None},
+    "photos (new)/{object}+{n}": {"photos (new)/mug+1.jpg": "mug", "photos new/mug+1.jpg": None},
+    "größe-{object}.{ending}": {"größe-mug.jpg": "mug", "größe-mug.b.jpg": "mug"},
+}
+
+
+@pytest.mark.parametrize("rule", BY_RULE)
+def test_a_rule_names_the_object_of_a_path_or_says_that_it_does_not_fit(rule):
+    assert {path: Naming(rule).object_of(path) for path in BY_RULE[rule]} == BY_RULE[rule]
+
+
+@pytest.mark.parametrize(
+    ("rule", "said"),
+    {
+        "": "must be named from folder, stem, or a pattern with {object}",
+        "stems": "got 'stems'",
+        "{split}/{photo}": "pattern with {object}",
+        "object/photo": "pattern with {object}",
+        "{Object}": "pattern with {object}",
+        "{object}/{}": "braces in a pattern must hold one word each",
+        "{object}/{a b}": "braces in a pattern must hold one word each",
+        "{object}/{1}": "braces in a pattern must hold one word each",
+        "{object}}": "braces in a pattern must hold one word each",
+        "{object}{view}": "must have text between them",
+    }.items(),
+)
+def test_a_rule_that_is_none_is_refused_with_what_it_must_be(rule, said):
+    with pytest.raises(BadInput) as raised:
+        Naming(rule)
+    assert said in str(raised.value)
+    assert "{split}/{object}/{photo}" in str(raised.value)
+
+
+@given(rule=st.text("{}object/_.a(", max_size=20), path=st.text("object/_.a1(", min_size=1, max_size=20))
+def test_any_text_is_a_rule_or_refused_and_an_object_is_a_part_of_the_path(rule, path):
+    try:
+        naming = Naming(rule)
+    except BadInput:
+        return
+    name = naming.object_of(path)
+    assert name is None or (name and name in path and "/" not in name)
+
+
+# Doubts ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["train", "Test", "VAL", "images", "photos", "data"])
+def test_a_folder_called_train_is_warned_of(name):
+    (said,) = doubts({name: 40, "mug": 3}, Naming())
+    assert said.startswith(f"{name} is taken for the name of an object, with 40 photo(s)")
+    assert "--objects-from '{split}/{object}/{photo}'" in said
+
+
+def test_names_that_differ_by_a_number_only_are_warned_of_the_harder_where_each_has_one_photo():
+    (said,) = doubts({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
+    assert said.startswith(
+        "every object has one photo, and 4 of 5 objects have names that differ from another's by a number only: "
+        "cup (1), cup (2), mug_0 and 1 more"
+    )
+    (said,) = doubts({"mug_0": 3, "mug_1": 1, "ball": 1}, Naming())
+    assert said.startswith("2 of 3 objects have names that differ")
+    (said,) = doubts({"mug": 1, "mug (2)": 1}, Naming())
+    assert "2 of 2" in said
+
+
+def test_one_object_for_many_photos_is_warned_of():
+    assert doubts({"set": 12}, Naming()) == ["all 12 photos are taken for photos of one object, set"]
+    assert doubts({"mug": 1}, Naming()) == []
+
+
+def test_what_looks_right_is_not_doubted():
+    assert doubts({"mug": 3, "cup": 3, "trainer": 1}, Naming()) == []
+    assert doubts({"1": 3, "2": 3}, Naming()) == []  # a number is a name as good as any
+    assert doubts({"slab-knurl-20000-00010": 3, "cone-ribs-20000-00015": 3}, Naming()) == []
+    assert doubts({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []  # the numbers of mug_1_5.jpg are gone already
+
+
+def test_numbers_of_photos_are_told_by_least_median_and_most():
+    assert per_object([4, 1, 1, 2]) == {"min": 1, "median": 1.5, "max": 4}
