@@ -40,6 +40,7 @@ from retrieval.operating import (
 from retrieval.stored import fingerprint
 from retrieval.version import __version__
 
+
 def build_index(
     folder: Path,
     checkpoint: Checkpoint,

@@ -25,8 +25,7 @@ from retrieval.resize import RgbImage
 
 METADATA_FILE = "metadata.jsonl"
 UNREAD = frozenset(
-    ".apng .arw .bpg .cr2 .cr3 .dng .eps .exr .gif .hdr .ico .j2k .jfif .jp2 .jxl .jxr .nef .orf .pbm .pcx .pgm .pnm "
-    ".ppm .psd .raf .raw .rw2 .svg .tga".split()
+    {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jfif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
 """Endings of pictures that are not read: their objects may be left without a photo."""
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
@@ -99,7 +98,9 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         for path, name in objects.items()
         if name is not None and _ending(path) in EXTENSIONS
     ]
-    skipped = [SkippedPhoto(path, reason) for path, name in objects.items() if (reason := _unusable(path, name, naming))]
+    skipped = [
+        SkippedPhoto(path, reason) for path, name in objects.items() if (reason := _unusable(path, name, naming))
+    ]
     ignored = sorted(set(walk.files) - set(objects) - {METADATA_FILE})
     skipped = [*walk.skipped, *skipped]
     if not listed and (unfit := [path for path in objects if _ending(path) in EXTENSIONS]):
@@ -214,9 +215,7 @@ def _bad_name(name: str) -> str:
 # The user's own metadata -----------------------------------------------------------------------------------
 
 
-def _with_metadata(
-    photos: list[CataloguePhoto], path: Path, naming: Naming
-) -> tuple[list[CataloguePhoto], list[str]]:
+def _with_metadata(photos: list[CataloguePhoto], path: Path, naming: Naming) -> tuple[list[CataloguePhoto], list[str]]:
     """Add what metadata.jsonl says of each photo and its object; remark on lines that fit no photo."""
     by_object, by_photo = _read_metadata(path, naming)
     listed = []

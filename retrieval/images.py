@@ -27,9 +27,7 @@ from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
 from retrieval.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
 from retrieval.resize import RgbImage, check_rgb, resize
 
-EXTENSIONS = (
-    frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
-)
+EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 512 * 2**20
 PREPROCESSING_VERSION = 1

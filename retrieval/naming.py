@@ -25,8 +25,9 @@ FOLDER, STEM = "folder", "stem"
 OBJECT = "object"
 
 NOT_OBJECTS = frozenset(
-    "catalog catalogue data dataset dev gallery image images img imgs jpeg jpg object objects photo photos pic pics "
-    "picture pictures png raw rgb test testing train training val valid validation".split()
+    {"catalog", "catalogue", "data", "dataset", "dev", "gallery", "image", "images", "img", "imgs", "jpeg", "jpg"}
+    | {"object", "objects", "photo", "photos", "pic", "pics", "picture", "pictures", "png", "raw", "rgb"}
+    | {"test", "testing", "train", "training", "val", "valid", "validation"}
 )
 """Names of folders that hold many objects, as data sets have them."""
 
