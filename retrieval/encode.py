@@ -8,6 +8,7 @@ there would not meet an index made elsewhere.
 
 import copy
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,9 @@ from retrieval.fusion import Code, Matcher
 
 T = TypeVar("T")
 Image = NDArray[np.float32]
+
+# A fork has none of the threads with which OpenMP computed before, and would wait for them for ever.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def to_batch(images: Sequence[Image], device: torch.device | str = "cpu") -> Tensor:

@@ -123,7 +123,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _decode(data: bytes, name: str | Path) -> RgbImage:
-    _check_pixels(_webp_size(data), name)
+    check_pixels(_webp_size(data), name)
     decoder = decoder_of(data, name)
     with _quiet:
         try:
@@ -131,14 +131,29 @@ def _decode(data: bytes, name: str | Path) -> RgbImage:
         except Image.DecompressionBombError:
             raise ImageError(name, _too_large("far more")) from None
         with image:
-            _check_pixels(image.size, name)
+            check_pixels(image.size, name)
             image.load()
             orientation = _orientation(image)
             rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
     return np.ascontiguousarray(_upright(rgb, orientation))
 
 
-def _check_pixels(size: tuple[int, int], name: str | Path) -> None:
+def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
+    """An opened Pillow image as `decode_rgb` gives its file, but for samples beyond 8 bits, which Pillow has dropped
+    by then. Raises ImageError."""
+    try:
+        check_pixels(image.size, name)
+        with _quiet:
+            image.load()
+            rgb = _eight_bit_rgb(image, name)
+        return np.ascontiguousarray(_upright(rgb, _orientation(image)))
+    except ImageError:
+        raise
+    except Exception as error:  # a file behind it that is damaged, or closed by now
+        raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
+
+
+def check_pixels(size: tuple[int, int], name: str | Path) -> None:
     """Refuse a size from a header before anything of that size is allocated."""
     width, height = size
     if width < 1 or height < 1:

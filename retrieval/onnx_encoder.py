@@ -4,11 +4,16 @@ The file is ONNX with the checkpoint's digest among its metadata. The last entry
 before it, since ONNX itself takes a flipped bit in a weight for what it is.
 """
 
+import ctypes
 import hashlib
 import logging
+import os
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,26 +38,54 @@ class OnnxEncoder:
     def __init__(self, path: Path, checkpoint: str, threads: int | None = None) -> None:
         """Open `path`, which must be the export of the checkpoint with that digest. threads: None leaves the choice
         to ONNX Runtime. Raises CheckpointError for another or a damaged one."""
-        import onnxruntime
-
-        model = unsealed(path)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads or 0
-        # Its threads would spin after a run, on the cores that decode the next images or judge candidates.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no common base
-            raise CheckpointError(f"{path} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
-        made_from = self._session.get_modelmeta().custom_metadata_map.get(CHECKPOINT, "unknown")
-        if made_from != checkpoint:
-            raise CheckpointError(f"{path} is the export of another checkpoint ({made_from[:12]})")
+        self._open = partial(_session, path, checkpoint, threads)
+        self._process, self._session = os.getpid(), self._open()
 
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
         """Halves (B, hidden) and embeddings (B, embedding_dim) of touches, each its fingers' images in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
-        half, embedding = self._session.run(None, {"images": images})
+        half, embedding = self._own_session().run(None, {"images": images})
         return half, embedding
+
+    def _own_session(self) -> Any:
+        """The session of this process; a fork opens its own."""
+        if self._process != os.getpid():
+            self._session = self._open()
+            self._process = os.getpid()
+        return self._session
+
+
+_sessions: WeakSet[Any] = WeakSet()
+
+
+def _leave_alone() -> None:
+    """A fork has none of the threads of the sessions it was born with, and would wait for them for ever, even to let
+    go of one: here they are never let go of."""
+    for session in _sessions:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+
+
+os.register_at_fork(after_in_child=_leave_alone)
+
+
+def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent; and no fork waits for its thread at the end
+    import onnxruntime
+
+    model = unsealed(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or 0
+    # Its threads would spin after a run, on the cores that decode the next images or judge candidates.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common base
+        raise CheckpointError(f"{path} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
+    made_from = session.get_modelmeta().custom_metadata_map.get(CHECKPOINT, "unknown")
+    if made_from != checkpoint:
+        raise CheckpointError(f"{path} is the export of another checkpoint ({made_from[:12]})")
+    _sessions.add(session)
+    return session
 
 
 def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:

@@ -1,12 +1,11 @@
 """From gel images to ranked objects: encode the touch, take candidates, rerank them by match logit from halves."""
 
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+import copy
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,78 +13,39 @@ from numpy.typing import NDArray
 from indexes.generation import Generation
 from indexes.store import IndexStore
 from retrieval import defaults
+from retrieval.answer import Match, QueryResult
 from retrieval.calibration import Calibration
-from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.encoded import Encoded, Encoder, TouchReader
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.judge import Judge
+from retrieval.objects import Objects
 from retrieval.onnx_encoder import exported_beside
-from retrieval.resize import RgbImage
+from retrieval.stopwatch import Stopwatch
 from retrieval.stored import Stored, file_digest, fingerprint, read_judge, read_stored
+from retrieval.touches import AnyImage, AnyTouches, GivenImage
 
 DEFAULT_CANDIDATES = 1000
-DECODERS = 2  # a touch has as many images
 Floats = NDArray[np.float32]
-
-
-class Encoder(Protocol):
-    """What makes halves (G, hidden) and embeddings (G, embedding_dim) of touches: PyTorch or ONNX Runtime."""
-
-    @property
-    def name(self) -> str:
-        """How it is called in the answer."""
-
-    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
-        """Encode grasps, each its fingers' images."""
-
-
-@dataclass(frozen=True)
-class Match:
-    """One object of a ranking, by its best photo. probability is None where the model was never calibrated."""
-
-    rank: int
-    object_id: str
-    logit: float
-    probability: float | None
-    photo: str
-    metadata: dict[str, Any]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
-class QueryResult:
-    """A ranking. verdict: "match", "no match" (the best is below the reject threshold) or "uncalibrated"."""
-
-    touches: list[list[str]]
-    index: dict[str, Any]
-    timing_ms: dict[str, float]
-    verdict: str
-    results: list[Match]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The document of `retrieve query --json`."""
-        return {
-            "query": {"touches": self.touches},
-            "index": self.index,
-            "timing_ms": self.timing_ms,
-            "verdict": self.verdict,
-            "results": [match.to_dict() for match in self.results],
-        }
+Rows = NDArray[np.int64]
 
 
 class Searcher:
-    """An opened index with its model, for any number of queries."""
+    """An opened index with its model, for any number of queries.
+
+    Any number of threads may query it at once, and a process forked from this one too: no thread or lock outlives a
+    query. `close` it, or open it by `with`; a query that is under way then is answered.
+    """
 
     def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
         self.index, self.generation, self.checkpoint = index, generation, checkpoint
         self.encoder, self.judge = encoder, judge
+        self.reader = TouchReader(checkpoint.config, encoder)
         self.calibration: Calibration | None = None
         if "calibration" in generation.documents:
             self.calibration = Calibration.from_dict(generation.documents["calibration"])
-        self._object_of_row = generation.codes("object_id")
-        self._original = _originals(generation.codes("digest"))
-        self._threads = ThreadPoolExecutor(DECODERS, "decode")
+        self.catalogue = Path(generation.manifest.about["catalogue"])
+        self.objects = Objects(generation)
+        self._closed = False
 
     @classmethod
     def open(cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True) -> "Searcher":
@@ -103,49 +63,72 @@ class Searcher:
             Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
         )
 
-    @property
-    def catalogue(self) -> Path:
-        """The folder of photos that the index was built from."""
-        return Path(self.generation.manifest.about["catalogue"])
+    def close(self) -> None:
+        """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""
+        self._closed = True
+        for name in ("generation", "encoder", "reader", "judge", "objects"):
+            vars(self).pop(name, None)
+
+    def __enter__(self) -> "Searcher":
+        return self._held()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def query(
         self,
-        touches: Sequence[Sequence[str | Path]],
+        touches: AnyTouches,
         *,
-        background: Sequence[str | Path] | None = None,
+        background: Sequence[AnyImage] | None = None,
         top: int = 10,
         candidates: int | None = None,
     ) -> QueryResult:
         """Rank the catalogue's objects for one object felt in one or more grasps.
 
-        touches: for each grasp its gel images, in finger order. background: the fingers' no-contact frames, for a
-        model that subtracts them and for no other. top: objects to return. candidates: photos per grasp that the full
-        classifier judges, `top` at least, by default as many as the index was found to need; with no fewer than there
-        are photos, or a model without trained embeddings, it judges all of them and no candidate stage runs. Several
-        grasps count as independent given the object: their logits add. Raises BadInput, ImageError or NumericalError.
+        touches: one grasp, which is a list with an image for each finger in their order, or a list of several such
+        grasps; for a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a
+        Pillow image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like
+        any other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
+        background: the fingers' no-contact frames, for a model that subtracts them and for no other. top: objects to
+        return. candidates: photos per grasp that the full classifier judges, `top` at least, by default as many as the
+        index was found to need; with no fewer than there are photos, or a model without trained embeddings, it judges
+        all of them and no candidate stage runs. Several grasps count as independent given the object: their logits add.
+        Raises BadInput, ImageError or NumericalError.
         """
-        limit = self.default_candidates if candidates is None else candidates
-        if top < 1 or limit < 1 or not touches:
-            raise BadInput(f"give at least one touch, top >= 1 and candidates >= 1; got {len(touches)}, {top}, {limit}")
-        clock = _Clock()
-        with clock("decode"):
-            images = self._load(touches, self._references(background))
-        with clock("encode"):
-            touch_halves, embeddings = _finite(self.encoder.encode(images))
-        with clock("candidates"):
-            rows = self._candidates(embeddings, max(limit, top))
-        with clock("rerank"):
-            logits = self.judge.logits(touch_halves, self.generation.arrays["halves"], rows)
-            judged = np.arange(self.generation.count) if rows is None else rows
-            best = self._best_of_objects(judged, self._equal_for_equals(judged, logits), top)
-        results = [self._match(rank, row, logit, len(touches)) for rank, (row, logit) in enumerate(best, start=1)]
-        return QueryResult(
-            touches=[[str(path) for path in touch] for touch in touches],
-            index=self._about(self.generation.count if rows is None else len(rows)),
-            timing_ms=clock.finished(),
-            verdict=self._verdict(results[0], len(touches)),
-            results=results,
-        )
+        held = self._held()
+        limit = held._limit(top, candidates)
+        return held._answers([held.reader.grasps(touches)], background, top, limit)[0]
+
+    def query_many(
+        self,
+        objects: Sequence[AnyTouches],
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+    ) -> list[QueryResult]:
+        """Answer for several objects in the hand, each given as `query` takes it, in their order.
+
+        Their touches are encoded in batches. The logits are those of single queries within 1e-4, as a batch rounds in
+        another order. Where one object's touches are not fit, nothing is answered and the error names it.
+        """
+        held = self._held()
+        limit = held._limit(top, candidates)
+        asked = [held.reader.grasps(touches, of=f"object {number}, ") for number, touches in enumerate(objects, 1)]
+        return held._answers(asked, background, top, limit) if asked else []
+
+    def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
+        """The unit embeddings (G, embedding_dim) and halves (G, hidden) of G grasps, given as `query` takes them.
+
+        The inner product with a photo's embedding (`retrieval.embed_photos`) is the score by which candidates are
+        found; it orders photos for one touch and is no probability. Match logits are
+        `searcher.judge.logits(halves, photo_halves)`, added over the grasps.
+        """
+        held = self._held()
+        grasps, references = held.reader.grasps(touches), held.reader.references(background)
+        return held.reader.encode(grasps, references, Stopwatch())
 
     @property
     def default_candidates(self) -> int:
@@ -153,79 +136,81 @@ class Searcher:
         measured = self.generation.manifest.about.get("candidates")
         return int(measured["k"]) if measured else DEFAULT_CANDIDATES
 
-    def _references(self, background: Sequence[str | Path] | None) -> Sequence[str | Path | None]:
-        """The no-contact frame of each finger, None for a model that looks at no such frame."""
-        policy = self.checkpoint.config.preprocessing.background
-        if background is None and policy != "none":
-            raise BadInput(
-                f'this model subtracts the untouched gel (background = "{policy}"): give a no-contact frame for each '
-                "finger with --background"
-            )
-        if background is not None and policy == "none":
-            raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
-        return [None] * self._fingers if background is None else self._one_per_finger("background", background)
+    def _held(self) -> "Searcher":
+        """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
+        held = copy.copy(self)
+        if held._closed:
+            raise BadInput(f"this searcher of {self.index} was closed; open the index again")
+        return held
 
-    def _load(
-        self, touches: Sequence[Sequence[str | Path]], references: Sequence[str | Path | None]
-    ) -> list[list[RgbImage]]:
-        """The images of all grasps, decoded side by side; of several bad files the first is told."""
-        load = self.checkpoint.config.preprocessing.load_touch
-        pairs = [list(zip(self._one_per_finger("touch", touch), references, strict=True)) for touch in touches]
-        jobs = [[self._threads.submit(load, *pair) for pair in touch] for touch in pairs]
-        return [[job.result() for job in touch] for touch in jobs]
+    def _limit(self, top: int, candidates: int | None) -> int:
+        """Photos that are judged for each grasp."""
+        limit = self.default_candidates if candidates is None else candidates
+        if top < 1 or limit < 1:
+            raise BadInput(f"top and candidates must be 1 or more; got {top} and {limit}")
+        return max(top, limit)
 
-    def _one_per_finger(self, what: str, files: Sequence[str | Path]) -> Sequence[str | Path]:
-        if len(files) != self._fingers:
-            raise BadInput(
-                f"this model takes {self._fingers} gel image(s) for one {what}; got {len(files)}: "
-                + ", ".join(str(path) for path in files)
-            )
-        return files
+    # The stages: each takes and gives what belongs to one object, images of all objects side by side ------------
 
-    @property
-    def _fingers(self) -> int:
-        return self.checkpoint.config.matcher.fingers
+    def _answers(
+        self,
+        asked: Sequence[Sequence[Sequence[GivenImage]]],
+        background: Sequence[AnyImage] | None,
+        top: int,
+        limit: int,
+    ) -> list[QueryResult]:
+        clock = Stopwatch()
+        references = self.reader.references(background)
+        every = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
+        ends = np.cumsum([len(grasps) for grasps in asked])[:-1]
+        halves, embeddings = np.split(every.halves, ends), np.split(every.embeddings, ends)
+        with clock("candidates"):
+            rows = [self._candidates(own, limit) for own in embeddings]
+        with clock("rerank"):
+            logits = [self._judged(own, found) for own, found in zip(halves, rows, strict=True)]
+            ranked = [self.objects.best(self._rows(found), own, top) for own, found in zip(logits, rows, strict=True)]
+        timing_ms = clock.finished(len(asked))
+        return [
+            self._answer(grasps, self._about(len(own)), timing_ms, best)
+            for grasps, own, best in zip(asked, logits, ranked, strict=True)
+        ]
 
-    def _candidates(self, embeddings: NDArray[np.float32], k: int) -> NDArray[np.int64] | None:
+    def _candidates(self, embeddings: Floats, k: int) -> Rows | None:
         """Rows to judge, the union over grasps; None for all, where the stage would leave nothing out."""
         if not self.checkpoint.config.has_embeddings or k >= self.generation.count:
             return None
         found = [rows for rows, _ in self.generation.search(embeddings, k)]
         return np.unique(np.concatenate(found))
 
-    def _equal_for_equals(self, rows: NDArray[np.int64], logits: Floats) -> Floats:
-        """Photos of equal bytes have equal logits; a matrix product may round its last rows in another way."""
-        if self._original is None:
-            return logits
-        original, of_original = self._original[rows], np.empty(self.generation.count, dtype=np.float32)
-        of_original[original[::-1]] = logits[::-1]  # the last assignment counts: that of the first equal photo
-        equal: Floats = of_original[original]
-        return equal
+    def _judged(self, halves: Floats, rows: Rows | None) -> Floats:
+        """Match logits of the rows, summed over grasps."""
+        logits = self.judge.logits(halves, self.generation.arrays["halves"], rows)
+        return self.objects.equal_for_equals(self._rows(rows), logits)
 
-    def _best_of_objects(self, rows: NDArray[np.int64], logits: Floats, top: int) -> list[tuple[int, float]]:
-        """(row, logit) of the best photo of each of the `top` best objects; ties by object, then by row."""
-        looked_at = 8 * top
-        while True:
-            near = _largest(logits, looked_at)
-            objects = self._object_of_row[rows[near]]
-            order = np.lexsort((rows[near], self._object_ranks(rows[near], logits[near]), -logits[near]))
-            _, first = np.unique(objects[order], return_index=True)
-            if len(first) >= top or len(near) == len(rows):
-                best = near[order[np.sort(first)[:top]]]
-                return [(int(rows[place]), float(logits[place])) for place in best]
-            looked_at *= 8
+    def _rows(self, rows: Rows | None) -> Rows:
+        return np.arange(self.generation.count) if rows is None else rows
 
-    def _object_ranks(self, rows: NDArray[np.int64], logits: Floats) -> NDArray[np.int64]:
-        """Of each row, its object's place in the order of names; all 0 where no tie asks for it, as it parses rows."""
-        if len(np.unique(logits)) == len(logits):
-            return np.zeros(len(rows), dtype=np.int64)
-        names = np.array([self.generation.rows[row]["object_id"] for row in rows])
-        return np.unique(names, return_inverse=True)[1]
+    def _answer(
+        self,
+        grasps: Sequence[Sequence[GivenImage]],
+        about: dict[str, Any],
+        timing_ms: dict[str, float],
+        best: Sequence[tuple[int, float]],
+    ) -> QueryResult:
+        results = [self._match(rank, row, logit, len(grasps)) for rank, (row, logit) in enumerate(best, start=1)]
+        return QueryResult(
+            touches=[[image.name for image in grasp] for grasp in grasps],
+            index=about,
+            timing_ms=timing_ms,
+            verdict=self._verdict(results[0], len(grasps)),
+            results=results,
+        )
 
     def _match(self, rank: int, row_number: int, logit: float, grasps: int) -> Match:
         row = self.generation.rows[row_number]
         probability = float(self.calibration.probability(logit, grasps)) if self.calibration else None
-        return Match(rank, row["object_id"], logit, probability, row["path"], row["metadata"])
+        path = self.catalogue.absolute() / row["path"]
+        return Match(rank, row["object_id"], logit, probability, row["path"], row["metadata"], path)
 
     def _verdict(self, best: Match, grasps: int) -> str:
         if self.calibration is None:
@@ -239,34 +224,13 @@ class Searcher:
             "generation": self.generation.name,
             "kind": self.generation.manifest.kind,
             "photos": self.generation.count,
-            "objects": int(self._object_of_row.max()) + 1,
+            "objects": self.objects.count,
             "scored": scored,
             "encoder": self.encoder.name,
             "catalogue": str(self.catalogue),
             "model": str(self.checkpoint.path),
             "trained_on": self.checkpoint.provenance.get("source", "unknown"),
         }
-
-
-def _finite(code: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    for name, values in zip(("half", "embedding"), code, strict=True):
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(bad):
-            raise NumericalError(f"the {name} of touch {bad[0] + 1} holds a NaN or infinite number; the model is unfit")
-    return code
-
-
-def _originals(contents: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """For each photo the first one of equal bytes, which `contents` numbers; None where no two are equal."""
-    _, first = np.unique(contents, return_index=True)
-    return first[contents] if len(first) < len(contents) else None
-
-
-def _largest(values: Floats, count: int) -> NDArray[np.int64]:
-    """Places of the `count` largest values, and of all that equal the least of them."""
-    if count >= len(values):
-        return np.arange(len(values))
-    return np.flatnonzero(values >= np.partition(values, len(values) - count)[len(values) - count])
 
 
 def _require(generation: Generation, stored: Stored) -> None:
@@ -298,21 +262,3 @@ def _model_of(generation: Generation) -> Path:
     raise CheckpointError(
         f"the model of this index is no longer at {path}; name it with --model, or build the index again"
     )
-
-
-class _Clock:
-    """Milliseconds of named stages and in total."""
-
-    def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self._stages: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self._stages[stage] = 1e3 * (time.perf_counter() - start)
-
-    def finished(self) -> dict[str, float]:
-        """The stages in their order, and "total" since the clock was made."""
-        return {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}

@@ -13,15 +13,15 @@ PACKAGES = ("indexes", "robot", "retrieval")
 MAY_TOUCH_ROBOT = {"retrieval/dataset.py", "retrieval/cli.py", "retrieval/rig_commands.py"}
 # In `retrieval` the stages run one way; a module may import those of its own line and of lines above.
 STAGES = (
-    ("errors", "version", "progress", "interruption", "output"),
+    ("errors", "version", "progress", "interruption", "output", "stopwatch"),
     ("binomial",),
     ("resize", "judge", "heic", "naming"),
     ("images",),
-    ("catalogue", "config", "dataset", "losses"),
+    ("catalogue", "config", "dataset", "losses", "touches"),
     ("check", "towers"),
     ("pruner",),
     ("fusion",),
-    ("encode", "distributed", "calibration"),
+    ("encode", "encoded", "distributed", "calibration"),
     ("stored",),
     ("checkpoint", "batches", "gate", "onnx_encoder"),
     ("features", "distil"),
@@ -31,6 +31,7 @@ STAGES = (
     ("ahead",),
     ("embed", "operating"),
     ("build", "build_report"),
+    ("answer", "objects"),
     ("search",),
     ("evaluation", "grasp_success"),
     ("hard_cases",),

@@ -3,16 +3,18 @@
 import base64
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from retrieval.answer import Match, QueryResult
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search import Match, QueryResult, Searcher
+from retrieval.search import Searcher
 from tests.pages import Page
 
 SCRIPT = "<script>alert(1)</script>"
@@ -23,7 +25,7 @@ def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match"):
     """A result with these (object, logit, probability, photo, metadata)."""
     index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
     index |= {"catalogue": "catalog", "model": "m.safetensors", "trained_on": "nothing"}
-    ranked = [Match(rank, *match) for rank, match in enumerate(matches, start=1)]
+    ranked = [Match(rank, *match, Path("catalog", match[3])) for rank, match in enumerate(matches, start=1)]
     return QueryResult([list(touch) for touch in touches], index, {"decode": 1.0, "total": 2.0}, verdict, ranked)
 
 

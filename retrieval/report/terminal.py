@@ -4,7 +4,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from retrieval.search import QueryResult
+from retrieval.answer import QueryResult
 
 
 def print_table(result: QueryResult) -> None:

@@ -17,10 +17,11 @@ from retrieval.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.config import Config
 from retrieval.defaults import shipped_model
 from retrieval.encode import TorchEncoder, touch_batch
+from retrieval.encoded import Encoder
 from retrieval.export import graph_of
 from retrieval.fusion import Matcher
 from retrieval.onnx_encoder import OnnxEncoder, sealed
-from retrieval.search import Encoder, Searcher
+from retrieval.search import Searcher
 from retrieval.stored import fingerprint, read_judge
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
 

@@ -1,0 +1,106 @@
+"""Images however they are given, to what the matcher keeps of them: halves and embeddings."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.config import Config
+from retrieval.errors import BadInput, NumericalError
+from retrieval.resize import RgbImage
+from retrieval.stopwatch import Stopwatch
+from retrieval.touches import AnyImage, AnyTouches, GivenImage, read_grasps
+
+BATCH = 32
+"""Grasps whose images are in memory, and in the encoder, at once."""
+DECODERS = 2  # a touch has as many images
+Floats = NDArray[np.float32]
+
+
+class Encoder(Protocol):
+    """What makes halves (G, hidden) and embeddings (G, embedding_dim) of touches: PyTorch or ONNX Runtime."""
+
+    @property
+    def name(self) -> str:
+        """How it is called in the answer."""
+
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
+        """Encode grasps, each its fingers' images."""
+
+
+class Encoded(NamedTuple):
+    """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
+    found, and `halves` (N, hidden), by which it judges pairs. float32."""
+
+    embeddings: Floats
+    halves: Floats
+
+
+class TouchReader:
+    """Reads and encodes the touches of a model."""
+
+    def __init__(self, config: Config, encoder: Encoder) -> None:
+        self.encoder, self.fingers = encoder, config.matcher.fingers
+        self._preprocessing = config.preprocessing
+
+    def grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
+        """The grasps of one object, by `retrieval.touches.read_grasps`; no image is read."""
+        return read_grasps(touches, self.fingers, of=of)
+
+    def references(self, background: Sequence[AnyImage] | None) -> Sequence[RgbImage | None]:
+        """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
+        that is missing, and for one that would not be looked at."""
+        policy = self._preprocessing.background
+        if background is None and policy != "none":
+            raise BadInput(
+                f'this model subtracts the untouched gel (background = "{policy}"): give a no-contact frame for each '
+                "finger with --background"
+            )
+        if background is None:
+            return [None] * self.fingers
+        if policy == "none":
+            raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
+        frames = read_grasps(background, self.fingers, what="background")
+        if len(frames) != 1:
+            raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
+        return [frame.read() for frame in frames[0]]
+
+    def encode(
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None], clock: Stopwatch
+    ) -> Encoded:
+        """Of all grasps, in batches, with stages "decode" and "encode" on the clock."""
+        parts = []
+        for start in range(0, len(grasps), BATCH):
+            with clock("decode"):
+                images = self._views(grasps[start : start + BATCH], references)
+            with clock("encode"):
+                parts.append(self.encoder.encode(images))
+        halves, embeddings = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return Encoded(_finite(embeddings, "embedding"), _finite(halves, "half"))
+
+    def _views(
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None]
+    ) -> list[list[RgbImage]]:
+        """The images of grasps as the tower sees them, made side by side; of several bad ones the first is told.
+
+        The threads end with the call, for a fork of the process would not have them.
+        """
+
+        def view(given: GivenImage, reference: RgbImage | None) -> RgbImage:
+            return self._preprocessing.touch(given.read(), reference)
+
+        with ThreadPoolExecutor(DECODERS, "decode") as threads:
+            jobs = [
+                [threads.submit(view, given.loaded(), frame) for given, frame in zip(grasp, references, strict=True)]
+                for grasp in grasps
+            ]
+            return [[job.result() for job in grasp] for grasp in jobs]
+
+
+def _finite(values: Floats, name: str) -> Floats:
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} holds a NaN or infinite number; the model is unfit")
+    return values

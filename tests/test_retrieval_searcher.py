@@ -1,0 +1,221 @@
+"""A searcher in a robot's process: arrays, several objects at once, threads, forks, and an end."""
+
+import os
+import shutil
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from retrieval.build import build_index
+from retrieval.checkpoint import load_checkpoint
+from retrieval.errors import BadInput, ImageError
+from retrieval.export import graph_of
+from retrieval.onnx_encoder import sealed
+from retrieval.search import Searcher
+from tests import synthetic
+
+
+@pytest.fixture(scope="module")
+def index(catalogue, model, tmp_path_factory):
+    """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
+    out = tmp_path_factory.mktemp("searcher") / "index"
+    build_index(catalogue, load_checkpoint(model), out, quiet=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def searcher(index):
+    with Searcher.open(index) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def grasps(tmp_path_factory):
+    """Files of three grasps of each of two objects."""
+    objects = synthetic.make_objects(2, seed=9)
+    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
+
+
+def array(path):
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def ranking(result):
+    return [(match.object_id, match.photo, match.logit) for match in result.results]
+
+
+def test_arrays_give_the_answer_of_their_files_to_the_bit(searcher, grasps):
+    files = grasps[0]
+    arrays = [[array(path) for path in grasp] for grasp in files]
+    assert ranking(searcher.query(arrays)) == ranking(searcher.query(files))
+    assert ranking(searcher.query(np.array(arrays))) == ranking(searcher.query(files))
+
+
+def test_one_grasp_needs_no_list_of_grasps(searcher, grasps):
+    assert ranking(searcher.query(grasps[0][0])) == ranking(searcher.query(grasps[0][:1]))
+
+
+def test_an_answer_names_arrays_by_their_place_and_photos_by_absolute_paths(searcher, grasps, catalogue):
+    answer = searcher.query([array(path) for path in grasps[0][0]])
+    assert answer.touches == [
+        ["grasp 1, finger a (array 120 x 160 x 3 uint8)", "grasp 1, finger b (array 120 x 160 x 3 uint8)"]
+    ]
+    assert answer.top is answer.results[0]
+    assert answer.top.photo_path == catalogue.absolute() / answer.top.photo
+    assert answer.top.photo_path.is_file()
+    assert "photo_path" not in answer.to_dict()["results"][0]
+
+
+def test_one_pillow_image_may_be_given_for_both_fingers(searcher, touch):
+    image = Image.open(touch[0])
+    assert ranking(searcher.query([image, image])) == ranking(searcher.query([touch[0], touch[0]]))
+
+
+def test_a_bad_array_is_named_by_grasp_and_finger(searcher, touch):
+    good = array(touch[0])
+    with pytest.raises(
+        ImageError, match=r"grasp 2, finger b \(array 120 x 160 x 3 float64\): an array must hold uint8"
+    ):
+        searcher.query([[good, good], [good, good / 255]])
+
+
+# Several objects -----------------------------------------------------------------------------------------------------
+
+
+def test_several_objects_are_answered_as_one_at_a_time(searcher, grasps):
+    objects = [grasps[0], grasps[1][0], grasps[1][:2]]
+    together = searcher.query_many(objects, top=3)
+    for answer, touches in zip(together, objects, strict=True):
+        alone = searcher.query(touches, top=3)
+        assert [match.object_id for match in answer.results] == [match.object_id for match in alone.results]
+        for ours, theirs in zip(answer.results, alone.results, strict=True):
+            assert ours.logit == pytest.approx(theirs.logit, abs=1e-4)
+        assert answer.touches == alone.touches
+        assert answer.verdict == alone.verdict
+
+
+def test_the_grasps_of_all_objects_are_encoded_in_batches(searcher, grasps, monkeypatch):
+    asked, encode = [], searcher.encoder.encode
+
+    def counted(touches):
+        asked.append(len(touches))
+        return encode(touches)
+
+    monkeypatch.setattr(searcher.encoder, "encode", counted)
+    assert len(searcher.query_many([grasps[0][:2]] * 20, top=1)) == 20
+    assert asked == [32, 8]
+
+
+def test_no_object_gives_no_answer(searcher):
+    assert searcher.query_many([]) == []
+
+
+def test_of_several_objects_the_bad_one_is_named_before_anything_is_read(searcher, grasps):
+    with pytest.raises(BadInput, match=r"object 2, this model takes 2 gel image\(s\) for one touch; got 1"):
+        searcher.query_many([["absent.png", "absent.png"], grasps[0][0][:1]])
+    broken = [array(path) for path in grasps[0][0]]
+    with pytest.raises(ImageError, match=r"object 2, grasp 1, finger b \("):
+        searcher.query_many([grasps[0], [broken[0], broken[1][..., 0]]])
+
+
+# The end -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_closed_searcher_says_so_and_closes_twice(index, touch):
+    with Searcher.open(index) as searcher:
+        assert searcher.query(touch).results
+    searcher.close()
+    for use in (lambda: searcher.query(touch), lambda: searcher.query_many([touch]), lambda: searcher.encode(touch)):
+        with pytest.raises(BadInput, match=r"this searcher of .*index was closed; open the index again"):
+            use()
+    with pytest.raises(BadInput, match="was closed"), searcher:
+        pass
+
+
+def test_what_is_under_way_when_a_searcher_is_closed_is_answered(index, touch, monkeypatch):
+    searcher = Searcher.open(index)
+    expected, encode = ranking(searcher.query(touch)), searcher.encoder.encode
+
+    def closed_meanwhile(touches):
+        searcher.close()
+        return encode(touches)
+
+    monkeypatch.setattr(searcher.encoder, "encode", closed_meanwhile)
+    assert ranking(searcher.query(touch)) == expected
+
+
+# Threads and forks ---------------------------------------------------------------------------------------------------
+
+
+def test_eight_threads_get_the_answers_of_one(searcher, grasps):
+    alone = [ranking(searcher.query(touches)) for touches in grasps]
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda number: searcher.query(grasps[number % 2]), range(48)))
+    for number, answer in enumerate(answers):
+        expected = alone[number % 2]
+        assert [match.object_id for match in answer.results] == [name for name, _, _ in expected]
+        np.testing.assert_allclose([m.logit for m in answer.results], [logit for _, _, logit in expected], atol=1e-4)
+
+
+def in_fork(work, seconds=60):
+    """What `work` returns in a forked process; killed and told where it does not end."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        try:
+            os.write(writer, repr(work()).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    end = time.monotonic() + seconds
+    while os.waitpid(child, os.WNOHANG) == (0, 0):
+        if time.monotonic() > end:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            pytest.fail("the forked process did not end")
+        time.sleep(0.01)
+    with os.fdopen(reader) as said:
+        return said.read()
+
+
+forking = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+
+
+@forking
+def test_a_fork_answers_as_its_parent_does(searcher, touch):
+    expected = ranking(searcher.query(touch))
+    torch.ones(1 << 20).add(1)  # by OpenMP's threads, which the fork does not have
+    assert in_fork(lambda: ranking(searcher.query(touch))) == repr(expected)
+
+
+@forking
+def test_a_fork_of_a_process_that_computed_on_several_threads_computes_on_one(searcher):
+    assert torch.get_num_threads() > 1
+    sums = torch.ones(1 << 20).add(1).sum()
+    assert in_fork(lambda: (torch.get_num_threads(), float(torch.ones(1 << 20).add(1).sum()))) == repr((1, float(sums)))
+
+
+@forking
+def test_a_fork_opens_the_export_again_and_lets_go_of_its_parents(catalogue, model, touch, tmp_path):
+    pytest.importorskip("onnx")
+    own = Path(shutil.copy(model, tmp_path / "m.safetensors"))
+    own.with_suffix(".onnx").write_bytes(sealed(graph_of(load_checkpoint(own))))
+    build_index(catalogue, load_checkpoint(own), tmp_path / "index", quiet=True)
+    searcher = Searcher.open(tmp_path / "index")
+    expected = ranking(searcher.query(touch))
+    assert searcher.query(touch).index["encoder"] == "onnx"
+
+    def answered_and_closed():
+        with searcher:
+            return ranking(searcher.query(touch))
+
+    assert in_fork(answered_and_closed) == repr(expected)
+    assert in_fork(searcher.close) == "None"
+    assert ranking(searcher.query(touch)) == expected
