@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.drivers import discover
+from robot.drivers import discover, vendor
 from robot.drivers.kinect2 import Kinect2
 from robot.drivers.realsense import RealSense
 from robot.drivers.uvc_camera import UvcCamera
@@ -285,6 +285,25 @@ def test_a_missing_package_is_a_sentence_with_what_to_install(monkeypatch):
         realsense().connect()
     with pytest.raises(DeviceError, match="build libfreenect2 with shared libraries first"):
         kinect().connect()
+
+
+def test_a_missing_library_of_the_system_is_a_sentence_with_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    for package, library in (("pyrealsense2", "libusb-1.0.so.0"), ("pylibfreenect2", "libodd.so.7")):
+        monkeypatch.delitem(sys.modules, package, raising=False)
+        reason = f"{library}: cannot open shared object file: No such file or directory"
+        (tmp_path / f"{package}.py").write_text(f"raise ImportError({reason!r})")
+    said = r"needs libusb-1\.0\.so\.0, a library of the system that pyrealsense2 cannot find; run apt-get install"
+    with pytest.raises(DeviceError, match=said):
+        realsense().connect()
+    with pytest.raises(DeviceError, match=r"libodd\.so\.7.*; install the package of your system that brings it"):
+        kinect().connect()
+
+
+def test_the_loader_of_macos_names_a_missing_library_in_other_words():
+    reason = "dlopen(/x/pyrealsense2.so, 0x0002): Library not loaded: @rpath/libusb-1.0.0.dylib\n  Referenced from: /x"
+    said = vendor.missing_library("pyrealsense2", ImportError(reason))
+    assert said.startswith("libusb-1.0.0.dylib, a library of the system")
 
 
 # Plain USB camera -------------------------------------------------------------------------------------------

@@ -138,3 +138,15 @@ def test_a_package_that_fails_is_told_of_and_hides_nothing_else(roots, monkeypat
     monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2())
     assert [each.kind for each in discover.discover(*roots)] == ["kinect2"]
     assert "RealSense cameras could not be listed: no udev rules" in caplog.text
+
+
+def test_a_package_without_its_library_of_the_system_is_told_of_and_one_that_is_not_installed_is_not(
+    roots, tmp_path, monkeypatch, caplog
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2")
+    reason = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
+    (tmp_path / "pyrealsense2.py").write_text(f"raise ImportError({reason!r})")
+    assert discover.discover(*roots) == []
+    assert "RealSense cameras could not be listed: that needs libusb-1.0.so.0" in caplog.text
+    assert "Kinect" not in caplog.text

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robot.drivers.vendor import missing_library
+
 log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
 _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
@@ -122,8 +124,8 @@ def find_realsenses() -> list[Found]:
             _by_serial("realsense", each.get_info(rs.camera_info.serial_number), each.get_info(rs.camera_info.name))
             for each in devices
         ]
-    except ImportError:
-        return []
+    except ImportError as error:
+        return _not_loaded("RealSense", "pyrealsense2", error)
     except Exception as error:  # a vendor's package that fails must not hide the other devices
         log.warning("RealSense cameras could not be listed: %s", error)
         return []
@@ -138,11 +140,18 @@ def find_kinects() -> list[Found]:
         count = freenect.enumerateDevices()
         serials = [as_text(freenect.getDeviceSerialNumber(number)) for number in range(count)]
         return [_by_serial("kinect2", serial, "Kinect 2") for serial in serials]
-    except ImportError:
-        return []
+    except ImportError as error:
+        return _not_loaded("Kinect 2", "pylibfreenect2", error)
     except Exception as error:  # as above
         log.warning("Kinect 2 cameras could not be listed: %s", error)
         return []
+
+
+def _not_loaded(camera: str, package: str, error: ImportError) -> list[Found]:
+    """Nothing; said aloud where the package is installed and the system lacks what it needs."""
+    if said := missing_library(package, error):
+        log.warning("%s cameras could not be listed: that needs %s", camera, said)
+    return []
 
 
 def as_text(serial: str | bytes) -> str:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Clock
 from robot.drivers.discover import as_text
-from robot.drivers.vendor import check_waits, start_again, vendor_errors
+from robot.drivers.vendor import check_waits, load, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -173,11 +173,8 @@ class Kinect2(Camera):
 
 
 def _package() -> Any:
-    try:
-        import pylibfreenect2
-    except ImportError as error:
-        raise DeviceError(
-            "a Kinect 2 needs pylibfreenect2, which is missing; build libfreenect2 with shared libraries first "
-            "(github.com/OpenKinect/libfreenect2), then run pip install pylibfreenect2"
-        ) from error
-    return pylibfreenect2
+    build = (
+        "build libfreenect2 with shared libraries first (github.com/OpenKinect/libfreenect2), "
+        "then run pip install pylibfreenect2"
+    )
+    return load("pylibfreenect2", "a Kinect 2", build)

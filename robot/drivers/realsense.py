@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock
-from robot.drivers.vendor import check_waits, finite, start_again, vendor_errors
+from robot.drivers.vendor import check_waits, finite, load, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -161,10 +161,4 @@ def _copied(frame: Any, what: str) -> npt.NDArray[Any]:
 
 
 def _package() -> Any:
-    try:
-        import pyrealsense2
-    except ImportError as error:
-        raise DeviceError(
-            "a RealSense camera needs pyrealsense2, which is missing; run pip install 'touch-retrieval[realsense]'"
-        ) from error
-    return pyrealsense2
+    return load("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")

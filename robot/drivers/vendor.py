@@ -1,14 +1,45 @@
-"""What drivers over a maker's package share: its exceptions, its numbers, waiting, and starting again."""
+"""What drivers over a maker's package share: loading it, its exceptions, its numbers, waiting, and starting again."""
 
 import contextlib
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module
+from typing import Any
 
 from robot.drivers.frames import MOST_S
 from robot.errors import DeviceError
 from robot.settings import check_range
 
 _MOST_WARMUP = 1000
+_LIBRARY = re.compile(r"(lib[^\s:/]+\.(?:so|dylib)[.\d]*)")
+"""As the loaders of Linux and macOS name what they do not find."""
+
+_BRINGS = {
+    "libfreenect2": "ldconfig after building libfreenect2 with shared libraries (github.com/OpenKinect/libfreenect2)",
+    "libusb": "apt-get install libusb-1.0-0 (Debian, Ubuntu) or brew install libusb (macOS)",
+    "libudev": "apt-get install libudev1 (Debian, Ubuntu)",
+}
+
+
+def load(package: str, device: str, install: str) -> Any:
+    """The maker's package, imported. Raises DeviceError that says what is missing: it, or a library of the system."""
+    try:
+        return import_module(package)
+    except ImportError as error:
+        said = missing_library(package, error) or f"{package}, which is missing; {install}"
+        raise DeviceError(f"{device} needs {said}") from error
+
+
+def missing_library(package: str, error: ImportError) -> str | None:
+    """In words, where the package is there and a library of the system that it needs is not; else None."""
+    found = None if isinstance(error, ModuleNotFoundError) else _LIBRARY.search(str(error))
+    if found is None:
+        return None
+    library = found[1]
+    run = next((run for name, run in _BRINGS.items() if library.startswith(name)), None)
+    cure = f"run {run}" if run else "install the package of your system that brings it"
+    return f"{library}, a library of the system that {package} cannot find; {cure}"
 
 
 def check_waits(warmup_frames: int, timeout_s: float) -> None:
