@@ -2,8 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Two processes; whoever is done first takes tests from the other, so that a file's tests and what they share stay together.
+PYTEST := python -m pytest -n 2 --dist worksteal
 
-.PHONY: demo test test-lowest benchmark clean
+.PHONY: demo test test-slow test-all test-lowest benchmark clean
 
 demo: $(VENV)/installed
 	$(BIN)/retrieve demo
@@ -12,12 +14,18 @@ test: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/$(PYTEST) -m "not slow"
+
+# What is dear to run and seldom the first to break: whole trainings, notebooks, kill after kill, the README's commands.
+test-slow: $(VENV)/installed
+	$(BIN)/$(PYTEST) -m slow
+
+test-all: test test-slow
 
 # The oldest versions that pyproject.toml admits.
 test-lowest:
 	$(MAKE) VENV=.venv-lowest CONSTRAINTS=.ci/lowest.txt .venv-lowest/installed
-	.venv-lowest/bin/python -m pytest
+	.venv-lowest/bin/$(PYTEST)
 
 benchmark: $(VENV)/installed
 	$(BIN)/python -m tests.benchmarks

@@ -1,8 +1,13 @@
 """Pictures and a hastily trained model that several test files share; each is made once a session."""
 
 import os
+import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import faiss
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
@@ -11,7 +16,11 @@ from retrieval.config import Config, MatcherConfig, TrainingConfig
 from retrieval.images import Preprocessing
 from tests import synthetic
 
-torch.set_num_threads(2)
+# Of two processes side by side (`-n 2`) each has one thread: two that wait for each other on one core crawl.
+THREADS = 1 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1 else 2
+torch.set_num_threads(THREADS)
+faiss.omp_set_num_threads(THREADS)
+cv2.setNumThreads(THREADS)
 
 # Timing decides no test: not how long an example takes, and not how long the first one is drawn on a new machine.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -36,10 +45,21 @@ TINY = Config(
 )
 
 
+@pytest.fixture(scope="session")
+def _state_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("state")
+
+
 @pytest.fixture(autouse=True)
-def _own_state_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test reads or writes what the user's commands remember."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No test reads or writes what the user's commands remember, or what another test's do.
+
+    One folder, emptied after whoever wrote into it: making one for each of thousands of tests takes half a minute.
+    """
+    monkeypatch.setenv("XDG_STATE_HOME", str(_state_folder))
+    yield
+    for left in _state_folder.iterdir():
+        shutil.rmtree(left)
 
 
 @pytest.fixture(scope="session")
@@ -74,5 +94,11 @@ def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pytest_configure() -> None:
-    """Tools that download nothing say so at once, rather than look for a network."""
+    """Tools that download nothing say so at once, rather than look for a network; and Ctrl-C is heard.
+
+    A shell has what it starts with `&` ignore Ctrl-C, and so would every process that a test starts and interrupts.
+    """
     os.environ["HF_HUB_OFFLINE"] = "1"
+    os.environ["OMP_NUM_THREADS"] = str(THREADS)  # of the processes that tests start
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

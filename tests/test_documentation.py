@@ -48,6 +48,7 @@ def home(tmp_path, recording, catalogue, monkeypatch):
         yield tmp_path
 
 
+@pytest.mark.slow
 def test_every_retrieve_command_of_the_readme_runs(home):
     found = commands("retrieve")
     shorter = {

@@ -16,6 +16,7 @@ from indexes.errors import LockedIndex, NoIndex, WriteFailed
 from indexes.generation import Generation
 from indexes.store import IndexStore
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
+from tests.waiting import first_line, running
 
 STEPS = ("fsync", "rename", "replace", "link", "mkdir", "unlink", "rmdir")
 
@@ -130,10 +131,8 @@ while True:
 def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
     store, rng = IndexStore(tmp_path), np.random.default_rng(0)
     for _ in range(3):
-        writer = subprocess.Popen([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind], stdout=subprocess.PIPE)
-        with writer:
-            assert writer.stdout is not None
-            writer.stdout.readline()
+        with running([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
+            first_line(writer)
             time.sleep(float(rng.uniform(0, 0.05)))
             found = store.open()  # reading while it writes
             writer.kill()
@@ -253,9 +252,8 @@ with IndexStore(sys.argv[1]).lock():
 
 def test_a_writer_in_another_process_is_named_and_its_death_frees_the_lock(tmp_path):
     filled(tmp_path)
-    with subprocess.Popen([sys.executable, "-c", HOLDING, str(tmp_path)], stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
+    with running([sys.executable, "-c", HOLDING, str(tmp_path)]) as holder:
+        first_line(holder)
         with pytest.raises(LockedIndex, match=f"process {holder.pid} is writing"):
             filled(tmp_path)
         assert IndexStore(tmp_path).open().count == 20  # readers do not wait

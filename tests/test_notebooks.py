@@ -83,6 +83,7 @@ def beside(tmp_path, recording, monkeypatch):
     monkeypatch.chdir(tmp_path / "notebooks")
 
 
+@pytest.mark.slow
 @every_notebook
 def test_a_notebook_runs_from_top_to_bottom_and_was_committed_with_what_every_cell_shows(name, beside):
     tiny = "\n".join(f"{key} = {value!r}" for key, value in TINY[name].items())

@@ -1,5 +1,7 @@
 """The rehearsal: what a rig of real drivers records is what any other command takes, unchanged."""
 
+import pytest
+
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
 from retrieval.defaults import shipped_model
@@ -8,6 +10,7 @@ from robot.recording import read_info, read_recording
 from tests.rehearsal import rehearse
 
 
+@pytest.mark.slow
 def test_what_the_emulated_gripper_and_replayed_sensors_collect_is_searched_like_what_they_replay(
     tmp_path, monkeypatch
 ):

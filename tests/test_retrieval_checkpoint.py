@@ -402,9 +402,10 @@ def unsafe_calls(source):
                 yield f"{name} without {keyword}={value}"
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: "/".join(path.parts[-2:]))
-def test_no_module_unpickles_anything(path):
-    assert list(unsafe_calls(path.read_text("utf-8"))) == []
+def test_no_module_unpickles_anything():
+    assert len(SOURCES) > 100
+    found = {str(path): list(unsafe_calls(path.read_text("utf-8"))) for path in SOURCES}
+    assert {path: calls for path, calls in found.items() if calls} == {}
 
 
 @pytest.mark.parametrize(

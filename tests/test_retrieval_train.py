@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -28,6 +27,7 @@ from retrieval.train import (
     train,
 )
 from tests.conftest import TINY
+from tests.waiting import running, until
 
 CPU = torch.device("cpu")
 
@@ -355,11 +355,13 @@ def difference(ours, reference):
     return max(float((ours[name] - reference[name]).abs().max()) for name in reference) / scale
 
 
+@pytest.mark.slow
 def test_two_ranks_have_the_gradient_of_one_process(recording, tmp_path):
     one, two = (gradients(recording, tmp_path, ranks, "all") for ranks in (1, 2))
     assert difference(two, one) < 1e-5  # float32, summed in another order
 
 
+@pytest.mark.slow
 def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, tmp_path):
     reference = gradients(recording, tmp_path, 1, "contrast")
     assert difference(gradients(recording, tmp_path, 2, "contrast"), reference) < 1e-5
@@ -388,6 +390,7 @@ photo_px = 32
 """
 
 
+@pytest.mark.slow
 def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_path):
     """A rank that left before the files are written, or that stopped at another step, would take the other down."""
     out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
@@ -395,12 +398,10 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [*torchrun, "-m", "retrieval.cli", "train", str(recording), "--out", str(out), "--config", str(config)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 120
-        while not state_path(out).exists() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.02)
+    with running(command, env=environment) as process:
+        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=120)
+        _, said = process.communicate(timeout=240)
     assert "--resume goes on from here" in said
     stopped = read_tensors(state_path(out))[1]["step"]
     assert stopped > 0
@@ -408,7 +409,7 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 2"))
     state_path(out).unlink()
     out.unlink()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
     made = load_checkpoint(out)
@@ -453,12 +454,8 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
         "--config",
         str(config),
     ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-        deadline = time.monotonic() + 120
-        while not state_path(out).exists() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.02)
-        process.kill()
-        process.communicate()
+    with running(command) as process:
+        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
     assert state_path(out).exists()
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr

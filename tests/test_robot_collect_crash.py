@@ -18,7 +18,7 @@ from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.test_robot_collect import files
 from tests.test_robot_recording_crash import Failing
-from tests.waiting import until
+from tests.waiting import running, until
 
 ROOT = Path(__file__).parents[1]
 NAMES = ["round-0", "thin-1", "wide-2", "round-3"]
@@ -211,8 +211,7 @@ def test_workers_leave_with_their_parent(tmp_path, end):
     (tmp_path / "endless.py").write_text(ENDLESS)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "r")]
-    parent = subprocess.Popen(command, env=environment, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    try:
+    with running(command, env=environment, cwd=ROOT) as parent:
         log = tmp_path / "r" / "attempts.jsonl"
         until(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, limit_s=60.0)
         workers = children(parent.pid)
@@ -222,8 +221,6 @@ def test_workers_leave_with_their_parent(tmp_path, end):
             time.sleep(0.1)
         said = parent.communicate(timeout=60)[1]
         until(lambda: not any(map(is_running, workers)), limit_s=60.0)
-    finally:
-        parent.kill()
     if signal.SIGINT in end:
         assert "KeyboardInterrupt" in said
     assert read_recording(tmp_path / "r").grasps

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import signal
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from robot.drivers import rosbridge
 from robot.drivers.rosbridge import RosbridgeLink, decode, encode
 from robot.drivers.rosbridge_emulator import Emulator, Faults, serve
 from robot.errors import DeviceError
+from tests.waiting import STARTED, STARTED_IDS, first_line, running
 
 
 def readers():
@@ -265,25 +267,20 @@ def test_faults_are_drawn_from_a_seed_and_counted():
     assert Faults().draw(kinds) is None
 
 
-def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c():
-    import signal
-
+@pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
+def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
     command = [sys.executable, "-m", "robot.drivers.rosbridge_emulator", "--port", "0", "--faults", "1"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            words = process.stdout.readline()
-            url = next(word for word in words.split() if word.startswith("ws://")).rstrip(";")
-            link = RosbridgeLink(url, timeout_s=10.0)
-            link.open()
-            link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
-            link._wait(lambda: link.counts["noise"] or link.history("/robot/joint_states") or None, 10.0, "message")
-            link.close()
-            process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
-            counts = process.stdout.read()
-            assert "corrupted: " in counts or "duplicated: " in counts
-        finally:
-            process.kill()
+    with running([*by, *command]) as process:
+        url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
+        link = RosbridgeLink(url, timeout_s=60.0)
+        link.open()
+        link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
+        link._wait(lambda: link.counts["noise"] or link.history("/robot/joint_states") or None, 60.0, "message")
+        link.close()
+        process.send_signal(signal.SIGINT)
+        counts, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "corrupted: " in counts or "duplicated: " in counts
 
 
 def test_the_module_needs_no_optional_package_to_be_imported():

@@ -4,7 +4,6 @@ import contextlib
 import logging
 import math
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -26,7 +25,7 @@ from robot.drivers.sawyer_model import READY, SawyerModel, forward, inverse
 from robot.drivers.straight_line import Schedule, way_points
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
-from tests.waiting import until
+from tests.waiting import running, until
 
 WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 MOUNT = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
@@ -517,13 +516,10 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
     emulator = Emulator()
     with serve(emulator) as url:
         code = PROGRAM.replace("PORT", url.rpartition(":")[2])
-        with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as process:
-            try:
-                until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 30.0)
-                process.send_signal(signal.SIGINT)
-                errors = process.communicate(timeout=30)[1]
-            finally:
-                process.kill()
+        with running([sys.executable, "-c", code]) as process:
+            until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 60.0)
+            process.send_signal(signal.SIGINT)
+            errors = process.communicate(timeout=60)[1]
         assert "KeyboardInterrupt" in errors
         assert "and while" not in errors
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02

@@ -5,9 +5,9 @@ import math
 import os
 import re
 import select
+import signal
 import socket
 import struct
-import subprocess
 import sys
 import time
 
@@ -17,6 +17,7 @@ import pytest
 from robot.drivers import wsg50_emulated
 from robot.drivers.wsg50_codec import Frame, encode
 from robot.drivers.wsg50_emulator import Emulator, Faults, main, serve_pty, serve_tcp
+from tests.waiting import STARTED, STARTED_IDS, first_line, running
 from tests.wsg50_frames import bytes_of
 
 STOP = 0x22
@@ -146,16 +147,14 @@ def test_a_line_that_is_cut_can_be_taken_up_again():
         assert emulator.in_fast_stop
 
 
-@pytest.mark.parametrize("port", [["--tcp", "0"], ["--pty"]])
-def test_it_runs_as_a_program_and_says_where(port):
+@pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
+@pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
+def test_it_runs_as_a_program_and_says_where(port, end, by):
     program = [sys.executable, "-m", "robot.drivers.wsg50_emulator", *port, "--object-mm", "40"]
-    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert select.select([process.stdout], [], [], 30)[0]
-            line = process.stdout.readline()
-            assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
-        finally:
-            process.send_signal(2)
-        _, errors = process.communicate(timeout=30)
+    with running([*by, *program]) as process:
+        line = first_line(process)
+        assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
+        process.send_signal(end)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 0
     assert "faults: {" in errors

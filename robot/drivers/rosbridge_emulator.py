@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from robot.drivers.sawyer_model import SawyerModel, forward, inverse
+from robot.interrupts import until_interrupted
 
 JOINT_NAMES = [f"right_j{number}" for number in range(7)]
 LIMB = "/robot/limb/right/"
@@ -329,7 +330,7 @@ def serve(emulator: Emulator, host: str = "127.0.0.1", port: int = 0) -> Iterato
 
 
 def main() -> None:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C or SIGTERM."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=9090)
@@ -337,7 +338,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     emulator = Emulator(faults=Faults(asked.faults, seed=asked.seed))
-    with contextlib.suppress(KeyboardInterrupt), serve(emulator, asked.host, asked.port) as url:
+    with until_interrupted(), serve(emulator, asked.host, asked.port) as url:
         print(f"a made-up arm behind rosbridge at {url}; Ctrl-C ends it", flush=True)
         threading.Event().wait()
     for kind, count in sorted(emulator.faults.counts.items()):

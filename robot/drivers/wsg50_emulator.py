@@ -28,6 +28,7 @@ from robot.drivers.wsg50_codec import PREAMBLE, Frame, decode, encode
 from robot.drivers.wsg50_emulated import Emulator
 from robot.drivers.wsg50_emulated_numbers import UPDATES
 from robot.drivers.wsg50_faults import Faults
+from robot.interrupts import until_interrupted
 
 __all__ = ["Emulator", "Faults", "main", "serve_pty", "serve_tcp"]
 
@@ -243,13 +244,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     faults = Faults(options.faults, seed=options.seed)
     serving = serve_pty(emulator, faults) if options.pty else serve_tcp(emulator, faults, port=options.tcp)
     try:
-        with serving as address:
+        with until_interrupted(), serving as address:
             print(address, flush=True)
             threading.Event().wait()
     except OSError as error:
         parser.error(f"it must be served somewhere, and cannot be: {error.strerror}; try another port, --tcp 0 for any")
-    except KeyboardInterrupt:
-        print(f"faults: {faults.counts}", file=sys.stderr)
+    print(f"faults: {faults.counts}", file=sys.stderr)
 
 
 if __name__ == "__main__":
