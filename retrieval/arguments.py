@@ -6,6 +6,8 @@ from typing import Any
 
 from retrieval.version import __version__
 
+DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
@@ -116,7 +118,7 @@ def _add_build_index(commands: Any) -> None:
         "number), or a pattern such as {split}/{object}/{photo} or {object}_{view}.jpg (default: as the index has it, "
         "else folder)",
     )
-    parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
+    parser.add_argument("--model", help=f"checkpoint (default: {DEFAULT_MODEL})")
     parser.add_argument("--out", type=Path, default=Path("index"), help="index folder (default: index)")
     parser.add_argument("--kind", help="candidate index (default: exact, unless a bound asks for more); see the README")
     parser.add_argument(
@@ -144,7 +146,7 @@ def _add_query(commands: Any) -> None:
         metavar="IMAGE",
         help="no-contact frames, one per finger, for models with a background policy",
     )
-    parser.add_argument("--index", help="index folder (default: ./index, else the last one built)")
+    parser.add_argument("--index", help="index folder (default: ./index, else the last one built from this folder)")
     parser.add_argument("--model", help="checkpoint (default: the one the index was built with)")
     parser.add_argument("--top", type=int, default=10, help="objects to return (default: 10)")
     parser.add_argument(
@@ -161,9 +163,7 @@ def _add_export(commands: Any) -> None:
         "export",
         "Write a checkpoint's touch encoder as ONNX; `query` finds it beside the checkpoint and does without PyTorch.",
     )
-    parser.add_argument(
-        "model", nargs="?", help="checkpoint (default: the last one trained, else the shipped one)", metavar="MODEL"
-    )
+    parser.add_argument("model", nargs="?", help=f"checkpoint (default: {DEFAULT_MODEL})", metavar="MODEL")
     parser.add_argument("--out", type=Path, help="file to write (default: beside the checkpoint, ending in .onnx)")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
 
@@ -201,7 +201,7 @@ def _add_frontier(commands: Any) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for frontier.json, frontier.html and plots")
     parser.add_argument("--recording", type=Path, help="grasps of unseen objects (default: a small one is collected)")
-    parser.add_argument("--model", help="checkpoint (default: the last one trained, else the shipped one)")
+    parser.add_argument("--model", help=f"checkpoint (default: {DEFAULT_MODEL})")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these approximations only")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, to see that it runs; concludes nothing")
     parser.add_argument(

@@ -179,7 +179,7 @@ def run_build_index(arguments: argparse.Namespace) -> None:
     from retrieval.build import build_index
     from retrieval.checkpoint import load_checkpoint
 
-    path, why = defaults.find_model(arguments.model)
+    path, why = defaults.find_model(arguments.model, arguments.out)
     say(f"model: {path} ({why})")
     report = build_index(
         arguments.catalogue,

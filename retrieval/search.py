@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,12 +15,12 @@ from retrieval import defaults
 from retrieval.answer import Match, QueryResult
 from retrieval.calibration import Calibration
 from retrieval.encoded import Encoded, Encoder, TouchReader
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import BadInput
 from retrieval.judge import Judge
 from retrieval.objects import Objects
 from retrieval.onnx_encoder import exported_beside
 from retrieval.stopwatch import Stopwatch
-from retrieval.stored import Stored, file_digest, fingerprint, read_judge, read_stored
+from retrieval.stored import Stored, fingerprint, read_judge, read_stored
 from retrieval.touches import AnyImage, AnyTouches, GivenImage
 
 DEFAULT_CANDIDATES = 1000
@@ -57,7 +56,7 @@ class Searcher:
         for another model.
         """
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
-        stored = read_stored(Path(model) if model else _model_of(generation))
+        stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
         _require(generation, stored)
         return cls(
             Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
@@ -248,17 +247,3 @@ def _torch_encoder(stored: Stored) -> Encoder:
     from retrieval.encode import TorchEncoder
 
     return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher)
-
-
-def _model_of(generation: Generation) -> Path:
-    """The checkpoint that built an index: where it lay then, else wherever a default has the same digest."""
-    path = Path(generation.manifest.about["checkpoint"])
-    if path.is_file():
-        return path
-    with suppress(CheckpointError):
-        other, _ = defaults.find_model(None)
-        if file_digest(other) == generation.fingerprint["checkpoint"]:
-            return other
-    raise CheckpointError(
-        f"the model of this index is no longer at {path}; name it with --model, or build the index again"
-    )

@@ -35,19 +35,33 @@ def test_the_two_commands_work_exactly_as_written(workplace, capsys):
     assert "simulated rig" in said.err
 
 
-def test_the_index_and_the_model_are_found_again_from_another_folder(workplace, model, capsys, monkeypatch):
-    assert main(["build-index", "catalog/", "--model", str(model)]) == 0
-    elsewhere = workplace / "elsewhere"
-    elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)
-    assert main(["query", "--gelsight", "../a.png", "../b.png"]) == 0
-    assert f"index: {workplace / 'index'} (the last one built)" in capsys.readouterr().err
+def test_an_index_built_elsewhere_is_found_again_from_where_it_was_built_only(workplace, model, capsys, monkeypatch):
+    assert main(["build-index", "catalog/", "--model", str(model), "--out", "away/index"]) == 0
+    assert main(["query", "--gelsight", "a.png", "b.png"]) == 0
+    assert f"index: {workplace / 'away/index'} (the last one built from this folder)" in capsys.readouterr().err
+    monkeypatch.chdir(workplace / "away" / "index")
+    assert main(["query", "--gelsight", "../../a.png", "../../b.png"]) == 2
+    assert "there is no index in this folder" in capsys.readouterr().err
 
 
-def test_the_last_trained_model_is_the_default(workplace, model, capsys):
+def test_the_first_line_says_which_model_serves_and_a_training_elsewhere_changes_nothing(
+    workplace, model, capsys, monkeypatch
+):
     defaults.remember("model", model)
+    (workplace / "elsewhere").mkdir()
+    monkeypatch.chdir(workplace / "elsewhere")
+    assert main(["build-index", "../catalog"]) == 0
+    assert capsys.readouterr().err.startswith(f"model: {defaults.shipped_model()} (shipped; ")
+    monkeypatch.chdir(workplace)
     assert main(["build-index", "catalog/"]) == 0
-    assert f"model: {model} (the last one trained)" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f"model: {model} (the last one trained in this folder)\n")
+
+
+def test_a_built_index_is_built_again_with_its_own_model(workplace, model, capsys):
+    assert main(["build-index", "catalog/", "--model", str(model)]) == 0
+    capsys.readouterr()
+    assert main(["build-index", "catalog/"]) == 0
+    assert capsys.readouterr().err.startswith(f"model: {model} (the one that index was built with)\n")
 
 
 def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
@@ -149,7 +163,7 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml", "--seed", "3"]) == 0
     assert "kept step 2" in capsys.readouterr().err
     assert main(["build-index", "catalog"]) == 0
-    assert f"model: {workplace / 'm.safetensors'} (the last one trained)" in capsys.readouterr().err
+    assert f"model: {workplace / 'm.safetensors'} (the last one trained in this folder)" in capsys.readouterr().err
     assert main(["query", "--gelsight", "a.png", "b.png", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 

@@ -4,10 +4,13 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from indexes.store import IndexStore
 from retrieval import defaults
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.stored import file_digest
 
 
 @pytest.fixture(autouse=True)
@@ -35,17 +38,89 @@ def test_what_is_given_is_taken_even_if_it_is_not_there():
     assert defaults.find_index("none") == (Path("none"), "given")
 
 
-def test_the_last_model_is_taken_while_it_is_there(tmp_path, monkeypatch):
-    shipped, last = tmp_path / "shipped.safetensors", tmp_path / "last.safetensors"
+def shipped_in(folder, monkeypatch):
+    shipped = folder / "shipped.safetensors"
+    shipped.write_bytes(b"shipped")
     monkeypatch.setattr(defaults, "shipped_model", lambda: shipped)
-    shipped.touch()
+    return shipped
+
+
+def index_built_with(model, folder):
+    rows = [{"id": name, "digest": name} for name in "ab"]
+    about = {"checkpoint": str(model)}
+    IndexStore(folder).write(
+        rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": file_digest(model)}, about=about
+    )
+    return folder
+
+
+def test_the_last_model_trained_from_this_folder_is_taken_while_it_is_there(tmp_path, monkeypatch):
+    shipped, last = shipped_in(tmp_path, monkeypatch), tmp_path / "last.safetensors"
     last.touch()
     assert defaults.find_model(None)[0] == shipped
     assert "train your own" in defaults.find_model(None)[1]
     defaults.remember("model", Path("last.safetensors"))
-    assert defaults.find_model(None) == (last, "the last one trained")
+    assert defaults.find_model(None) == (last, "the last one trained in this folder")
     last.unlink()
     assert defaults.find_model(None)[0] == shipped
+
+
+def test_what_was_made_from_another_folder_is_never_taken(tmp_path, monkeypatch):
+    shipped, model = shipped_in(tmp_path, monkeypatch), tmp_path / "m.safetensors"
+    model.touch()
+    defaults.remember("model", model)
+    defaults.remember("index", an_index(tmp_path / "built"))
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    assert defaults.find_model(None)[0] == shipped
+    with pytest.raises(BadInput, match="no index in this folder and none was built from it"):
+        defaults.find_index(None)
+    defaults.remember("model", shipped)  # what was trained since elsewhere changes nothing at the first place
+    monkeypatch.chdir(tmp_path)
+    assert defaults.find_model(None) == (model, "the last one trained in this folder")
+    assert defaults.find_index(None)[0] == tmp_path / "built"
+
+
+def test_an_index_in_the_folder_knows_its_own_model(tmp_path, monkeypatch):
+    shipped_in(tmp_path, monkeypatch)
+    own, newer = tmp_path / "own.safetensors", tmp_path / "newer.safetensors"
+    own.write_bytes(b"own")
+    newer.write_bytes(b"newer")
+    index_built_with(own, tmp_path / "index")
+    assert defaults.find_model(None) == (own, "the one that index was built with")
+    defaults.remember("model", newer)
+    assert defaults.find_model(None) == (
+        own,
+        f"the one that index was built with; {newer} was trained in this folder too: name it to take it",
+    )
+    assert defaults.find_model(None, Path("elsewhere"))[0] == newer  # no index is there to know better
+
+
+def test_a_model_of_an_index_that_went_away_is_found_by_its_content_or_missed_aloud(tmp_path, monkeypatch):
+    shipped, gone = shipped_in(tmp_path, monkeypatch), tmp_path / "gone.safetensors"
+    gone.write_bytes(b"shipped")
+    index_built_with(gone, tmp_path / "index")
+    gone.unlink()
+    assert defaults.find_model(None)[0] == shipped
+    shipped.write_bytes(b"another")
+    with pytest.raises(CheckpointError, match=r"no longer at .*gone\.safetensors; name it with --model"):
+        defaults.find_model(None)
+
+
+def test_a_damaged_index_names_no_model(tmp_path, monkeypatch):
+    shipped = shipped_in(tmp_path, monkeypatch)
+    index_built_with(shipped, tmp_path / "index")
+    (tmp_path / "index" / "gen-000001" / "manifest.json").write_text("{")
+    assert defaults.find_model(None)[1].startswith("shipped")
+
+
+def test_only_so_many_folders_are_remembered(tmp_path, monkeypatch):
+    monkeypatch.setattr(defaults, "MOST_FOLDERS", 2)
+    for name in "abac":
+        (tmp_path / name).mkdir(exist_ok=True)
+        monkeypatch.chdir(tmp_path / name)
+        defaults.remember("model", tmp_path / name / "m.safetensors")
+    assert [Path(folder).name for folder in json.loads(state_file().read_text())] == ["a", "c"]
 
 
 @pytest.mark.usefixtures("nothing_shipped")
@@ -57,7 +132,7 @@ def test_without_any_model_the_error_says_what_to_run():
 def test_the_index_of_this_folder_comes_before_the_last_one(tmp_path):
     last = an_index(tmp_path / "elsewhere" / "index")
     defaults.remember("index", last)
-    assert defaults.find_index(None) == (last, "the last one built")
+    assert defaults.find_index(None) == (last, "the last one built from this folder")
     an_index(tmp_path / "index")
     assert defaults.find_index(None) == (Path("index"), "in this folder")
 
@@ -66,7 +141,9 @@ def test_a_folder_that_is_no_index_is_not_taken_for_one(tmp_path):
     (tmp_path / "index").mkdir()
     (tmp_path / "other").mkdir()
     defaults.remember("index", tmp_path / "other")
-    with pytest.raises(BadInput, match=r"no index here and none was built before; run `retrieve build-index"):
+    with pytest.raises(
+        BadInput, match=r"no index in this folder and none was built from it; run `retrieve build-index"
+    ):
         defaults.find_index(None)
 
 
@@ -74,14 +151,12 @@ def test_paths_are_remembered_in_full_each_kind_on_its_own(tmp_path, monkeypatch
     defaults.remember("model", Path("a.safetensors"))
     defaults.remember("index", Path("index"))
     defaults.remember("model", Path("b.safetensors"))
-    expected = {"model": str(tmp_path / "b.safetensors"), "index": str(tmp_path / "index")}
+    expected = {str(tmp_path): {"index": str(tmp_path / "index"), "model": str(tmp_path / "b.safetensors")}}
     assert json.loads(state_file().read_text()) == expected
     assert os.listdir(state_file().parent) == ["last.json"]
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b"3", b"null", b"\xff", b'{"model": 3, "index": null}', b'{"model": "/none"}']
-)
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"3", b"null", b"\xff", b'{"model": 3}', b'{"model": "/none"}'])
 @pytest.mark.usefixtures("nothing_shipped")
 def test_a_note_that_makes_no_sense_is_as_none_and_is_replaced(content, tmp_path):
     state_file().parent.mkdir(parents=True)
@@ -110,7 +185,7 @@ def test_a_user_without_a_home_folder_does_without_the_note(tmp_path, monkeypatc
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", homeless)
     defaults.remember("index", tmp_path)
-    with pytest.raises(BadInput, match="no index here"):
+    with pytest.raises(BadInput, match="no index in this folder"):
         defaults.find_index(None)
 
 
