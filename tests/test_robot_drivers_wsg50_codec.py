@@ -310,3 +310,35 @@ def test_whatever_is_found_in_noise_is_parsed_or_refused_with_the_drivers_own_er
                 parse(payload)
         with contextlib.suppress(WireError):
             commands.reply(Frame(0x40, payload))
+
+
+class Counted(tuple):
+    """The table of the check sum, which counts how often it is looked into."""
+
+    looked = 0
+
+    def __getitem__(self, index):
+        type(self).looked += 1
+        return super().__getitem__(index)
+
+
+@pytest.mark.parametrize("half", ["aa aa aa 06 ff 00", "aa aa aa 06 00 01", "aa aa aa 06 ff 00 55"])
+def test_frames_that_break_off_cost_each_byte_once_however_many_claim_it(half, monkeypatch):
+    """Summed frame by frame, each byte is gone through once for every frame that claims it, 40 times here."""
+    stream = bytes.fromhex(half) * 500
+    monkeypatch.setattr(codec, "_TABLE", Counted(codec._TABLE))
+    Counted.looked = 0
+    used, frame = decode(stream)
+    assert frame is None
+    assert used > len(stream) - 265  # all but what may still become a frame
+    assert Counted.looked <= len(stream)
+
+
+@given(st.binary(max_size=600), st.data())
+def test_the_sum_of_a_stretch_is_that_of_its_bytes_alone(data, draw):
+    first = draw.draw(st.integers(0, len(data)))
+    sums = codec._Sums(data, first)
+    for _ in range(3):
+        start = draw.draw(st.integers(first, len(data)))
+        stop = draw.draw(st.integers(start, min(len(data), start + 264)))
+        assert sums.of(start, stop) == codec.checksum(data[start:stop])

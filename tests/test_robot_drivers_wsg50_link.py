@@ -1,5 +1,7 @@
 """The line to a WSG-50: deadlines, replies told apart, old ones dropped, ports that go away."""
 
+import contextlib
+import itertools
 import os
 import select
 import socket
@@ -13,8 +15,8 @@ from contextlib import closing
 import pytest
 from serial.urlhandler import protocol_socket
 
+from robot.drivers import wsg50_codec, wsg50_link
 from robot.drivers import wsg50_commands as commands
-from robot.drivers import wsg50_link
 from robot.drivers.wsg50 import WSG50
 from robot.drivers.wsg50_codec import Frame, decode, encode
 from robot.drivers.wsg50_commands import Command, Status
@@ -89,6 +91,41 @@ class Endless:
     def close(self): ...
 
 
+class Timed:
+    """Stands for a port, for the time and for a slow computer: a byte that is summed takes 10 us, a look .5 ms.
+
+    What its other side sends is `data` over and over, `at_once` bytes a look; an echo comes too where `echoes`.
+    """
+
+    def __init__(self, data, at_once, echoes):
+        self.stream, self.at_once, self.echoes = itertools.cycle(data), at_once, echoes
+        self.now_s, self.told = 1000.0, b""
+
+    def monotonic(self):
+        return self.now_s
+
+    def __call__(self, name, **_):
+        return self
+
+    def __getitem__(self, index):
+        self.now_s += 1e-5
+        return TABLE[index]
+
+    def read(self, timeout_s):
+        self.now_s += 5e-4
+        told, self.told = self.told, b""
+        return told + bytes(itertools.islice(self.stream, self.at_once))
+
+    def write(self, data):
+        frame = decode(data)[1]
+        if self.echoes and frame and frame.id == Command.LOOP:
+            self.told = reply(frame, frame.payload)
+
+    def close(self): ...
+
+
+TABLE = wsg50_codec._TABLE
+HALF = b"\xaa\xaa\xaa\x06\xff\x00"
 UPDATE = encode(Frame(Command.SYSTEM_STATE, OK + bytes(4)))
 FLOODS = pytest.mark.parametrize(
     "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
@@ -205,6 +242,34 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
     link.open()
     ended = ends(lambda: wait(link))
     assert ended is None if end is None else isinstance(ended, end)
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+@pytest.mark.parametrize("at_once", [1, 512])
+@pytest.mark.parametrize("data", [HALF, HALF + b"\x55", b"\xaa", UPDATE], ids=range(4))
+@pytest.mark.parametrize(
+    ("wait", "time_outs"),
+    [
+        (lambda link: link.poll(Command.HOME, 0.1), 1),
+        (lambda link: link.urgent(commands.stop()), 1),
+        (lambda link: link.sync(), 3),
+        (lambda link: link.call(commands.stop()), 4),
+        (lambda link: link.tell(commands.stop()), 7),
+        (lambda link: link.pump(0.0), 0),
+    ],
+    ids=["poll", "urgent", "sync", "call", "tell", "pump"],
+)
+def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, at_once, echoes, monkeypatch):
+    """Half frames byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
+    peer = Timed(data, at_once, echoes)
+    for module, name in ((wsg50_link, "Port"), (wsg50_link, "time"), (wsg50_codec, "_TABLE")):
+        monkeypatch.setattr(module, name, peer)
+    link = Link("a port", timeout_s=0.1)
+    link.open()
+    began = peer.now_s
+    with contextlib.suppress(DeviceError):
+        wait(link)
+    assert peer.now_s - began <= 0.1 * time_outs + 0.05 * (time_outs + 1)  # and what has come by then is decoded
 
 
 @FLOODS

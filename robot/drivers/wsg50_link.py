@@ -30,8 +30,12 @@ _GAP_SHARE = 0.25
 _PADDING = bytes(MAX_PAYLOAD + 8)
 """Ends any frame that the gripper may still be waiting for the rest of, and can begin none."""
 
-_MOST_AT_ONCE = 1 << 16
-"""Bytes taken in by a look at what has come: more than gathers while this program is held up for some seconds."""
+_MOST_LOOKS = 6
+"""So often, 4096 bytes at a time, is taken in what has come by the end of a wait: more than gathers in ten seconds in
+which this program is held up. A peer that sends without end, if byte by byte, must not hold it up for longer."""
+
+_PATIENCE = 3.0
+"""So many time-outs after a question was first asked it is not asked again."""
 
 
 class NoReply(DeviceError):
@@ -51,8 +55,11 @@ class CommandFailed(DeviceError):
 
 
 class Link:
-    """A line to one gripper. port, baud, stop_bits: as Port takes them. Raises LinkLost, NoReply, CommandFailed,
-    WireError, all of them DeviceError.
+    """A line to one gripper. port, baud, stop_bits: as Port takes them. timeout_s: of each answer, an echo's too.
+    Raises LinkLost, NoReply, CommandFailed, WireError, all of them DeviceError.
+
+    Whatever comes or does not come, `poll` and `pump` end when told to, `urgent` after one time-out, `sync` after 3,
+    `call` after 4, and `tell` and `ask`, which may ask three times, after 7 at the latest.
 
     counts: what went wrong, by kind. updates: of each command that updates itself, its parameters and when they came
     (s of time.monotonic).
@@ -100,15 +107,18 @@ class Link:
 
     def ask(self, frame: Frame, parse: Callable[[bytes], _T]) -> _T:
         """As `tell`; returns what its reply holds. A reply that cannot be parsed is not sound."""
-        for _ in range(_TRIES - 1):
+        until = time.monotonic() + _PATIENCE * self.timeout_s
+        for left in reversed(range(_TRIES)):
             try:
                 return parse(self.call(frame))
             except NoEcho:
                 raise
             except (NoReply, WireError):
+                if not left or time.monotonic() > until:
+                    raise
                 self.counts["asked again"] += 1
                 self._in_doubt = True
-        return parse(self.call(frame))
+        raise AssertionError("the loop returns or raises")
 
     def begin(self, frame: Frame) -> None:
         """Send a command whose replies `poll` fetches; clears the line first if it is in doubt."""
@@ -205,9 +215,9 @@ class Link:
                 yield frame
             else:
                 self._wait(deadline)
-        most = len(self._buffer) + _MOST_AT_ONCE
-        while len(self._buffer) < most and self._fill(0.0):
-            pass
+        for _ in range(_MOST_LOOKS):
+            if not self._fill(0.0):
+                break
         while frame := self._decoded():
             yield frame
 
