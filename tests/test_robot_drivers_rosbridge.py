@@ -17,7 +17,7 @@ from robot.drivers import rosbridge
 from robot.drivers.rosbridge import RosbridgeLink, decode, encode
 from robot.drivers.rosbridge_emulator import Emulator, Faults, serve
 from robot.errors import DeviceError
-from tests.waiting import STARTED, STARTED_IDS, first_line, running
+from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
 
 
 def readers():
@@ -170,6 +170,76 @@ def test_messages_of_a_topic_are_kept_with_their_times():
         assert link.wait_for("/t", since_s=before) == history[-1]
         with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
             link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
+
+
+def kept_after(texts):
+    """What a link that subscribed to /t has of it after these texts came."""
+    link = RosbridgeLink("ws://127.0.0.1:1")
+    link._socket = type("Deaf", (), {"send": lambda self, text: None})()
+    link._gone = ""
+    link.subscribe("/t", "std_msgs/String")
+    for text in texts:
+        link._take(text)
+    return link.history("/t")
+
+
+def test_of_a_topic_the_newest_messages_are_kept_up_to_a_number_and_a_length_of_all():
+    def published(number, characters):
+        return json.dumps({"op": "publish", "topic": "/t", "msg": {"n": number, "data": "x" * characters}})
+
+    many = kept_after(published(number, 10) for number in range(1000))
+    assert [arrival.message["n"] for arrival in many] == list(range(800, 1000))
+    long = kept_after(published(number, 100_000) for number in range(1000))
+    assert [arrival.message["n"] for arrival in long] == list(range(995, 1000))  # 5 x 100 KB within 512 KiB
+    alone = kept_after([published(0, 10), published(1, 1_000_000)])
+    assert [arrival.message["n"] for arrival in alone] == [1]
+
+
+def test_who_sends_a_message_without_measure_loses_the_connection_and_is_told_why():
+    def answer(operation):
+        return ['{"op": "publish", "topic": "/t", "msg": {"data": "' + "x" * 2**20 + '"}}']
+
+    with linked(answer) as link:
+        link.subscribe("/t", "std_msgs/String")
+        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is gone: .*message too big"):
+            link.wait_for("/t", timeout_s=20.0)
+        assert link.history("/t") == []
+
+
+def test_what_is_not_yet_read_does_not_pile_up(monkeypatch):
+    """Nothing is read here: a peer that floods has to wait before it has sent the half, however long it may take."""
+    text = json.dumps({"op": "publish", "topic": "/t", "msg": {"data": "x" * 2**17}})
+    read, sent = threading.Event(), []
+
+    def answer(operation):
+        for _ in range(1000):
+            yield text
+            sent.append(1)
+
+    with scripted(answer) as (url, _):
+        link = RosbridgeLink(url, timeout_s=20.0)
+        monkeypatch.setattr(link, "_take", lambda text: read.wait(60.0))
+        link.open()
+        link.subscribe("/t", "std_msgs/String")
+        until(lambda: link._socket.recv_messages.paused or len(sent) == 1000)
+        assert link._socket.recv_messages.paused
+        assert link._socket.recv_messages.frames.qsize() <= 20
+        assert len(sent) < 500
+        read.set()
+        link.close()
+
+
+def test_a_complaint_is_cut_off_and_harmless_on_a_terminal(caplog):
+    def answer(operation):
+        flood = {"op": "status", "level": "warning", "msg": "\x1b[2J" + "x" * 10**5}
+        return [flood, reply_to(operation, result=False, values="\x1b[31mno " + "y" * 10**5)]
+
+    with linked(answer) as link, pytest.raises(DeviceError) as caught:
+        link.call("/s", {})
+    for said in (caplog.text, str(caught.value)):
+        assert "\x1b" not in said
+        assert "\\x1b" in said
+        assert len(said) < 1000
 
 
 def test_a_connection_that_breaks_ends_every_wait_at_once():

@@ -31,7 +31,14 @@ T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 _KEPT = 200
 """Messages kept of each topic: two seconds of one at 100 Hz."""
-_LARGEST_BYTES = 2**22
+_KEPT_CHARACTERS = 2**19
+"""And no more than these, of JSON, all together: the oldest go. Read, they take up to 30 times as many bytes."""
+_LARGEST_BYTES = 2**20
+"""Who sends a larger message loses the connection; a robot's state is a thousandth of that."""
+_UNREAD = 16
+"""Messages that may wait to be read; then nothing is taken from the network, and the other side has to wait."""
+_WORDS = 300
+"""Characters of a complaint that are passed on."""
 _PING_S = 5.0
 
 
@@ -41,6 +48,29 @@ class Arrival:
 
     message: Message
     time_s: float
+
+
+class _Kept:
+    """The newest messages of a topic, few enough and short enough together; the last one whatever its length."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[tuple[Arrival, int]] = deque()
+        self._characters = 0
+
+    def add(self, arrival: Arrival, characters: int) -> None:
+        """Keep a message that was so long as JSON, and drop the oldest for it."""
+        self._arrivals.append((arrival, characters))
+        self._characters += characters
+        while len(self._arrivals) > 1 and (len(self._arrivals) > _KEPT or self._characters > _KEPT_CHARACTERS):
+            self._characters -= self._arrivals.popleft()[1]
+
+    def all(self) -> list[Arrival]:
+        """Oldest first."""
+        return [arrival for arrival, _ in self._arrivals]
+
+    def newest(self) -> Arrival | None:
+        """The last that came."""
+        return self._arrivals[-1][0] if self._arrivals else None
 
 
 def encode(operation: Message) -> str:
@@ -71,7 +101,7 @@ class RosbridgeLink:
         self.counts: Counter[str] = Counter()
         self._news = threading.Condition()
         self._numbers = itertools.count(1)
-        self._topics: dict[str, deque[Arrival]] = {}
+        self._topics: dict[str, _Kept] = {}
         self._awaited: dict[str, str] = {}
         self._replies: dict[str, Message] = {}
         self._held = contextlib.ExitStack()
@@ -97,7 +127,7 @@ class RosbridgeLink:
                 ping_timeout=_PING_S,
                 compression=None,  # on a cable, time matters and size does not
                 max_size=_LARGEST_BYTES,
-                max_queue=None,
+                max_queue=_UNREAD,
                 proxy=None,
             )
             self._socket = self._held.enter_context(connection)  # websockets 17 wants a context, 15 allows one
@@ -125,7 +155,7 @@ class RosbridgeLink:
 
     def subscribe(self, topic: str, kind: str) -> None:
         """Ask for the messages of a topic of this ROS type, the newest first when the link is slow."""
-        self._topics[topic] = deque(maxlen=_KEPT)
+        self._topics[topic] = _Kept()
         self._send({"op": "subscribe", "topic": topic, "type": kind, "throttle_rate": 0, "queue_length": 1})
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
@@ -150,20 +180,22 @@ class RosbridgeLink:
                 self._replies.pop(identity, None)
         values = reply.get("values")
         if reply.get("result", True) is not True or not isinstance(values, dict):
-            raise DeviceError(f"{service} failed: {values}")
+            raise DeviceError(f"{service} failed: {_in_short(values)}")
         return values
 
     def history(self, topic: str) -> list[Arrival]:
         """The messages kept of a subscribed topic, oldest first."""
         with self._news:
-            return list(self._topics.get(topic, ()))
+            kept = self._topics.get(topic)
+            return kept.all() if kept else []
 
     def wait_for(self, topic: str, *, since_s: float = float("-inf"), timeout_s: float | None = None) -> Arrival:
         """The newest message of a topic once there is one that came after `since_s`. Raises DeviceError."""
 
         def fresh() -> Arrival | None:
             kept = self._topics.get(topic)
-            return kept[-1] if kept and kept[-1].time_s > since_s else None
+            newest = kept.newest() if kept else None
+            return newest if newest and newest.time_s > since_s else None
 
         return self._wait(fresh, timeout_s, f"message on {topic}")
 
@@ -205,19 +237,19 @@ class RosbridgeLink:
         handlers = {"publish": self._published, "service_response": self._answered, "status": self._complained}
         with self._news:
             handler = handlers.get(operation["op"])
-            if handler is None or not handler(operation):
+            if handler is None or not handler(operation, len(text)):
                 self.counts["noise"] += 1
             self._news.notify_all()
 
-    def _published(self, operation: Message) -> bool:
+    def _published(self, operation: Message, characters: int) -> bool:
         topic, message = operation.get("topic"), operation.get("msg")
         kept = self._topics.get(topic) if isinstance(topic, str) else None
         if kept is None or not isinstance(message, dict):
             return False
-        kept.append(Arrival(message, self.clock()))
+        kept.add(Arrival(message, self.clock()), characters)
         return True
 
-    def _answered(self, operation: Message) -> bool:
+    def _answered(self, operation: Message, _: int) -> bool:
         identity = operation.get("id")
         service = self._awaited.get(identity) if isinstance(identity, str) else None
         if service is None or operation.get("service", service) != service:
@@ -226,15 +258,20 @@ class RosbridgeLink:
             self._replies[str(identity)] = operation
         return True
 
-    def _complained(self, operation: Message) -> bool:
+    def _complained(self, operation: Message, _: int) -> bool:
         """An error that names a call fails it; others can only be logged."""
         identity, words = operation.get("id"), operation.get("msg")
         self.counts["status"] += 1
         if isinstance(identity, str) and identity in self._awaited and operation.get("level") == "error":
             self._replies[identity] = {"result": False, "values": words}
         else:
-            _LOG.warning("rosbridge at %s says: %s", self.url, words)
+            _LOG.warning("rosbridge at %s says: %s", self.url, _in_short(words))
         return True
+
+
+def _in_short(words: object) -> str:
+    """What the other side says, cut off, and harmless on a terminal."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(words)[:_WORDS])
 
 
 def _websocket_client() -> Callable[..., Any]:
