@@ -1,11 +1,13 @@
 """How attempts at a grasp are made: speeds, waits, and what is recorded."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from robot.errors import RobotConfigError
 from robot.grasp import GraspSettings
-from robot.settings import check_range
+from robot.settings import build, check_range
 
 OUTPUTS = ("depth", "before", "after")
 """What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
@@ -42,3 +44,9 @@ class AttemptSettings:
             check_range(name, getattr(self, name), 0.0, 1e6)
         check_range("table_share", self.table_share, 0.0, 1.0)
         check_range("jpeg_quality", self.jpeg_quality, 0, 100)
+
+
+def attempt_of(attempt: Mapping[str, Any], grasp: Mapping[str, Any]) -> AttemptSettings:
+    """From the tables [attempt] and [grasp] of a rig's file. Raises RobotConfigError."""
+    drawn = GraspSettings.from_dict(grasp, where="[grasp]")
+    return build(AttemptSettings, attempt, where="[attempt]", grasp=drawn)

@@ -26,6 +26,9 @@
     driver = "realsense"
     hand_eye = "hand_eye.json"                # made by `retrieve rig calibrate`
 
+    [gel.a]                                   # what it is made of, as far as is known (robot.gel_settings)
+    thickness_mm = 3.0
+    modulus_mpa = 0.35
     [grasp]                                   # how grasps are drawn (robot.grasp.GraspSettings)
     force_n = [5, 15]
     [attempt]                                 # how they are made (robot.attempt_settings.AttemptSettings)
@@ -48,10 +51,11 @@ from typing import Any
 import numpy as np
 
 from robot import hand_eye
-from robot.attempt_settings import AttemptSettings
+from robot.attempt_settings import AttemptSettings, attempt_of
 from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
+from robot.gel_settings import gels_of
 from robot.grasp import GraspSettings
 from robot.readings import Box
 from robot.rig import Rig, ask_on_terminal
@@ -157,17 +161,19 @@ class RealRig(Rig):
         attempt: Mapping[str, Any] = {},
         grasp: Mapping[str, Any] = {},
         object: Mapping[str, Any] = {},
+        gel: Mapping[str, Any] = {},
         source: str = "real rig",
         sensor: str = "gelsight",
     ) -> None:
         """Raises RobotConfigError, UnknownName for a driver; connects nothing."""
         ceilings = build(Limits, limits, where="[limits]")
+        gels = gels_of(gel, sensors)
         super().__init__(
             _arm(arm, ceilings, ask_on_terminal),
             _gripper(gripper, ceilings),
             _sensors(sensors),
             _camera(camera),
-            info={"source": source, "sensor": sensor},
+            info={"source": source, "sensor": sensor, "gels": [{finger: gels[finger].said() for finger in gels}]},
             attempt=_attempt(attempt, grasp, ceilings),
             given=build(GivenObject, object, where="[object]").fit() if object else None,
         )
@@ -235,13 +241,12 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
     """How attempts are made: as said, else as by default but within the ceilings. Raises RobotConfigError."""
     low, high = GraspSettings.force_n
     force_n = (min(low, limits.force_n), min(high, limits.force_n))
-    drawn = GraspSettings.from_dict({"force_n": force_n, **grasp}, where="[grasp]")
     capped = {
         "travel_mm_s": min(AttemptSettings.travel_mm_s, limits.arm_speed_mm_s),
         "approach_mm_s": min(AttemptSettings.approach_mm_s, limits.arm_speed_mm_s),
         "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
     }
-    settings = build(AttemptSettings, {**capped, **attempt}, where="[attempt]", grasp=drawn)
+    settings = attempt_of({**capped, **attempt}, {"force_n": force_n, **grasp})
     _check_ceilings(settings, limits)
     return settings
 

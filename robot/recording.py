@@ -1,7 +1,8 @@
 """The recording: a folder of grasps, appended one at a time and read by training.
 
-    recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, and what
-                      else the writer wants to say
+    recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, gels (for each
+                      pair that served: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and what else
+                      the writer wants to say
     metadata.jsonl    one JSON object a line for each grasp
     images/           PNG or JPEG files
     attempts.jsonl    where a rig collected it: every attempt, those without a grasp included (robot.attempt_log)
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Self
 
 from robot.errors import RecordingError
+from robot.gel_settings import UNKNOWN
 from robot.recorded_grasp import RecordedGrasp as RecordedGrasp
 from robot.recorded_grasp import check_name, unknown_keys
 from robot.storage import PART, ImageSource, append_line, file_content, storage_errors, sync_folder, write_file
@@ -151,7 +153,7 @@ class RecordingWriter:
         with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
             writer.append("000001", "mug", {"photo": photo, "touch_a": touch}, force_n=12.0)
 
-    `info` must name source and sensor; rig, units, seed and background have defaults, other keys are kept. A
+    `info` must name source and sensor; rig, units, seed, gels and background have defaults, other keys are kept. A
     recording that exists is continued if its source, sensor, units and background agree (its recording.json
     stays); half a last line is cut off. Raises RecordingError for wrong input, StorageError when the disk
     refuses or another writer has the folder; what was appended before stays whole, and appending may go on.
@@ -250,6 +252,7 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
         "seed": None,
         "software_version": software_version(),
         "background": "none",
+        "gels": UNKNOWN,
     }
     try:
         full: dict[str, Any] = json.loads(json.dumps({**defaults, **info}, allow_nan=False))

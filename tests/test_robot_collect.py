@@ -204,6 +204,24 @@ def test_a_collection_goes_on_with_devices_that_read_back_other_values(tmp_path)
     assert OneRig.times == 2
 
 
+@pytest.mark.parametrize("make", [OneRig, FakeRig])
+def test_a_collection_of_software_that_said_nothing_of_the_gels_goes_on(tmp_path, make):
+    given = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
+    collect(lambda: make(3), tmp_path / "r", **given)
+    path = tmp_path / "r" / "recording.json"
+    info = json.loads(path.read_text())
+    assert info.pop("gels") == "unknown"
+    path.write_text(json.dumps(info))
+
+    def knowing():
+        rig = make(3)
+        rig.info["gels"] = [{"a": {"thickness_mm": 2.0}}]
+        return rig
+
+    collect(knowing, tmp_path / "r", **(given | {"objects": ["round-0", "round-2"]}))
+    assert {grasp.object_id for grasp in read_recording(tmp_path / "r").grasps} == {"round-0", "round-2"}
+
+
 # What is asked of the devices -------------------------------------------------------------------------------
 
 

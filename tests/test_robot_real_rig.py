@@ -70,6 +70,13 @@ def test_what_is_not_said_of_attempts_stays_under_the_ceilings(tmp_path):
     assert (attempt.travel_mm_s, attempt.approach_mm_s, attempt.closing_mm_s) == (90, 50, 40)
 
 
+def test_what_is_known_of_the_gels_is_recorded_and_the_rest_is_called_unknown(tmp_path):
+    unknown = {"thickness_mm": "unknown", "modulus_mpa": "unknown", "poisson": "unknown"}
+    assert load_rig(written(tmp_path), seed=0).info["gels"] == [{"a": unknown}]
+    rig = load_rig(written(tmp_path, **{"gel.a": "thickness_mm = 4"}), seed=0)
+    assert rig.info["gels"] == [{"a": {**unknown, "thickness_mm": 4.0}}]
+
+
 def test_a_given_object_stands_for_what_a_camera_without_depth_cannot_see(tmp_path):
     given = load_rig(written(tmp_path), seed=0).given
     assert (given.x_mm, given.y_mm, given.height_mm, given.radius_mm, given.method) == (0, 5, 100, 30, "given")
@@ -140,6 +147,9 @@ BAD = {
     "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of manual, sawyer; got \['man"),
     "a speed without end": ({"attempt": "travel_mm_s = inf"}, r"\[attempt\]: travel_mm_s must be a finite number"),
     "a place that is none": ({"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"}, "x_mm must be a finite"),
+    "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"of the fingers that feel, in \[gel\.a\]; got 'b'"),
+    "a gel of no thickness": ({"gel.a": "thickness_mm = 0"}, "a gel's thickness_mm must be from 0.01 to 100, got 0"),
+    "an unknown word of a gel": ({"gel.a": "stiffness = 4"}, r"\[gel\.a\] has no setting 'stiffness'"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
     "an object of no size": ({"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"}, "must be above 0"),
 }

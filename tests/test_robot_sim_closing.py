@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, SceneError
+from robot.readings import Pose
 from robot.sim.closing import ForceLaw, Jaws, LinearLaw, Motion, TabulatedLaw, close, pressed_law, settle
 from robot.sim.contact import Layer, press
 from robot.sim.frontier import spring_closing
 from robot.sim.hard_cases import naive_close
+from robot.sim.rig import SimRig
 
 
 def on_springs(stiffness_n_mm, force_n=20.0, clearance=(0.0, 0.0), **jaws):
@@ -131,6 +133,31 @@ def test_the_motion_ends_where_rest_is():
 
 
 # Force laws ------------------------------------------------------------------------------------------------
+
+
+def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
+    """The rig presses with the commanded force at once; the way there changes nothing of what it records."""
+    with SimRig(4, families=["cylinder"]) as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        at = rig.world.scene.placement
+        rig.arm.move_to(Pose(at.x_mm, at.y_mm, 20.0, 0.3), 100.0)
+        rig.gripper.grasp(12.0)
+        pinch = rig.world.scene.pinch
+        gaps = [np.maximum(pinch.gap(finger), 0.0) for finger in "ab"]
+        layers = [pinch.sensors[finger].layer for finger in "ab"]
+        pixel_mm = pinch._pixel_mm
+    pressed = [
+        press(gap, pixel_mm, layer, force_n=12.0, tolerance=1e-4) for gap, layer in zip(gaps, layers, strict=True)
+    ]
+    laws = [
+        pressed_law(gap, pixel_mm, layer, 1.5 * one.approach_mm, points=6)
+        for gap, layer, one in zip(gaps, layers, pressed, strict=True)
+    ]
+    motion = Motion(Jaws(12.0), (laws[0], laws[1]))
+    _, states = close(motion, 2.0, 0.01)
+    assert motion.contact_forces(states[-1]) == pytest.approx((12.0, 12.0), abs=1e-3)
+    depths = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 1.0]]) @ states[-1][:3]
+    assert depths == pytest.approx([one.approach_mm for one in pressed], rel=0.01)  # of the table's interpolation
 
 
 def test_a_pressed_law_is_the_solver_s_force_at_each_depth_of_its_table_and_near_between():

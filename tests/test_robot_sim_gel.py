@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, SceneError, UnknownName
+from robot.gel_settings import GelSettings
 from robot.sim import gel, optics
 from robot.sim.contact import Layer
 from robot.sim.fitted_optics import fitted_names, load_fitted
@@ -237,6 +238,14 @@ def test_sensors_are_drawn_alike_from_the_same_seed_and_differ_by_seed_and_finge
     assert len({draw_sensor(seed, finger) for seed in range(5) for finger in "ab"}) == 10
     again = pickle.loads(pickle.dumps(draw_sensor(4, "b")))  # noqa: S301
     np.testing.assert_array_equal(again.background(1), draw_sensor(4, "b").background(1))
+
+
+def test_what_is_said_of_a_gel_is_not_drawn_and_all_else_is_as_without_it():
+    drawn = draw_sensor(4, "a")
+    said = draw_sensor(4, "a", gel=GelSettings(thickness_mm=2.5, modulus_mpa=0.3))
+    assert said == replace(drawn, layer=replace(drawn.layer, thickness_mm=2.5, modulus_mpa=0.3))
+    assert said.gel == GelSettings(2.5, 0.3, drawn.layer.poisson)
+    assert draw_sensor(4, "a", gel=GelSettings()) == drawn
 
 
 def test_drawn_gels_lie_in_their_ranges_and_their_pictures_stay_off_the_ends():

@@ -1,12 +1,17 @@
 """The simulated rig is a rig: its devices say what the scene holds, and an attempt depends on nothing but its name."""
 
+import functools
 import math
 
 import numpy as np
 import pytest
 
+from robot.attempt import Attempter
+from robot.attempt_settings import AttemptSettings
+from robot.collect import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.readings import Pose
+from robot.recording import read_recording
 from robot.rig import load_rig
 from robot.sim.rig import STROKE_MM, SimRig
 
@@ -137,6 +142,45 @@ def test_markers_are_black_dots_on_the_same_gels():
     assert abs(np.median(darker)) < 3
 
 
+def test_force_and_manner_of_a_grasp_are_set_in_the_file(tmp_path):
+    path = tmp_path / "sim.toml"
+    path.write_text('rig = "sim"\n[grasp]\nforce_n = [10.0, 11.0]\n[attempt]\nsettle_s = 0.25\noutputs = ["before"]\n')
+    with load_rig(str(path), seed=0) as rig:
+        assert (rig.attempt.settle_s, rig.attempt.retries) == (0.25, AttemptSettings.retries)
+        attempter = Attempter(rig, 0, rig.attempt)
+        attempts = [attempter.run(rig.object_ids(1)[0], number) for number in range(6)]
+    tried = [attempt for attempt in attempts if attempt.images]
+    assert tried
+    assert all(10.0 <= attempt.fields["force_n"] <= 11.0 for attempt in tried)
+    assert set(tried[0].images) == {"photo", "touch_a", "touch_a_before", "touch_b", "touch_b_before"}
+
+
+def test_without_these_tables_attempts_are_made_as_by_default():
+    assert SimRig(0).attempt == AttemptSettings()
+
+
+def test_a_softer_gel_gives_way_further():
+    openings = []
+    for modulus in (0.2, 0.8):
+        gel = {finger: {"modulus_mpa": modulus, "thickness_mm": 3.0, "poisson": 0.48} for finger in "ab"}
+        with SimRig(4, families=["cylinder"], gel=gel) as rig:
+            rig.prepare(rig.object_ids(1)[0], 0)
+            openings.append(pinch(rig).opening_mm)
+    assert openings[0] < openings[1] - 0.1
+
+
+def test_a_recording_says_what_each_pair_of_gels_is_made_of(tmp_path):
+    made = {"thickness_mm": 3.0, "modulus_mpa": 0.35, "poisson": 0.48}
+    rig = functools.partial(load_rig, "sim", seed=0, gels=2, gel={"a": made, "b": {"thickness_mm": 2.0}})
+    settings = CollectSettings(1, attempt=AttemptSettings(outputs=("before",)))
+    collect(rig, tmp_path / "r", objects=1, seed=0, settings=settings)
+    first, second = read_recording(tmp_path / "r").info["gels"]
+    assert first["a"] == second["a"] == made
+    assert first["b"]["thickness_mm"] == second["b"]["thickness_mm"] == 2.0
+    layers = [pair["b"].layer for pair in rig()._gels]
+    assert [pair["b"]["modulus_mpa"] for pair in (first, second)] == [layer.modulus_mpa for layer in layers]
+
+
 def test_devices_say_when_nothing_stands_on_the_table(rig):
     with pytest.raises(DeviceError, match="call prepare"):
         rig.camera.read()
@@ -163,6 +207,15 @@ def test_an_object_of_another_world_is_refused(rig):
         ({"localisation_mm": [3.0, 1.0]}, RobotConfigError),
         ({"localisation_mm": [0.0, math.inf]}, RobotConfigError),
         ({"colour": "red"}, RobotConfigError),
+        ({"grasp": {"force_n": [1.0, 10.0]}}, RobotConfigError),
+        ({"grasp": {"force": 3}}, RobotConfigError),
+        ({"attempt": {"grasp": 3}}, RobotConfigError),
+        ({"attempt": {"settle_s": -1}}, RobotConfigError),
+        ({"gel": {"a": 3}}, RobotConfigError),
+        ({"gel": {"a": {"thickness_mm": 0}}}, RobotConfigError),
+        ({"gel": {"a": {"modulus_mpa": math.nan}}}, RobotConfigError),
+        ({"gel": {"a": {"colour": "red"}}}, RobotConfigError),
+        ({"gel": {"b": {}}, "fingers": ["a"]}, RobotConfigError),
     ],
 )
 def test_settings_that_no_rig_has_are_refused(settings, error):

@@ -6,6 +6,10 @@
 A contact of k N/m between masses of m kg oscillates with sqrt(k/m): at 1e9 N/m ten thousand times faster than the jaws
 close. An explicit method must follow that or blow up; the implicit one here is L-stable (Alexander 1977, SDIRK of
 order 2), so what is faster than the step dies out. Where only the end matters, `settle` gives it without a step.
+
+The simulated rig does not use it: a recording holds no moment of the way, and at its end each finger carries the
+commanded force, with which the rig presses at once (robot.sim.pinch). This is the reference for that: a test lets jaws
+close on the rig's own gels and finds the depths that the rig shows.
 """
 
 import math

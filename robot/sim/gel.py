@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import RobotConfigError, UnknownName
+from robot.gel_settings import GelSettings
 from robot.sim.contact import Layer
 from robot.sim.fitted_optics import load_fitted
 from robot.sim.gel_marks import Flaws, Markers, flaw_maps, marker_darkening
@@ -40,7 +41,7 @@ class Noise:
     shot: float = 0.006
 
 
-_PLAIN_LED, _PLAIN_NOISE = LedOptics(), Noise()
+_PLAIN_LED, _PLAIN_NOISE, _ANY_GEL = LedOptics(), Noise(), GelSettings()
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class GelSensor:
             raise RobotConfigError(f"tint and exposure must be above 0 and blur_px 0 or more, got {self}")
         if not (0 <= self.noise.read < math.inf and 0 <= self.noise.shot < math.inf):
             raise RobotConfigError(f"noise must be 0 or more grey levels, got {self.noise}")
+
+    @property
+    def gel(self) -> GelSettings:
+        """What the gel is made of."""
+        return GelSettings(self.layer.thickness_mm, self.layer.modulus_mpa, self.layer.poisson)
 
     @property
     def field(self) -> Field:
@@ -154,10 +160,11 @@ def _noise_tile(rows: int, cols: int, seed: int) -> Array:
 # Drawing sensors -------------------------------------------------------------------------------------------
 
 
-def draw_sensor(seed: int, finger: str, *, optics: str = "led") -> GelSensor:
+def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _ANY_GEL) -> GelSensor:
     """A sensor as one comes from the factory, and after some use: its own gel, lamps, tint and dust.
 
-    The same seed, finger and optics give the same sensor. `optics`: led, or the name of a fitted sensor.
+    The same seed, finger and optics give the same sensor. `optics`: led, or the name of a fitted sensor. `gel`: what
+    is not to be drawn; all else is drawn as without it.
     Raises UnknownName for other optics and RobotConfigError for an empty finger.
     """
     if optics not in OPTICS:
@@ -171,7 +178,7 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led") -> GelSensor:
         thickness_mm=float(rng.uniform(*THICKNESS_MM)),
     )
     sensor = GelSensor(
-        layer,
+        replace(layer, **gel.known()),
         tint=_triple(1 + 0.02 * rng.standard_normal(3)),
         exposure=float(rng.uniform(0.9, 1.12)),
         blur_px=float(rng.uniform(0.5, 0.9)),

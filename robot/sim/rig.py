@@ -3,7 +3,7 @@
 import hashlib
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,9 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from robot.attempt_settings import attempt_of
 from robot.devices import Arm, Gripper, TactileSensor
 from robot.devices import Camera as CameraDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
+from robot.gel_settings import gels_of
 from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from robot.recorded_grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
@@ -81,7 +83,10 @@ class SimRig(Rig):
     so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: only shapes
     of these. `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`).
     `contact_grid` (rows, columns) and `contact_tolerance` of the contact solver. `shadow`: whether the lamp casts one.
-    `localisation_mm`: how far off the camera's calibration is, drawn from this range.
+    `localisation_mm`: how far off the camera's calibration is, drawn from this range. `grasp`, `attempt` and `gel` are
+    the tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: force and place of a grasp
+    (robot.grasp.GraspSettings), how attempts are made (robot.attempt_settings.AttemptSettings), and what the gels are
+    made of (robot.gel_settings.GelSettings); what is not said of a gel is drawn for each.
     Raises RobotConfigError, UnknownName, SceneError.
     """
 
@@ -101,6 +106,9 @@ class SimRig(Rig):
         contact_tolerance: float = 1e-2,
         shadow: bool = True,
         localisation_mm: Sequence[float] = (5.0, 10.0),
+        grasp: Mapping[str, Any] = {},
+        attempt: Mapping[str, Any] = {},
+        gel: Mapping[str, Any] = {},
     ) -> None:
         check_seed(seed)
         _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
@@ -110,8 +118,12 @@ class SimRig(Rig):
         self._hand = Hand(grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
         dots = Markers() if markers else None
+        said = gels_of(gel, fingers)
         self._gels = [
-            {finger: replace(draw_sensor(int(pair), finger, optics=optics), markers=dots) for finger in fingers}
+            {
+                finger: replace(draw_sensor(int(pair), finger, optics=optics, gel=said[finger]), markers=dots)
+                for finger in fingers
+            }
             for pair in drawn
         ]
         self._camera = Camera()
@@ -127,11 +139,14 @@ class SimRig(Rig):
                 "sensor": f"simulated GelSight ({optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
+                "gels": [{finger: pair[finger].gel.said() for finger in sorted(pair)} for pair in self._gels],
                 **({"meshes_sha256": _mesh_digest(meshes)} if meshes else {}),
             },
             clock=clock,
             sleep=clock.sleep,
+            attempt=attempt_of(attempt, grasp),
         )
+        self.attempt.grasp.check(self.arm, self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
         """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
