@@ -281,7 +281,7 @@ def _extent(points: Points) -> float:
 def _points(name: str, points: npt.ArrayLike) -> Points:
     try:
         found = np.array(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise RobotConfigError(f"{name} points must be rows of x, y and z in mm: {error}") from error
     if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _FAR_MM).all():  # also refuses NaN
         raise RobotConfigError(

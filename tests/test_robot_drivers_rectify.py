@@ -112,6 +112,8 @@ SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
         ({"image_px": [10, 10], "crop": [0, 0, 0]}, "crop"),
         ({"image_px": [10, 10], "crop": [0.6, 0, 0.4, 0]}, "crop"),
         ({"image_px": [10, 10], "crop": [True, 0, 0, 0]}, "crop"),
+        ({"image_px": [10, 10], "crop": [10**400, 0, 0, 0]}, "crop"),
+        ({"image_px": [10**400, 10], "crop": [0, 0, 0, 0]}, "image_px"),
         ({"image_px": [10, 10], "corners_px": 3}, "four points"),
         ({"image_px": [10, 10], "corners_px": SQUARE[:3]}, "four points"),
         ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [9], [1, 9]]}, "2 numbers"),

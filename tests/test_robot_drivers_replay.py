@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 
 import cv2
 import numpy as np
@@ -202,6 +203,14 @@ def test_what_holds_no_pictures_cannot_be_connected(kind, tmp_path, clock):
 def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
     (folder / "0.png").write_bytes(b"not a picture")
     with pytest.raises(DeviceError, match=r"0\.png must be a picture"):
+        ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
+
+
+def test_a_pipe_that_bears_a_pictures_name_is_refused_unread(folder, clock):
+    """Reading it would wait for ever for somebody who writes into it."""
+    (folder / "0.png").unlink()
+    os.mkfifo(folder / "0.png")
+    with pytest.raises(DeviceError, match=r"0\.png must be a picture, but is no file"):
         ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
 
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import Counter
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -437,6 +438,17 @@ def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatc
         emulator.silent.clear()
         arm.recover()
         assert arm.refused == {}
+
+
+def test_however_often_the_robot_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
+    """Doubled each time, the last of twenty waits would take more than a day."""
+    waits = []
+    arm = arm_at("ws://127.0.0.1:9090", reconnect_tries=20)
+    monkeypatch.setattr(arm, "_join", Mock(side_effect=DeviceError("nobody is there")))
+    monkeypatch.setattr("robot.drivers.sawyer.time", SimpleNamespace(sleep=waits.append))
+    with pytest.raises(DeviceError, match="nobody is there"):
+        arm._rejoin()
+    assert (len(waits), waits[0], max(waits)) == (19, 0.25, 5.0)
 
 
 def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():

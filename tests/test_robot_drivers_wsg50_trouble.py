@@ -6,6 +6,7 @@ import signal
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -303,6 +304,18 @@ def test_connecting_to_nothing_is_a_sentence_and_leaves_nothing_open():
         assert not gripper._link.is_open
         assert not gripper.is_connected
         assert emulator.heard == [0x06] * 3  # asked three times whether it is there, and left alone
+
+
+def test_however_often_the_gripper_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
+    """Doubled each time, the last of twenty waits would take more than a day."""
+    waits = []
+    monkeypatch.setattr("robot.drivers.wsg50_setup.time", SimpleNamespace(sleep=waits.append))
+    for first, longest in ((0.2, 5.0), (30.0, 30.0)):
+        waits.clear()
+        gripper = WSG50(port="/nowhere/tty", reconnect_tries=20, reconnect_s=first)
+        with pytest.raises(DeviceError, match="after 20 tries"):
+            gripper._setup.reach()
+        assert (len(waits), waits[0], max(waits)) == (19, first, longest)
 
 
 def test_recovering_gives_up_after_the_tries_it_was_given(caplog):

@@ -32,7 +32,7 @@ from robot.errors import DeviceError, RobotConfigError
 
 Picture = npt.NDArray[np.uint8]
 _KEYS = {"image_px", "corners_px", "crop", "output_px", "note"}
-_MOST_PX = 20_000
+_MOST_PX, _MOST = 20_000, 1e9
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _from_json(found: Any) -> Rectifier:
 
 
 def _numbers(name: str, values: Any, count: int | None = None) -> tuple[float, ...]:
-    good = isinstance(values, list) and all(type(value) in (int, float) and math.isfinite(value) for value in values)
+    good = isinstance(values, list) and all(type(value) in (int, float) and abs(value) < _MOST for value in values)
     if not good or (count is not None and len(values) != count):
         raise RobotConfigError(f"{name} must be a list of {count or 'finite'} numbers, got {values!r}")
     return tuple(float(value) for value in values)

@@ -306,6 +306,8 @@ def _depth_m(path: Path) -> npt.NDArray[np.float32]:
 
 
 def _pixels(path: Path, way: int) -> npt.NDArray[Any]:
+    if not path.is_file():  # to read from a pipe, say, might never end
+        raise DeviceError(f"{path} must be a picture, but is no file")
     pixels = None
     with contextlib.suppress(cv2.error):
         pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), way)

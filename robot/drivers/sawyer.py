@@ -44,7 +44,8 @@ _MOST_TURN_RAD = 0.5
 """Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
 _STOP_S = 2.0
 """An arm that was told to hold must stand after so long."""
-_BACK_OFF_S = 0.25
+_BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
+"""First and longest wait between two tries to connect again; it doubles, and twenty tries would take days."""
 _MARGIN_MM = 20.0
 """So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
 
@@ -221,7 +222,7 @@ class Sawyer(Arm):
                 _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._reconnect_tries, error)
                 if trial + 1 == self._reconnect_tries:
                     raise
-            time.sleep(_BACK_OFF_S * 2**trial)
+            time.sleep(min(_BACK_OFF_S * 2**trial, _LONGEST_BACK_OFF_S))
         raise AssertionError("the loop returns or raises")
 
     def _pose(self) -> Pose:

@@ -148,7 +148,7 @@ def tip_of(message: Mapping[str, Any], tip: str) -> Mapping[str, Any]:
     """The geometry_msgs/Pose of the tip of this name in an intera_core_msgs/EndpointStates."""
     names, states = message.get("names"), message.get("states")
     if not isinstance(names, list) or not isinstance(states, list) or tip not in names:
-        raise DeviceError(f"the robot must report its tip {tip!r}, it reports {names}; set tip to one of these")
+        raise DeviceError(f"the robot must report its tip {tip!r}, it reports {_short(names)}; set tip to one of these")
     place = names.index(tip)
     state = states[place] if place < len(states) else None
     pose = state.get("pose") if isinstance(state, dict) else None

@@ -61,7 +61,7 @@ class WSG50(Gripper):
     saying it aloud; else a person must. grasp_width_mm: nominal width given with each grasp. least_part_mm: what is
     held at less is the other finger, not a part. finger_share: see wsg50_force. update_ms: period of the state while
     it moves, which must not be older than max_state_age_s. reconnect_tries, reconnect_s: how often `recover` opens the
-    port again, and the first wait (s), which doubles. max_force_n, max_speed_mm_s: ceilings.
+    port again, and the first wait (s), which doubles up to 5 s. max_force_n, max_speed_mm_s: ceilings.
 
     `stop` lets go of what is held, since STOP ends the gripper's force control. For one thread: to stop it from
     outside, interrupt that thread (Ctrl-C).

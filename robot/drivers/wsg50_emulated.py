@@ -15,6 +15,7 @@ from robot.drivers.wsg50_codec import MAX_PAYLOAD, Frame
 from robot.drivers.wsg50_emulated_updates import Updates
 from robot.drivers.wsg50_mechanics import STROKE_MM, Mechanics
 
+_MOST_HEARD = 100_000
 _HOMING_MM_S = 100.0
 _CLAMPING_MM = 3.0
 """Clamping travel: how far beyond the nominal width the fingers look for a part."""
@@ -31,7 +32,7 @@ class Emulator:
     has_force_fingers (else it cannot be tared), keeps_force_n (the force limit it has whatever it is told), jammed (the
     jaws move and no motion ends), silent (hears, and says nothing), mute_updates (says nothing unasked),
     answers_bad_checksum (says so when a command is damaged, else nothing). next_status: by id, what the next command
-    of this id is answered with instead of being done. heard: ids of all commands. Safe to use from several threads.
+    of this id is answered with instead of being done. heard: ids of the last 100,000 commands. Safe to use from several threads.
     """
 
     def __init__(
@@ -131,6 +132,7 @@ class Emulator:
         with self._lock:
             self._advance()
             self.heard.append(frame.id)
+            del self.heard[:-_MOST_HEARD]
             forced = self.next_status.pop(frame.id, None)
             answer = self._answer(frame.id, frame.payload) if forced is None else forced
             if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:

@@ -38,6 +38,9 @@ _RANGES = {
     "max_state_age_s": (1e-3, 60),
 }
 
+_LONGEST_WAIT_S = 5.0
+"""Between two tries to reach the gripper, unless the first wait is longer: doubled twenty times it would be days."""
+
 _ROUNDING = 1e-6
 """How much harder than asked a gripper may clamp, relatively: less than numbers of 32 bits are off."""
 
@@ -136,7 +139,7 @@ class Setup:
                     raise DeviceError(f"{self.name} cannot be reached after {number} tries: {error}") from error
                 _log.warning("%s: no line (%s); trying again in %.2g s", self.name, error, wait_s)
             time.sleep(wait_s)
-            wait_s *= 2
+            wait_s = min(2 * wait_s, max(wait_s, _LONGEST_WAIT_S))
 
     def open_again(self) -> None:
         """Open the port, or wait a little where it cannot be opened."""
