@@ -17,7 +17,6 @@ A calibration file is JSON, written by hand or by a tool, with image_px and one 
 """
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
