@@ -32,8 +32,7 @@ class Emulator:
     has_force_fingers (else it cannot be tared), keeps_force_n (the force limit it has whatever it is told), jammed (the
     jaws move and no motion ends), silent (hears, and says nothing), mute_updates (says nothing unasked),
     answers_bad_checksum (says so when a command is damaged, else nothing). next_status: by id, what the next command
-    of this id is answered with instead of being done. heard: ids of the last 100,000 commands. Safe to use from
-    several threads.
+    of this id is answered with instead of being done. heard: ids of the last commands. Safe in several threads.
     """
 
     def __init__(
