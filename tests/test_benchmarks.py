@@ -51,6 +51,7 @@ def test_a_benchmark_of_devices_gives_its_lines(name):
         json.dumps(line.figures, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_cold_query_is_told_step_by_step_for_each_backend(model):
     lines = list(cold.measure(photos=12, repetitions=1, model=model))
     assert len(lines) == 1 + SMALLEST["query"][2]

@@ -83,6 +83,7 @@ def test_the_two_make_commands_exist_and_the_first_lines_name_them():
     assert [line[1] for line in commands("make")][:2] == ["demo", "test"]
 
 
+@pytest.mark.slow
 def test_every_python_command_of_the_readme_exists():
     for line in commands("python"):
         module = line[line.index("-m") + 1]

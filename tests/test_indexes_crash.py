@@ -102,7 +102,9 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("how", CHANGES)
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=() if how == "grown" else pytest.mark.slow) for how in CHANGES]
+)
 def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_whole(tmp_path, how):
     states, parent = json.dumps(CHANGES[how]), "fresh" if how == "fresh" else "grown"
     seen = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS), states, parent))
@@ -127,7 +129,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize("kind", ["exact", "flat", "hnsw"])
+@pytest.mark.parametrize("kind", ["exact", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flat", "hnsw"))])
 def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
     store, rng = IndexStore(tmp_path), np.random.default_rng(0)
     for _ in range(3):

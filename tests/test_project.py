@@ -15,6 +15,11 @@ def bounds():
     return {re.split("[<>=]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
 
 
+def test_what_a_query_needs_is_bounded_as_it_is_for_everything_else():
+    listed = {*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())}
+    assert set(PROJECT["dependency-groups"]["query"]) <= listed
+
+
 def pins(name):
     lines = (ROOT / ".ci" / name).read_text().splitlines()
     return dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))

@@ -52,6 +52,7 @@ def test_scores_are_scaled_cosines_with_the_learned_bias(method):
     assert 1 <= scale <= 100
 
 
+@pytest.mark.slow
 def test_what_was_chosen_is_among_what_was_tried():
     fitted = Contrastive(Setting(CONFIG))
     fitted.fit(TRAIN, VALIDATION)

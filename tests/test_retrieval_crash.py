@@ -15,6 +15,8 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
+import pytest
+
 from retrieval.build import build_index
 from retrieval.catalogue import list_catalogue, read_photo
 from retrieval.checkpoint import load_checkpoint
@@ -101,6 +103,7 @@ def what_is_there(index, model, touch):
     return rows
 
 
+@pytest.mark.slow
 def test_a_killed_build_leaves_the_old_or_the_new_index_whole(catalogue, model, touch, tmp_path):
     index, rng = tmp_path / "index", random.Random(SEED)
     folders = [shutil.copytree(catalogue, tmp_path / "old"), changed_copy(catalogue, tmp_path / "new")]

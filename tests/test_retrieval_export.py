@@ -25,6 +25,7 @@ from retrieval.onnx_encoder import OnnxEncoder, sealed, unsealed
 from retrieval.search import Searcher
 from retrieval.towers import OUTPUTS, TOWERS
 from tests.test_imports import run_blocked
+from tests.test_project import PROJECT
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -250,6 +251,54 @@ def test_what_to_install_is_said(own, monkeypatch):
     monkeypatch.setattr(exporting, "find_spec", lambda name: None)
     with pytest.raises(BadInput, match=r"export needs onnx; install it with `pip install 'touch-retrieval\[onnx\]'`"):
         export(load_checkpoint(own))
+
+
+ONLY = """
+import sys
+from importlib.metadata import packages_distributions, requires
+import packaging.requirements as listed
+
+allowed, left = set(), {allowed!r}
+while left:
+    name = left.pop().lower().replace("_", "-")
+    if name in allowed:
+        continue
+    allowed.add(name)
+    needs = [listed.Requirement(each) for each in requires(name) or []]
+    left |= {{need.name for need in needs if need.marker is None or need.marker.evaluate({{"extra": ""}})}}
+theirs = {{
+    module: {{owner.lower().replace("_", "-") for owner in owners}}
+    for module, owners in packages_distributions().items()
+}}
+before = set(sys.modules)
+
+
+class Guard:
+    def find_spec(self, name, path=None, target=None):
+        owners = theirs.get(name.partition(".")[0])
+        if owners and not owners & (allowed | {{"touch-retrieval"}}):
+            raise ModuleNotFoundError("not in the group: " + name)
+
+
+sys.meta_path.insert(0, Guard())
+from retrieval.cli import main
+code = main({arguments!r})
+used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))
+print(sorted({allowed!r} - used), file=sys.stderr)
+sys.exit(code)
+"""
+
+
+def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(own, index, touch, onnx_wins, tmp_path):
+    """`pip install --group query` and the package without its dependencies are enough; nothing in the group is idle."""
+    export(load_checkpoint(own))
+    group = {item.partition(">=")[0] for item in PROJECT["dependency-groups"]["query"]}
+    asked = ["query", "--gelsight", *map(str, touch), "--index", str(index), "--html", str(tmp_path / "q.html")]
+    code = ONLY.format(allowed=group, arguments=asked)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Which object is in the hand?" in done.stdout
+    assert done.stderr.splitlines()[-1] in ("[]", "['faiss-cpu']"), done.stderr  # an exact search does without faiss
 
 
 def test_querys_help_and_a_wrong_index_import_no_encoder(tmp_path):

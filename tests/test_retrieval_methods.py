@@ -76,7 +76,9 @@ def test_every_touch_gets_a_finite_score_with_every_photo(name):
     assert np.isfinite(scores).all()
 
 
-@every_method
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("contrastive") else ()) for name in METHODS]
+)
 def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
     again = build_method(name, Setting(CONFIG))
     again.fit(TRAIN, VALIDATION)

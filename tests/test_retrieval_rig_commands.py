@@ -17,7 +17,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_check_prints_a_line_for_each_device(capsys):
+def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
+    monkeypatch.setattr("robot.rig_check.WATCHED_S", 0.2)
     assert main(["rig", "check", "--rig", "fake"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [

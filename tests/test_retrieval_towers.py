@@ -14,6 +14,11 @@ from retrieval.towers.base import stage_statistics
 from retrieval.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 
+# ResNet-18 and -50 are made of the two kinds of block that there are.
+every_tower = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "resnet34" else ()) for name in sorted(TOWERS)]
+)
+
 
 def transformers_resnet(name):
     from transformers import ResNetConfig, ResNetForImageClassification
@@ -48,7 +53,9 @@ def weights_in_order_of_use(model, images):
     return met
 
 
-@pytest.mark.parametrize("name", ["resnet18", "resnet34", "resnet50", "mobilenet_v2"])
+@pytest.mark.parametrize(
+    "name", ["resnet18", pytest.param("resnet34", marks=pytest.mark.slow), "resnet50", "mobilenet_v2"]
+)
 def test_a_tower_computes_what_an_independent_implementation_computes_with_the_same_weights(name):
     torch.manual_seed(3)
     other = (transformers_mobilenet() if name == "mobilenet_v2" else transformers_resnet(name)).eval()
@@ -79,7 +86,7 @@ def test_a_tower_computes_what_an_independent_implementation_computes_with_the_s
     ("name", "parameters", "pooled"),
     [
         ("resnet18", 11_689_512, 512),
-        ("resnet34", 21_797_672, 512),
+        pytest.param("resnet34", 21_797_672, 512, marks=pytest.mark.slow),
         ("resnet50", 25_557_032, 2048),
         ("mobilenet_v2", 3_504_872, 1280),
     ],
@@ -115,7 +122,7 @@ def test_mobilenet_has_the_key_names_of_published_checkpoints():
     assert len(keys) == 314
 
 
-@pytest.mark.parametrize("name", sorted(TOWERS))
+@every_tower
 def test_an_image_is_encoded_alike_in_any_batch(name):
     torch.manual_seed(0)
     tower = build_tower(name).eval()
@@ -235,7 +242,7 @@ def test_real_imagenet_weights_load_in_their_older_key_layout():
     assert features.max() <= 6
 
 
-@pytest.mark.parametrize("name", sorted(TOWERS))
+@every_tower
 def test_stages_are_mean_deviation_and_maximum_of_maps_of_any_image(name):
     torch.manual_seed(0)
     tower = build_tower(name, "stages").eval()

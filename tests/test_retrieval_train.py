@@ -438,6 +438,7 @@ def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(re
         train(recording, tmp_path / name, TINY, quiet=True)
 
 
+@pytest.mark.slow
 def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_path):
     """SIGKILL by the system, through the command line."""
     out = tmp_path / "m.safetensors"

@@ -85,7 +85,7 @@ def killed(out, syncs):
     return done.returncode != 0
 
 
-@pytest.mark.parametrize("syncs", [1, 3, 13, 14])
+@pytest.mark.parametrize("syncs", [*(pytest.param(syncs, marks=pytest.mark.slow) for syncs in (1, 3, 14)), 13])
 def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
     assert killed(tmp_path / "r", syncs)
     if syncs > 2:
@@ -94,6 +94,7 @@ def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
     assert files(tmp_path / "r") == whole
 
 
+@pytest.mark.slow
 def test_a_collection_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path, whole):
     kills = 0
     while killed(tmp_path / "r", 41):
@@ -124,6 +125,7 @@ def test_two_jobs_give_the_same_bytes_as_one(tmp_path, whole):
     assert files(tmp_path / "r") == whole
 
 
+@pytest.mark.slow
 def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path):
     make, settings = functools.partial(load_rig, "sim", seed=0), CollectSettings(grasps=1)
     for jobs in (1, 2):

@@ -9,6 +9,11 @@ from robot.rig_check import check_rig
 from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
 
 
+@pytest.fixture(autouse=True)
+def _a_short_look(monkeypatch):
+    monkeypatch.setattr(rig_check, "WATCHED_S", 0.2)
+
+
 @pytest.fixture
 def rig():
     return FakeRig(5)

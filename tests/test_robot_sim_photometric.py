@@ -258,6 +258,7 @@ def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
         assert judged(drawn, index, 0.0).mse > 20
 
 
+@pytest.mark.slow
 def test_held_out_pictures_have_no_say_in_the_fit(monkeypatch):
     monkeypatch.setattr(press_model, "_THICKNESSES_MM", (4.0,))
     drawn, _ = draw_presses(6)
@@ -311,6 +312,7 @@ def test_an_interval_goes_over_presses_not_over_repeats_of_one():
     assert (summary["low"], summary["high"]) == (2.0, 6.0)
 
 
+@pytest.mark.slow
 def test_the_command_fits_judges_and_writes_a_file_that_loads(tmp_path, monkeypatch, capsys):
     drawn, _ = draw_presses(5)
     arrays = {"f0": drawn.untouched, "imgs": drawn.pictures, "touch_center": drawn.centres, "touch_radius": drawn.radii}
