@@ -357,6 +357,7 @@ def shipped_setting(name):
     return Setting(**{**values, "reaches_mm": tuple(values["reaches_mm"])})
 
 
+@pytest.mark.slow
 @real
 @pytest.mark.parametrize("name", fitted_names())
 def test_the_shipped_fit_is_what_the_presses_give(name, packs):
