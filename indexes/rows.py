@@ -113,13 +113,27 @@ class Rows(Sequence[dict[str, Any]]):
 
     def find(self, ids: Iterable[str]) -> Slots:
         """For each id its row's number (n,), -1 where there is none."""
-        wanted, (by_key, ranked) = keys_of(ids), self._sorted_keys
+        return self._found(ids, self._by_id)
+
+    def holding(self, digests: Iterable[str]) -> Slots:
+        """For each digest the number of a row of that content (n,), -1 where there is none."""
+        return self._found(digests, self._by_digest)
+
+    def _found(self, values: Iterable[str], sorted_keys: tuple[Slots, NDArray[np.bytes_]]) -> Slots:
+        wanted, (by_key, ranked) = keys_of(values), sorted_keys
         place = np.minimum(np.searchsorted(ranked, wanted), len(ranked) - 1)
         return np.where(ranked[place] == wanted, by_key[place], -1)
 
     @cached_property
-    def _sorted_keys(self) -> tuple[Slots, NDArray[np.bytes_]]:
-        keys = self.keys("id")
+    def _by_id(self) -> tuple[Slots, NDArray[np.bytes_]]:
+        return self._sorted("id")
+
+    @cached_property
+    def _by_digest(self) -> tuple[Slots, NDArray[np.bytes_]]:
+        return self._sorted("digest")
+
+    def _sorted(self, name: str) -> tuple[Slots, NDArray[np.bytes_]]:
+        keys = self.keys(name)
         order = np.argsort(keys, kind="stable")
         return order, keys[order]
 

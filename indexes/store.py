@@ -11,6 +11,7 @@
       vectors.faiss       the structure of the index, for kinds that have one
       NAME.json           documents
     LOCK                  held by the writer
+    unfinished/           what a build had embedded when it was cut off, of no generation (see `indexes.unfinished`)
 
 A file of a segment never changes. A generation made from a parent gives the parent's files a second name (a hard link)
 and writes what is new; rows that are gone stay in their segments until they are a tenth of all. Small segments are

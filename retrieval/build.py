@@ -18,11 +18,12 @@ from indexes.generation import Generation
 from indexes.manifest import read_manifest
 from indexes.spool import Block
 from indexes.store import IndexStore
+from indexes.unfinished import Unfinished
 from indexes.writing import RECALL_QUERIES, Chosen, Laid
 from retrieval.build_report import BuildReport
 from retrieval.catalogue import Catalogue, list_catalogue
 from retrieval.checkpoint import Checkpoint
-from retrieval.embed import Embedder, Part
+from retrieval.embed import Embedder, Part, layouts
 from retrieval.errors import BadInput
 from retrieval.naming import FOLDER, Naming, doubts, per_object
 from retrieval.operating import (
@@ -78,12 +79,14 @@ def build_index(
             "objects_from": naming.text,
             "asked": asdict(asked),
         }
-        made = Embedder(checkpoint, parent)
         start = time.perf_counter()
-        with closing(made.parts(catalogue, quiet)) as parts:
-            changed = _unless_same(parent, parts, about)
-            job = _Job(store, made, about, asked, quiet)
-            generation = parent if parent is not None and changed is None else job.write(changed or ())
+        with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
+            made = Embedder(checkpoint, parent, unfinished)
+            with closing(made.parts(catalogue, quiet)) as parts:
+                changed = _unless_same(parent, parts, about)
+                job = _Job(store, made, about, asked, quiet)
+                generation = parent if parent is not None and changed is None else job.write(changed or ())
+            unfinished.clear()
         seconds = time.perf_counter() - start - job.settling_s
     inside = out.resolve()
     names = sorted(made.objects)
@@ -203,7 +206,7 @@ def _settled(made: Embedder, laid: Laid, asked: Asked, quiet: bool) -> Settled:
     photos, checkpoint = len(laid.slots), made.checkpoint
     previous = None if made.parent is None else made.parent.manifest
     before = None if previous is None else previous.about.get("candidates")
-    again = kept(before, asked, photos, made.embedded + made.removed)
+    again = kept(before, asked, photos, made.embedded + made.resumed + made.removed)
     if previous is not None and again is not None:
         parameters = load_kind(previous.kind).parameters_from(previous.asked)
         return Settled(previous.kind, parameters, sentence(again), again)

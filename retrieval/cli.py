@@ -181,15 +181,19 @@ def run_build_index(arguments: argparse.Namespace) -> None:
 
     path, why = defaults.find_model(arguments.model, arguments.out)
     say(f"model: {path} ({why})")
-    report = build_index(
-        arguments.catalogue,
-        load_checkpoint(path),
-        arguments.out,
-        objects_from=arguments.objects_from,
-        kind=arguments.kind,
-        min_recall=arguments.min_recall,
-        max_ms=arguments.max_ms,
-    )
+    try:
+        report = build_index(
+            arguments.catalogue,
+            load_checkpoint(path),
+            arguments.out,
+            objects_from=arguments.objects_from,
+            kind=arguments.kind,
+            min_recall=arguments.min_recall,
+            max_ms=arguments.max_ms,
+        )
+    except KeyboardInterrupt:
+        say(f"what was embedded is kept in {arguments.out}; the same command goes on with it")
+        raise
     defaults.remember("index", arguments.out)
     for line in report.lines():
         say(line)

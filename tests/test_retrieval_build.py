@@ -187,12 +187,33 @@ def test_removed_photos_vanish_and_are_counted(own, checkpoint, index):
     assert set(rows_of(index)) == {path.relative_to(own).as_posix() for path in own.rglob("*.jpg")}
 
 
-def test_a_photo_moved_to_another_object_is_a_new_photo(own, checkpoint, index):
+def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(own, checkpoint, index, embedded):
     build_index(own, checkpoint, index, quiet=True)
+    before = IndexStore(index).open()
+    embedded.clear()
     photo = first_photo(own)
-    photo.rename(sorted(own.iterdir())[1] / "moved.jpg")
+    moved = photo.rename(sorted(own.iterdir())[1] / "moved.jpg")
     report = build_index(own, checkpoint, index, quiet=True)
-    assert (report.photos, report.embedded, report.removed) == (24, 1, 1)
+    assert embedded == []
+    assert (report.photos, report.embedded, report.reused, report.renamed, report.removed) == (24, 0, 24, 1, 1)
+    assert "24 unchanged (1 under another name), 1 removed" in next(report.lines())
+    after = IndexStore(index).open()
+    old, new = (part.row_number(path.relative_to(own).as_posix()) for part, path in ((before, photo), (after, moved)))
+    assert after.rows[new]["object_id"] == moved.parent.name
+    np.testing.assert_array_equal(after.arrays["halves"][new], before.arrays["halves"][old])
+    np.testing.assert_array_equal(after.embeddings[after.slots[new]], before.embeddings[before.slots[old]])
+    assert report.half_error == before.manifest.about["half_error"]
+
+
+def test_a_whole_catalogue_under_other_names_is_not_embedded_again(own, checkpoint, index, embedded):
+    build_index(own, checkpoint, index, quiet=True)
+    embedded.clear()
+    for number, photo in enumerate(sorted(own.rglob("*.jpg"))):
+        photo.rename(own / f"{photo.parent.name}_{number}.jpg")
+    report = build_index(own, checkpoint, index, objects_from="stem", quiet=True)
+    assert embedded == []
+    assert (report.photos, report.objects, report.renamed) == (24, 8, 24)
+    assert Searcher.open(index).generation.count == 24
 
 
 def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(own, checkpoint, index):
