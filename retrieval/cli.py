@@ -278,6 +278,11 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
     say(f"report: {text}, {page}")
     if arguments.json:
         print_json(results)
+        return
+    from retrieval.report.results import read_results
+    from retrieval.report.terminal import print_measures
+
+    print_measures(read_results(arguments.out))
 
 
 def run_frontier(arguments: argparse.Namespace) -> None:

@@ -3,7 +3,7 @@
     python -m tests.notebooks                        execute all of notebooks/ and store what they show
     python -m tests.notebooks one_query.ipynb ...    these only
 
-A notebook says in its first lines what must be there before it runs (`make demo`, a benchmark's report).
+All of them run right after `make demo`.
 """
 
 import ast

@@ -8,7 +8,6 @@ import shutil
 import pytest
 
 from tests import synthetic
-from tests.made_up_evaluation import write_made_up
 from tests.notebooks import FOLDER, execute, kinds
 
 TINY = {
@@ -18,16 +17,16 @@ TINY = {
         "preset": "tiny",
         "iterations": 4,
         "methods": ("late_fusion", "cca", "chance"),
-        "benchmark": "../benchmark-report",
     },
     "error_against_time": {
         "out": "../build/error-against-time",
         "demo": "../demo",
-        "benchmark": "../benchmark-report",
         "photos": 700,
         "queries": 6,
         "repeats": 1,
         "quick": True,
+        "preset": "tiny",
+        "iterations": 4,
     },
     "one_query": {
         "demo": "../demo",
@@ -46,7 +45,7 @@ TINY = {
         "gallery": 2,
     },
     "your_own_data": {
-        "pictures": "../demo/recording/images",
+        "demo": "../demo/recording",
         "catalogue": "../demo/catalog",
         "out": "../build/your-own-data",
         "preset": "tiny",
@@ -74,11 +73,10 @@ def committed(name):
 
 @pytest.fixture
 def beside(tmp_path, recording, monkeypatch):
-    """What notebooks find beside their folder: the demo's recording and catalogue, and a benchmark's report."""
+    """What notebooks find beside their folder: the demo's recording and catalogue, and nothing else."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
     shutil.copytree(recording, tmp_path / "demo" / "recording")
     synthetic.write_catalogue(tmp_path / "demo" / "catalog", synthetic.make_objects(4), photos_per_object=2)
-    write_made_up(recording, tmp_path / "benchmark-report")
     (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path / "notebooks")
 
@@ -118,7 +116,10 @@ def test_committed_outputs_are_small_without_errors_and_name_no_folder_of_a_mach
 @every_notebook
 def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
     document = notebook(name)
-    assert document["cells"][0]["cell_type"] == "markdown"
+    headings = [cell["source"][0] for cell in document["cells"] if cell["cell_type"] == "markdown"]
+    assert document["cells"][0]["source"][0] == headings[0]
+    assert headings[0].startswith("# ")
+    assert not any(heading.startswith("# ") for heading in headings[1:])
     for cell in code_cells(name)[2:]:  # after parameters and imports
         lines = "".join(cell["source"]).splitlines()
         assert len(lines) <= LONGEST_CELL, lines[0]

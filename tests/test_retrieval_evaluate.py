@@ -283,6 +283,17 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
     assert f"report: {out / 'report.md'}" in said.err
     assert (out / "report.html").is_file()
     assert json.loads(said.out)["setting"]["preset"] == "tiny"
+    assert main([*command, "--methods", "late_fusion,cca,chance"]) == 0  # goes on with what is there
+    table = capsys.readouterr().out.splitlines()
+    assert table[0].split()[:3] == ["method,", "%", "pair"]
+    assert [line.split("  ")[0] for line in table[1:5]] == [
+        "late fusion",
+        "CCA",
+        "random scores",
+        "chance, closed form",
+    ]
+    assert all(line.count("[") >= 2 for line in table[1:4])
+    assert "queries of" in table[5]
 
 
 def test_the_command_refuses_what_it_would_not_look_at(grasped, tmp_path, capsys):

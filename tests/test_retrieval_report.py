@@ -3,6 +3,7 @@
 import base64
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -144,11 +145,18 @@ def test_a_model_without_calibration_shows_no_probability(tmp_path):
 # The table on a terminal ---------------------------------------------------------------------------------------
 
 
-def test_the_table_has_a_line_for_each_object(answer, capsys, monkeypatch):
+@pytest.fixture(params=["terminal", "pipe"])
+def stdout(request, capsys, monkeypatch):
+    """What is printed on a terminal of 120 columns, and into a pipe: a function that returns it."""
     monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: request.param == "terminal")
+    return lambda: capsys.readouterr().out
+
+
+def test_the_table_has_a_line_for_each_object(answer, stdout):
     result, _ = answer
     print_table(result)
-    out = capsys.readouterr().out
+    out = stdout()
     for match in result.results:
         line = next(line for line in out.splitlines() if match.photo in line)
         assert match.object_id in line
@@ -156,9 +164,20 @@ def test_the_table_has_a_line_for_each_object(answer, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["[bold]mug[/bold]", "[/red]", ":smile:", "[link=x]y"])
-def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
+def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, stdout):
     print_table(made_up((name, 1.5, None, f"{name}.jpg", {})))
-    out = capsys.readouterr().out
+    out = stdout()
     assert f" {name} " in out
     assert f"{name}.jpg" in out
+
+
+def test_a_piped_table_is_plain_and_uncut(capsys):
+    """Rich had folded names at 80 columns in a pipe, and drawn frames around them."""
+    long = "slab-knurl-with-a-long-name-20000-00010"
+    print_table(made_up((long, 1.5, 0.8, f"{long}/1.jpg", {}), ("mug", -0.25, 0.1, "a very/" + "deep/" * 20, {})))
+    name = f"{'object':<39}"
+    assert capsys.readouterr().out == (
+        f"rank  {name}  probability  logit  photo\n"
+        f"   1  {long}        0.800  +1.50  {long}/1.jpg\n"
+        f"   2  {'mug':<39}        0.100  -0.25  a very/{'deep/' * 20}\n"
+    )

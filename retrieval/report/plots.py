@@ -59,9 +59,11 @@ def _percents(shares: Sequence[float | None]) -> NDArray[np.float64]:
 
 
 def guess_curves(results: Results) -> Figure:
-    """Share of queries whose object is among the first N guesses, for 5 and for 10 candidates."""
-    figure = canvas(10.5, 4.6)
-    for panel, key in zip(figure.subplots(1, 2), ("guesses_k5", "guesses_k10"), strict=True):
+    """Share of queries whose object is among the first N guesses, for 5 and, where there are so many, 10 candidates."""
+    both = ("guesses_k5", "guesses_k10")
+    keys = [key for key in both if any(results.summary(name, key) for name in results.methods)] or both
+    figure = canvas(2.5 + 4 * len(keys), 4.6)
+    for panel, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
         for name in reversed(results.methods):
             if summary := results.summary(name, key):
                 _curve(panel, name, summary)
@@ -201,7 +203,7 @@ def objects_by_method(results: Results) -> Figure:
     panel.set_yticks(range(len(objects)), [short(item, 40) for item in objects], fontsize=8)
     panel.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
     panel.grid(visible=False)
-    figure.colorbar(image, ax=panel, label="right first guess among 5 test objects, %", shrink=0.6)
+    figure.colorbar(image, ax=panel, label="right first guess of 5, %", shrink=0.9)
     return figure
 
 

@@ -1,27 +1,72 @@
-"""Results of a query for people: the table on a terminal."""
+"""Results for people, as tables on stdout: drawn on a terminal, plain lines that nothing cuts where they are piped."""
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+import sys
+from collections.abc import Collection, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from retrieval.answer import QueryResult
 
+if TYPE_CHECKING:
+    from retrieval.report.results import Results
+
+MEASURES = ("pair_accuracy", "guesses_k5", "guesses_k10", "map")
+"""What the table of an evaluation shows; the report has the others."""
+
 
 def print_table(result: QueryResult) -> None:
-    """Print the ranking on stdout, as a table."""
-    table = Table(title="Which object is in the hand?")
-    for title, justify in (
-        ("rank", "right"),
-        ("object", "left"),
-        ("probability", "right"),
-        ("logit", "right"),
-    ):
-        # The object is the answer: folded where it is long, never cut.
-        table.add_column(title, justify=justify, no_wrap=title != "object", overflow="fold")  # type: ignore[arg-type]
-    table.add_column("photo", overflow="fold")
-    for match in result.results:
-        probability = "-" if match.probability is None else f"{match.probability:.3f}"
-        # As Text: a name may hold what rich takes for markup, such as "[bold]".
-        name, photo = Text(match.object_id), Text(match.photo)
-        table.add_row(str(match.rank), name, probability, f"{match.logit:+.2f}", photo)
+    """Print the ranking of a query."""
+    rows = [
+        (
+            str(match.rank),
+            match.object_id,
+            "-" if match.probability is None else f"{match.probability:.3f}",
+            f"{match.logit:+.2f}",
+            match.photo,
+        )
+        for match in result.results
+    ]
+    header = ("rank", "object", "probability", "logit", "photo")
+    print_columns("Which object is in the hand?", header, rows, words=(1, 4))
+
+
+def print_measures(results: "Results") -> None:
+    """Print the main measures of every method, with what they were taken over."""
+    from retrieval.report import tables  # a query's table needs none of what this imports
+
+    table = tables.measures(results, MEASURES)
+    if table is not None:
+        print_columns("On objects that no method saw", table.header, table.rows, words=(0,))
+        print(*table.notes, sep="\n")
+
+
+def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
+    """Print a table of text. words: columns of names, set to the left; numbers are set to the right."""
+    if sys.stdout.isatty():
+        _draw(title, header, rows, words)
+        return
+    for line in aligned([header, *rows], words):
+        print(line)
+
+
+def aligned(rows: Sequence[Sequence[str]], words: Collection[int]) -> Iterator[str]:
+    """Lines of cells in columns two spaces apart, as wide as they are."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        yield "  ".join(
+            cell.ljust(width) if column in words else cell.rjust(width) for column, (cell, width) in enumerate(cells)
+        ).rstrip()
+
+
+def _draw(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title)
+    for column, name in enumerate(header):
+        # Names are the answer: folded where they are long, never cut.
+        table.add_column(name, justify="left" if column in words else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))  # as Text: a name may hold what rich takes for markup, such as "[bold]"
     Console().print(table)
