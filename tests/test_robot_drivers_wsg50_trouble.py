@@ -132,8 +132,8 @@ def test_a_state_that_does_not_come_stops_the_motion(port):
 
 def test_a_program_that_was_held_up_is_no_silent_gripper(monkeypatch):
     slow = Emulator(referenced=True, object_mm=40.0)
-    with bench(emulator=slow, max_state_age_s=0.1) as (gripper, _):
-        poll, waits = gripper._link.poll, [0.3]
+    with bench(emulator=slow, max_state_age_s=1.0) as (gripper, _):
+        poll, waits = gripper._link.poll, [1.5]
 
         def held_up(command, seconds):
             status = poll(command, seconds)
