@@ -281,6 +281,7 @@ class Guard:
 
 
 sys.meta_path.insert(0, Guard())
+sys.stdout.isatty = lambda: True  # in a terminal, rich draws the table
 from retrieval.cli import main
 code = main({arguments!r})
 used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))
