@@ -144,13 +144,20 @@ def _add_query(commands: Any) -> None:
         nargs="+",
         type=Path,
         metavar="IMAGE",
-        help="no-contact frames, one per finger, for models with a background policy",
+        help="no-contact frames, one per finger: some models subtract them, others see by them if there is a contact",
     )
     parser.add_argument("--index", help="index folder (default: ./index, else the last one built from this folder)")
     parser.add_argument("--model", help="checkpoint (default: the one the index was built with)")
     parser.add_argument("--top", type=int, default=10, help="objects to return (default: 10)")
     parser.add_argument(
         "--candidates", type=int, help="photos that the full classifier judges (default: what the index needs)"
+    )
+    parser.add_argument(
+        "--none-prior",
+        type=float,
+        default=0.5,
+        metavar="P",
+        help="probability, before anything is felt, that the catalogue lacks the object (default: 0.5)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     parser.add_argument("--html", type=Path, help="write a page with photos and gel images")

@@ -1,6 +1,6 @@
 """From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,8 +16,9 @@ from retrieval import distributed
 from retrieval.config import Config
 from retrieval.dataset import Grasp, ImageCache, PairBatch
 from retrieval.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
-from retrieval.errors import DatasetError
+from retrieval.errors import DatasetError, Interrupted
 from retrieval.fusion import Matcher
+from retrieval.progress import Bar
 
 
 @dataclass(frozen=True)
@@ -146,3 +148,35 @@ class FrozenFeatures(BatchImages):
 
 FeatureSource = TrainedFeatures | FrozenFeatures
 """Where a training run gets the features of a batch from."""
+_CHUNK = 64
+
+
+@torch.inference_mode()
+def recorded_features(
+    matcher: Matcher,
+    source: FeatureSource,
+    grasps: Sequence[Grasp],
+    *,
+    what: str,
+    quiet: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+) -> tuple[Tensor, dict[Path, Tensor]]:
+    """Features of the touches of grasps (G, fingers * F), one grasp at least, and of each of their photo files (F,).
+
+    what: what they are for, in the bar and where it was stopped. Raises Interrupted.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    touches: list[Tensor] = []
+    photos: dict[Path, Tensor] = {}
+    with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
+        for start in range(0, len(grasps), _CHUNK):
+            if stopped():
+                raise Interrupted(f"stopped before the {what} was fitted")
+            part = list(grasps[start : start + _CHUNK])
+            files = list(dict.fromkeys(grasp.photo for grasp in part))
+            batch = PairBatch(part, files, none, none, np.zeros(0, dtype=np.float32), none, none)
+            touch, photo = source.eval_features(matcher, batch)
+            touches.append(touch)
+            photos |= zip(files, photo, strict=True)
+            bar.advance(len(part))
+    return torch.cat(touches), photos

@@ -168,7 +168,7 @@ class _Job:
         checkpoint = self.made.checkpoint
         return self.store.write_blocks(
             (_block(part) for part in parts),
-            {"calibration": checkpoint.calibration.to_dict()} if checkpoint.calibration else {},
+            {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
             fingerprint=fingerprint(checkpoint),
             about=self.about,
             parent=self.made.parent,

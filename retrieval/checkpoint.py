@@ -18,37 +18,41 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from retrieval.calibration import Calibration
 from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.fusion import Matcher
+from retrieval.gel_check import GelCheck
+from retrieval.gel_head import GelHead
+from retrieval.posterior import Posterior
 from retrieval.stored import (
     FORMAT,
     HEADER,
     Stored,
-    config_of,
     file_digest,
     matcher_header,
     read_header,
+    stored_of,
     unreadable,
     unusable,
 )
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_halves"
+_GEL_HEAD = "gel_head."
 
 
 @dataclass(frozen=True)
 class Checkpoint(Stored):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
-    queries: (Q, hidden) halves of touches of validation objects, by which an index can measure its own search.
+    posterior: what its logits mean; None where it was never calibrated. queries: (Q, hidden) halves of touches of
+    validation objects, by which an index can measure its own search.
     """
 
     matcher: Matcher
     split: Split | None
-    calibration: Calibration | None
+    posterior: Posterior | None = None
     queries: NDArray[np.float16] | None = None
 
 
@@ -58,8 +62,9 @@ def save_checkpoint(
     config: Config,
     *,
     split: Split | None,
-    calibration: Calibration | None,
     provenance: Mapping[str, Any],
+    posterior: Posterior | None = None,
+    gel_check: GelCheck | None = None,
     queries: NDArray[np.float16] | None = None,
     float16: bool = False,
 ) -> None:
@@ -71,7 +76,8 @@ def save_checkpoint(
     header = {
         "config": config.to_dict(),
         "split": split.to_dict() if split else None,
-        "calibration": calibration.to_dict() if calibration else None,
+        "posterior": posterior.to_dict() if posterior else None,
+        "gel_check": gel_check.to_dict() if gel_check else None,
         "provenance": dict(provenance),
     }
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
@@ -81,6 +87,21 @@ def save_checkpoint(
         state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
     write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
+
+
+def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> None:
+    """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
+    save_checkpoint(
+        path,
+        made.matcher,
+        made.config,
+        split=made.split,
+        provenance=made.provenance,
+        posterior=made.posterior,
+        gel_check=made.gel_check,
+        queries=made.queries,
+        float16=float16,
+    )
 
 
 def _half(path: Path, name: str, tensor: Tensor) -> Tensor:
@@ -117,20 +138,24 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
     """
     state, header = read_tensors(path, check=known is None)
     header = matcher_header(path, header)
-    about = known or Stored(path, file_digest(path), config_of(path, header), header["provenance"])
+    about = known or stored_of(path, file_digest(path), header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
-        calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
+        posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         queries = state.pop(_QUERIES, None)
         matcher = _matcher(about.config, state)
     except BadInput as error:
         raise unusable(path, error) from error
     kept = None if queries is None else queries.numpy()
-    return Checkpoint(path, about.digest, about.config, about.provenance, matcher, split, calibration, kept)
+    return Checkpoint(
+        path, about.digest, about.config, about.provenance, about.gel_check, matcher, split, posterior, kept
+    )
 
 
 def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
     matcher = Matcher(config.matcher)
+    if any(name.startswith(_GEL_HEAD) for name in state):
+        matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
     load_weights(matcher, state)
     return matcher.eval()
 
@@ -205,7 +230,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def _model_card(name: str, header: Mapping[str, Any]) -> str:
     matcher, provenance = header["config"]["matcher"], header["provenance"]
-    calibration, split = header["calibration"], header["split"]
+    posterior, gel_check, split = header["posterior"], header["gel_check"], header["split"]
     lines = [
         f"# {name}",
         "",
@@ -222,9 +247,13 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
         )
     for key, value in provenance["metrics"].items():
         lines.append(f"* {key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"* {key}: {value}")
-    if calibration:
+    if posterior:
         lines.append(
-            f"* Probabilities: calibrated on {calibration['positives']} true and {calibration['negatives']} false "
-            f"validation pairs, expected calibration error {calibration['ece_after']:.3f} on the same pairs"
+            f"* Probabilities: fitted on {posterior['tests']} sets of validation touches; "
+            f"slope {posterior['slope']:.3f}, offset {posterior['offset']:.3f}, "
+            f"dependence of grasps {posterior['dependence']:.3f}"
         )
+    if gel_check:
+        shares = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["shares"].items()]
+        lines.append(f"* Check of gel images, on validation objects: {', '.join(shares)}")
     return "\n".join(lines) + "\n"

@@ -34,9 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING)
     with noticed_interrupts() as interrupts:
         try:
-            COMMANDS[arguments.command](arguments)
+            code = COMMANDS[arguments.command](arguments)
             sys.stdout.flush()
-            return 0
+            return code or 0
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
@@ -204,13 +204,14 @@ def run_build_index(arguments: argparse.Namespace) -> None:
         raise RetrievalError(f"the index is written, but {count} object(s) have no photo that can be read; see above")
 
 
-def run_query(arguments: argparse.Namespace) -> None:
-    """`retrieve query`."""
+def run_query(arguments: argparse.Namespace) -> int:
+    """`retrieve query`; its exit code says the verdict."""
     from retrieval import defaults
 
     path, why = defaults.find_index(arguments.index)
     if arguments.index is None:
         say(f"index: {path} ({why})")
+    from retrieval.answer import EXIT_CODES, in_words
     from retrieval.search import Searcher
 
     searcher = Searcher.open(path, model=arguments.model, verify=not arguments.no_verify)
@@ -219,6 +220,7 @@ def run_query(arguments: argparse.Namespace) -> None:
         background=arguments.background,
         top=arguments.top,
         candidates=arguments.candidates,
+        none_prior=arguments.none_prior,
     )
     if arguments.html:
         from retrieval.report.query import query_html
@@ -229,12 +231,12 @@ def run_query(arguments: argparse.Namespace) -> None:
     say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
     if arguments.json:
         print_json(result.to_dict())
-        return
-    from retrieval.report.terminal import print_table
+    else:
+        from retrieval.report.terminal import print_table
 
-    print_table(result)
-    if result.verdict == "no match":
-        say("no photo is above the reject threshold: the object may not be in the catalogue")
+        print_table(result)
+    say(in_words(result))
+    return EXIT_CODES[result.verdict]
 
 
 def run_export(arguments: argparse.Namespace) -> None:
@@ -311,7 +313,7 @@ def run_frontier(arguments: argparse.Namespace) -> None:
         raise RetrievalError(f"{document['failed']} of {len(document['cases'])} hard cases do not hold; see the page")
 
 
-COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "demo": run_demo,
     "collect": run_collect,
     "import": run_import,

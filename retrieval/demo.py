@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from retrieval import cli
+from retrieval.answer import EXIT_CODES, MATCH
 from retrieval.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput, RetrievalError
 
@@ -77,19 +78,23 @@ def _split(grasps: Sequence[Grasp], catalogue: Path) -> dict[str, list[Grasp]]:
 
 
 def _first_places(index: Path, queries: dict[str, list[Grasp]]) -> str:
-    """How often the true object comes first, and among the first five."""
+    """How often the true object comes first, and among the first five; and what the verdicts were worth."""
     from retrieval.search import Searcher
 
-    searcher, places = Searcher.open(index), []
-    for name, grasps in queries.items():
-        names = [match.object_id for match in searcher.query([grasp.touches for grasp in grasps], top=10**6).results]
-        places.append(names.index(name))
-    count, gallery = len(places), len(names)
-    first, five = sum(place == 0 for place in places), sum(place < 5 for place in places)
+    with Searcher.open(index) as searcher:
+        gallery = searcher.objects.count
+        touches = [[grasp.touches for grasp in grasps] for grasps in queries.values()]
+        answers = searcher.query_many(touches, top=gallery)
+    ranked = [[match.object_id for match in answer.results] for answer in answers]
+    # An object that was not felt is not found.
+    places = [names.index(name) if name in names else gallery for name, names in zip(queries, ranked, strict=True)]
+    matched = [place for place, answer in zip(places, answers, strict=True) if answer.verdict == MATCH]
+    count, first, five = len(places), places.count(0), sum(place < 5 for place in places)
     chances = count / gallery, count * min(5, gallery) / gallery
     return (
         f"the true object comes first for {first} of {count} (chance {chances[0]:.1f}), "
-        f"among the first five for {five} (chance {chances[1]:.1f})"
+        f"among the first five for {five} (chance {chances[1]:.1f}); "
+        f'the verdict is "{MATCH}" for {len(matched)}, of which {matched.count(0)} are right'
     )
 
 
@@ -97,7 +102,8 @@ def _retrieve(*arguments: object) -> None:
     """Say a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
     _say("$ retrieve " + " ".join(words))
-    if code := cli.main(words):
+    code = cli.main(words)
+    if code not in EXIT_CODES.values():  # "none of these" is an answer too
         failure = BadInput if code == BadInput.exit_code else RetrievalError
         raise failure(f"`retrieve {words[0]}` failed; what it said stands above")
 

@@ -9,7 +9,6 @@ blend of features, and a few thousand recorded photos stand for the crowd that a
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from retrieval.batches import FeatureSource
-from retrieval.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.batches import FeatureSource, recorded_features
+from retrieval.checkpoint import Checkpoint
 from retrieval.config import Config
-from retrieval.dataset import Grasp, PairBatch
+from retrieval.dataset import Grasp
 from retrieval.errors import Interrupted, NumericalError
 from retrieval.features import Features
 from retrieval.fusion import FusionHead, Matcher
@@ -160,16 +159,10 @@ def recorded_halves(
     """Halves (N, hidden) of the touches of grasps and of their photos; of `MOST` grasps, drawn by the seed, if there
     are more."""
     order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(seed))[:MOST]
-    parts = []
-    with Bar("encode for pruner", len(order), "grasps", quiet=quiet) as bar, torch.inference_mode():
-        for rows in torch.split(order, 64):
-            _require_going_on(stopped)
-            batch = _unpaired([grasps[row] for row in rows.tolist()])
-            touch, photo = source.eval_features(matcher, batch)
-            parts.append((matcher.touch_code(touch).half, matcher.photo_code(photo).half))
-            bar.advance(len(rows))
-    touches, photos = zip(*parts, strict=True)
-    return torch.cat(touches), torch.cat(photos)
+    drawn = [grasps[row] for row in order.tolist()]
+    touches, photos = recorded_features(matcher, source, drawn, what="pruner", quiet=quiet, stopped=stopped)
+    with torch.inference_mode():
+        return matcher.touch_code(touches).half, matcher.photo_code(torch.stack(list(photos.values()))).half
 
 
 @torch.inference_mode()
@@ -177,13 +170,6 @@ def feature_halves(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor
     """Halves (G, hidden) of the touches and of the photos of features."""
     touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
     return matcher.touch_code(touch).half, matcher.photo_code(photo).half
-
-
-def _unpaired(grasps: list[Grasp]) -> PairBatch:
-    """The images of grasps, each photo file once, and no pairs."""
-    none = np.zeros(0, dtype=np.int64)
-    photos = list(dict.fromkeys(grasp.photo for grasp in grasps))
-    return PairBatch(grasps, photos, none, none, np.zeros(0, dtype=np.float32), none, none)
 
 
 def kept_queries(touch_halves: Tensor, seed: int) -> NDArray[np.float16] | None:
@@ -221,7 +207,7 @@ def with_pruner(
 
 
 def add_pruner(
-    path: Path,
+    made: Checkpoint,
     config: Config,
     source: FeatureSource,
     train: Sequence[Grasp],
@@ -229,29 +215,15 @@ def add_pruner(
     *,
     quiet: bool = False,
     stopped: Callable[[], bool] = lambda: False,
-) -> None:
-    """Put the checkpoint at `path` in place again with a pruner; `validation` may be empty. Raises as `distil`."""
-    made = load_checkpoint(path)
-    made.matcher.to(source.device)
+) -> Checkpoint:
+    """The checkpoint `made` with the pruner that `config` asks for, taught by recorded grasps.
+
+    `validation` may be empty. Its matcher is taken over, and lies where `source` computes. Raises as `distil`.
+    """
     halves = [
         recorded_halves(made.matcher, source, grasps, config.training.seed, quiet=quiet, stopped=stopped)
         for grasps in (train, validation)
         if grasps
     ]
     with source.stepping():
-        made = with_pruner(made, config, *halves, quiet=quiet, stopped=stopped)
-    store(made, path)
-
-
-def store(made: Checkpoint, path: Path, float16: bool = False) -> None:
-    """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
-    save_checkpoint(
-        path,
-        made.matcher,
-        made.config,
-        split=made.split,
-        calibration=made.calibration,
-        provenance=made.provenance,
-        queries=made.queries,
-        float16=float16,
-    )
+        return with_pruner(made, config, *halves, quiet=quiet, stopped=stopped)

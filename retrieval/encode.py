@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from retrieval.encoded import TouchCodes
 from retrieval.errors import ConfigError
 from retrieval.fusion import Code, Matcher
 
@@ -165,10 +166,11 @@ class TorchEncoder:
         self._fast = for_inference(matcher, ["touch_tower"])
 
     @torch.inference_mode()
-    def encode(self, touches: Sequence[Sequence[Image]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Halves (B, hidden) and embeddings (B, embedding_dim) of touches."""
-        code = self._fast.touch_entry(self._fast.touch_features(touch_batch(touches)))
-        return code.half.numpy(), code.embedding.numpy()
+    def encode(self, touches: Sequence[Sequence[Image]]) -> TouchCodes:
+        """Of touches, each its fingers' images."""
+        features = self._fast.touch_features(touch_batch(touches))
+        code, readings = self._fast.touch_entry(features), self._fast.gel_readings(features)
+        return TouchCodes(code.half.numpy(), code.embedding.numpy(), None if readings is None else readings.numpy())
 
 
 @torch.inference_mode()

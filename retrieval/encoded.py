@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from retrieval.config import Config
 from retrieval.errors import BadInput, NumericalError
+from retrieval.gel_check import contact_level
 from retrieval.resize import RgbImage
 from retrieval.stopwatch import Stopwatch
 from retrieval.touches import AnyImage, AnyTouches, GivenImage, read_grasps
@@ -19,14 +20,25 @@ DECODERS = 2  # a touch has as many images
 Floats = NDArray[np.float32]
 
 
+class TouchCodes(NamedTuple):
+    """What is made of G grasps, float32: halves (G, hidden), embeddings (G, embedding_dim), and what tells whether they
+    are touches: readings (G, fingers, 2) of a model with a gel head, levels (G, fingers) of grey by which images differ
+    from their no-contact frames, where these were given (`retrieval.gel_check`)."""
+
+    halves: Floats
+    embeddings: Floats
+    readings: Floats | None = None
+    levels: Floats | None = None
+
+
 class Encoder(Protocol):
-    """What makes halves (G, hidden) and embeddings (G, embedding_dim) of touches: PyTorch or ONNX Runtime."""
+    """What makes codes of touches: PyTorch or ONNX Runtime."""
 
     @property
     def name(self) -> str:
         """How it is called in the answer."""
 
-    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
         """Encode grasps, each its fingers' images."""
 
 
@@ -41,8 +53,9 @@ class Encoded(NamedTuple):
 class TouchReader:
     """Reads and encodes the touches of a model."""
 
-    def __init__(self, config: Config, encoder: Encoder) -> None:
-        self.encoder, self.fingers = encoder, config.matcher.fingers
+    def __init__(self, config: Config, encoder: Encoder, compares: bool = False) -> None:
+        """compares: whether a touch is compared with its no-contact frame, to see if there is a contact."""
+        self.encoder, self.fingers, self._compares = encoder, config.matcher.fingers, compares
         self._preprocessing = config.preprocessing
 
     def grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
@@ -60,7 +73,7 @@ class TouchReader:
             )
         if background is None:
             return [None] * self.fingers
-        if policy == "none":
+        if policy == "none" and not self._compares:
             raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
         frames = read_grasps(background, self.fingers, what="background")
         if len(frames) != 1:
@@ -69,27 +82,39 @@ class TouchReader:
 
     def encode(
         self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None], clock: Stopwatch
-    ) -> Encoded:
+    ) -> TouchCodes:
         """Of all grasps, in batches, with stages "decode" and "encode" on the clock."""
-        parts = []
+        parts, levels = [], []
         for start in range(0, len(grasps), BATCH):
             with clock("decode"):
-                images = self._views(grasps[start : start + BATCH], references)
+                views = self._views(grasps[start : start + BATCH], references)
+                levels += [[level for _, level in grasp] for grasp in views]
             with clock("encode"):
-                parts.append(self.encoder.encode(images))
-        halves, embeddings = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return Encoded(_finite(embeddings, "embedding"), _finite(halves, "half"))
+                parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
+        halves, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
+        readings = [part.readings for part in parts if part.readings is not None]
+        return TouchCodes(
+            _finite(halves, "half"),
+            _finite(embeddings, "embedding"),
+            np.concatenate(readings) if readings else None,
+            None if references[0] is None else np.array(levels, dtype=np.float32),
+        )
 
     def _views(
         self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None]
-    ) -> list[list[RgbImage]]:
-        """The images of grasps as the tower sees them, made side by side; of several bad ones the first is told.
+    ) -> list[list[tuple[RgbImage, float]]]:
+        """The images of grasps as the tower sees them, and how far each is from its no-contact frame (0 without one);
+        made side by side; of several bad ones the first is told.
 
         The threads end with the call, for a fork of the process would not have them.
         """
 
-        def view(given: GivenImage, reference: RgbImage | None) -> RgbImage:
-            return self._preprocessing.touch(given.read(), reference)
+        subtracts = self._preprocessing.background != "none"
+
+        def view(given: GivenImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
+            image = given.read()
+            level = 0.0 if reference is None else contact_level(image, reference)
+            return self._preprocessing.touch(image, reference if subtracts else None), level
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [

@@ -80,6 +80,7 @@ def graph_of(checkpoint: Checkpoint) -> bytes:
 
     side = checkpoint.config.preprocessing.touch_px
     example = torch.zeros(1, checkpoint.config.matcher.fingers, side, side, 3)
+    outputs = ["half", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter by tracing is the old one; the new one needs one more package
         torch.onnx.export(
@@ -87,8 +88,8 @@ def graph_of(checkpoint: Checkpoint) -> bytes:
             (example,),
             str(Path(folder, "model.onnx")),
             input_names=["images"],
-            output_names=["half", "embedding"],
-            dynamic_axes={name: {0: "touches"} for name in ("images", "half", "embedding")},
+            output_names=outputs,
+            dynamic_axes={name: {0: "touches"} for name in ("images", *outputs)},
             opset_version=18,
             dynamo=False,
         )
@@ -98,7 +99,8 @@ def graph_of(checkpoint: Checkpoint) -> bytes:
 
 
 class _TouchEncoder(nn.Module):
-    """Images (B, fingers, H, W, 3) to halves and embeddings, without the checks of values, which ONNX has not."""
+    """Images (B, fingers, H, W, 3) to halves, embeddings and what the gel head reads, where the matcher has one;
+    without the checks of values, which ONNX has not."""
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
@@ -106,12 +108,13 @@ class _TouchEncoder(nn.Module):
         if isinstance(matcher.touch_norm, nn.BatchNorm1d):
             self.matcher.add_module("touch_norm", _Standardise(matcher.touch_norm))
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower = self.matcher.touch_tower
         pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
         features = tower._encode((pictures - tower.mean) / tower.std)
-        code = self.matcher.touch_entry(features.reshape(-1, self.matcher.config.fingers * tower.feature_count))
-        return code.half, code.embedding
+        features = features.reshape(-1, self.matcher.config.fingers * tower.feature_count)
+        code, readings = self.matcher.touch_entry(features), self.matcher.gel_readings(features)
+        return (code.half, code.embedding) if readings is None else (code.half, code.embedding, readings)
 
 
 class _Standardise(nn.Module):
@@ -130,7 +133,7 @@ def compare(checkpoint: Checkpoint, written: Path, path: Path) -> Exported:
     ours, theirs = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
-    (half, embedding), (other_half, other_embedding) = ours.encode([touch]), theirs.encode([touch])
+    (half, embedding, *_), (other_half, other_embedding, *_) = ours.encode([touch]), theirs.encode([touch])
     times = [(_ms(lambda: ours.encode([touch])), _ms(lambda: theirs.encode([touch]))) for _ in range(ROUNDS)]
     torch_ms, onnx_ms = (statistics.median(arm) for arm in zip(*times, strict=True))
     half_difference = float(np.abs(half - other_half).max() / np.abs(half).max())

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from retrieval.config import MatcherConfig
 from retrieval.errors import BadInput
+from retrieval.gel_head import GelHead
 from retrieval.judge import Judge
 from retrieval.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.pruner import Pruner
@@ -77,6 +78,7 @@ class Matcher(nn.Module):
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.pruner = Pruner(config.hidden, config.pruner_width, config.embedding_dim) if config.pruner_width else None
+        self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.judgement`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
         """Features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
@@ -109,6 +111,10 @@ class Matcher(nn.Module):
         """Half and embedding for candidate search of touch features."""
         code = self.touch_code(features)
         return code if self.pruner is None else Code(code.half, self.pruner.touch(code.half))
+
+    def gel_readings(self, features: Tensor) -> Tensor | None:
+        """(B, fingers, 2) what touch features say of each finger's image (`GelHead`); None without a check."""
+        return None if self.gel_head is None else self.gel_head(features.unflatten(1, (self.config.fingers, -1)))
 
     def photo_entry(self, features: Tensor) -> Code:
         """Half and embedding for candidate search of photo features: what an index keeps."""

@@ -18,6 +18,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.encoded import TouchCodes
 from retrieval.errors import CheckpointError
 from retrieval.resize import RgbImage
 from retrieval.stored import Stored
@@ -41,11 +42,11 @@ class OnnxEncoder:
         self._open = partial(_session, path, checkpoint, threads)
         self._process, self._session = os.getpid(), self._open()
 
-    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
-        """Halves (B, hidden) and embeddings (B, embedding_dim) of touches, each its fingers' images in 0..1."""
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
+        """Of touches, each its fingers' images in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
-        half, embedding = self._own_session().run(None, {"images": images})
-        return half, embedding
+        half, embedding, *readings = self._own_session().run(None, {"images": images})
+        return TouchCodes(half, embedding, readings[0] if readings else None)
 
     def _own_session(self) -> Any:
         """The session of this process; a fork opens its own."""

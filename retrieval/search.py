@@ -4,26 +4,30 @@ import copy
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.errors import UnsupportedFormat
 from indexes.generation import Generation
 from indexes.store import IndexStore
 from retrieval import defaults
-from retrieval.answer import Match, QueryResult
-from retrieval.calibration import Calibration
-from retrieval.encoded import Encoded, Encoder, TouchReader
+from retrieval.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
+from retrieval.encoded import Encoded, Encoder, TouchCodes, TouchReader
 from retrieval.errors import BadInput
+from retrieval.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.judge import Judge
-from retrieval.objects import Objects
+from retrieval.objects import JudgedObjects, Objects
 from retrieval.onnx_encoder import exported_beside
+from retrieval.posterior import NONE_PRIOR, Belief, Posterior, require_prior
 from retrieval.stopwatch import Stopwatch
 from retrieval.stored import Stored, fingerprint, read_judge, read_stored
 from retrieval.touches import AnyImage, AnyTouches, GivenImage
 
 DEFAULT_CANDIDATES = 1000
+COMPLETED = 20
+"""Objects, at least, of which every photo is judged."""
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
@@ -38,10 +42,10 @@ class Searcher:
     def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
         self.index, self.generation, self.checkpoint = index, generation, checkpoint
         self.encoder, self.judge = encoder, judge
-        self.reader = TouchReader(checkpoint.config, encoder)
-        self.calibration: Calibration | None = None
-        if "calibration" in generation.documents:
-            self.calibration = Calibration.from_dict(generation.documents["calibration"])
+        self.gel_check = checkpoint.gel_check
+        compares = self.gel_check is not None and self.gel_check.level_above is not None
+        self.reader = TouchReader(checkpoint.config, encoder, compares)
+        self.posterior = _posterior_of(index, generation)
         self.catalogue = Path(generation.manifest.about["catalogue"])
         self.objects = Objects(generation)
         self._closed = False
@@ -83,22 +87,25 @@ class Searcher:
         background: Sequence[AnyImage] | None = None,
         top: int = 10,
         candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
     ) -> QueryResult:
-        """Rank the catalogue's objects for one object felt in one or more grasps.
+        """Which of the catalogue's objects was felt in one or more grasps, or none of them?
 
         touches: one grasp, which is a list with an image for each finger in their order, or a list of several such
         grasps; for a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a
         Pillow image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like
         any other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
-        background: the fingers' no-contact frames, for a model that subtracts them and for no other. top: objects to
-        return. candidates: photos per grasp that the full classifier judges, `top` at least, by default as many as the
-        index was found to need; with no fewer than there are photos, or a model without trained embeddings, it judges
-        all of them and no candidate stage runs. Several grasps count as independent given the object: their logits add.
-        Raises BadInput, ImageError or NumericalError.
+        background: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
+        them what a contact is. top: objects to return. candidates: photos per grasp that the full classifier judges,
+        `top` at least, by default as many as the index was found to need; with no fewer than there are photos, or a
+        model without trained embeddings, it judges all of them and no candidate stage runs. none_prior: probability,
+        before anything is felt, that the catalogue lacks the object. Match logits of several grasps add; what the sum
+        is worth, and how objects and "none of these" get their probabilities, stands in `retrieval.posterior`. Only
+        grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
         """
         held = self._held()
         limit = held._limit(top, candidates)
-        return held._answers([held.reader.grasps(touches)], background, top, limit)[0]
+        return held._answers([held.reader.grasps(touches)], background, top, limit, none_prior)[0]
 
     def query_many(
         self,
@@ -107,6 +114,7 @@ class Searcher:
         background: Sequence[AnyImage] | None = None,
         top: int = 10,
         candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
         """Answer for several objects in the hand, each given as `query` takes it, in their order.
 
@@ -116,7 +124,7 @@ class Searcher:
         held = self._held()
         limit = held._limit(top, candidates)
         asked = [held.reader.grasps(touches, of=f"object {number}, ") for number, touches in enumerate(objects, 1)]
-        return held._answers(asked, background, top, limit) if asked else []
+        return held._answers(asked, background, top, limit, none_prior) if asked else []
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
         """The unit embeddings (G, embedding_dim) and halves (G, hidden) of G grasps, given as `query` takes them.
@@ -127,7 +135,8 @@ class Searcher:
         """
         held = self._held()
         grasps, references = held.reader.grasps(touches), held.reader.references(background)
-        return held.reader.encode(grasps, references, Stopwatch())
+        codes = held.reader.encode(grasps, references, Stopwatch())
+        return Encoded(codes.embeddings, codes.halves)
 
     @property
     def default_candidates(self) -> int:
@@ -157,65 +166,132 @@ class Searcher:
         background: Sequence[AnyImage] | None,
         top: int,
         limit: int,
+        none_prior: float,
     ) -> list[QueryResult]:
+        require_prior(none_prior)
         clock = Stopwatch()
         references = self.reader.references(background)
-        every = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
+        codes = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
         ends = np.cumsum([len(grasps) for grasps in asked])[:-1]
-        halves, embeddings = np.split(every.halves, ends), np.split(every.embeddings, ends)
+        shown = np.split(np.array(self._shown(codes)), ends)
+        felt = [_felt(own) for own in shown]
+        halves, embeddings = np.split(codes.halves, ends), np.split(codes.embeddings, ends)
         with clock("candidates"):
-            rows = [self._candidates(own, limit) for own in embeddings]
+            rows = [self._candidates(own[used], limit) for own, used in zip(embeddings, felt, strict=True)]
         with clock("rerank"):
-            logits = [self._judged(own, found) for own, found in zip(halves, rows, strict=True)]
-            ranked = [self.objects.best(self._rows(found), own, top) for own, found in zip(logits, rows, strict=True)]
+            judged = [
+                self._judged(own[used], found, top, none_prior)
+                for own, used, found in zip(halves, felt, rows, strict=True)
+            ]
         timing_ms = clock.finished(len(asked))
         return [
-            self._answer(grasps, self._about(len(own)), timing_ms, best)
-            for grasps, own, best in zip(asked, logits, ranked, strict=True)
+            self._answer(grasps, own.tolist(), timing_ms, found, top, none_prior)
+            for grasps, own, found in zip(asked, shown, judged, strict=True)
         ]
 
-    def _candidates(self, embeddings: Floats, k: int) -> Rows | None:
-        """Rows to judge, the union over grasps; None for all, where the stage would leave nothing out."""
+    def _shown(self, codes: TouchCodes) -> list[str]:
+        """What each grasp shows, as far as the model has a check."""
+        if self.gel_check is None or codes.readings is None:
+            return [CONTACT] * len(codes.halves)
+        return self.gel_check.judge(codes.readings, codes.levels)
+
+    def _candidates(self, embeddings: Floats, k: int) -> Rows:
+        """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
+        if not len(embeddings):
+            return np.zeros(0, dtype=np.int64)
         if not self.checkpoint.config.has_embeddings or k >= self.generation.count:
-            return None
+            return np.arange(self.generation.count)
         found = [rows for rows, _ in self.generation.search(embeddings, k)]
         return np.unique(np.concatenate(found))
 
-    def _judged(self, halves: Floats, rows: Rows | None) -> Floats:
-        """Match logits of the rows, summed over grasps."""
-        logits = self.judge.logits(halves, self.generation.arrays["halves"], rows)
-        return self.objects.equal_for_equals(self._rows(rows), logits)
+    def _judged(self, halves: Floats, rows: Rows, top: int, none_prior: float) -> "_Judged | None":
+        """Objects by their judged photos, and what is believed of them; None where nothing was felt.
 
-    def _rows(self, rows: Rows | None) -> Rows:
-        return np.arange(self.generation.count) if rows is None else rows
+        Candidates are some photos of an object: of the best objects the others are judged as well.
+        """
+        if not len(halves):
+            return None
+        meaning, logits = self.posterior or Posterior(), self._logits(halves, rows)
+        objects = self.objects.judged(rows, logits, meaning, len(halves))
+        best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
+        if len(rest := self.objects.rest_of(best, rows)):
+            rows = np.concatenate([rows, rest])
+            logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
+            objects = self.objects.judged(rows, logits, meaning, len(halves))
+        if self.posterior is None:
+            return _Judged(len(rows), len(halves), objects, None)
+        unjudged = self.objects.count - len(objects.numbers)
+        sample = self._sample_logits(halves, objects) if unjudged else np.zeros(0)
+        belief = self.posterior.believe(
+            objects.logits, len(halves), none_prior=none_prior, unjudged=unjudged, sample=sample
+        )
+        return _Judged(len(rows), len(halves), objects, belief)
+
+    def _logits(self, halves: Floats, rows: Rows) -> Floats:
+        """Match logits of the rows, summed over grasps."""
+        every = len(rows) == self.generation.count
+        logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
+        return self.objects.equal_for_equals(rows, logits)
+
+    def _sample_logits(self, halves: Floats, judged: JudgedObjects) -> NDArray[np.float64]:
+        """Logits of a sample of the objects without a judged photo; where the sample holds none of them, they are taken
+        to be like the least of the judged ones, which candidates are not expected to be."""
+        rows = self.objects.sample_without(judged.numbers)
+        if not len(rows):
+            return np.array([judged.logits.min()])
+        meaning = self.posterior or Posterior()
+        return self.objects.judged(rows, self._logits(halves, rows), meaning, len(halves)).logits
 
     def _answer(
         self,
         grasps: Sequence[Sequence[GivenImage]],
-        about: dict[str, Any],
+        shown: list[str],
         timing_ms: dict[str, float],
-        best: Sequence[tuple[int, float]],
+        judged: "_Judged | None",
+        top: int,
+        none_prior: float,
     ) -> QueryResult:
-        results = [self._match(rank, row, logit, len(grasps)) for rank, (row, logit) in enumerate(best, start=1)]
+        belief = judged.belief if judged else None
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
-            index=about,
+            grasps=shown,
+            index=self._about(judged.photos if judged else 0),
             timing_ms=timing_ms,
-            verdict=self._verdict(results[0], len(grasps)),
-            results=results,
+            verdict=_verdict(shown, belief),
+            none_probability=belief.none if belief else None,
+            posterior=self._meaning(judged, none_prior) if judged else None,
+            results=self._ranking(judged, top) if judged else [],
         )
 
-    def _match(self, rank: int, row_number: int, logit: float, grasps: int) -> Match:
+    def _ranking(self, judged: "_Judged", top: int) -> list[Match]:
+        objects, belief = judged.objects, judged.belief
+        return [
+            self._match(
+                rank,
+                int(objects.rows[place]),
+                float(objects.logits[place]),
+                None if belief is None else float(belief.objects[place]),
+            )
+            for rank, place in enumerate(self.objects.best(objects, top), start=1)
+        ]
+
+    def _match(self, rank: int, row_number: int, logit: float, probability: float | None) -> Match:
         row = self.generation.rows[row_number]
-        probability = float(self.calibration.probability(logit, grasps)) if self.calibration else None
         path = self.catalogue.absolute() / row["path"]
         return Match(rank, row["object_id"], logit, probability, row["path"], row["metadata"], path)
 
-    def _verdict(self, best: Match, grasps: int) -> str:
-        if self.calibration is None:
-            return "uncalibrated"
-        log_odds = float(self.calibration.log_odds(best.logit, grasps))
-        return "match" if log_odds >= self.calibration.reject_log_odds else "no match"
+    def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
+        """The formula of the probabilities, with the numbers of this answer."""
+        if self.posterior is None or judged.belief is None:
+            return None
+        return {
+            **self.posterior.to_dict(),
+            "none_prior": none_prior,
+            "grasps": judged.grasps,
+            "objects": self.objects.count,
+            "judged_objects": len(judged.objects.numbers),
+            "unjudged_probability": judged.belief.unjudged,
+        }
 
     def _about(self, scored: int) -> dict[str, Any]:
         return {
@@ -230,6 +306,42 @@ class Searcher:
             "model": str(self.checkpoint.path),
             "trained_on": self.checkpoint.provenance.get("source", "unknown"),
         }
+
+
+def _posterior_of(index: Path, generation: Generation) -> Posterior | None:
+    """What the index keeps of its model's probabilities; None where the model was never calibrated."""
+    if "calibration" not in generation.documents:
+        return None
+    try:
+        return Posterior.from_dict(generation.documents["calibration"])
+    except BadInput as error:
+        raise UnsupportedFormat(
+            f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
+        ) from error
+
+
+class _Judged(NamedTuple):
+    """What was judged for one object in the hand: so many photos, by so many grasps."""
+
+    photos: int
+    grasps: int
+    objects: JudgedObjects
+    belief: Belief | None
+
+
+def _felt(shown: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Which grasps are judged: those with contact, and none where an image is no gel image."""
+    return np.asarray((shown == CONTACT) & (shown != NOT_A_GEL).all())
+
+
+def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
+    if NOT_A_GEL in shown:
+        return NOT_A_GEL
+    if CONTACT not in shown:
+        return NO_CONTACT
+    if belief is None:
+        return UNCALIBRATED
+    return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
 
 
 def _require(generation: Generation, stored: Stored) -> None:

@@ -11,22 +11,25 @@ from safetensors import SafetensorError, safe_open
 
 from retrieval.config import Config
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.gel_check import GelCheck
 from retrieval.judge import Judge
 
 FORMAT = 1
 HEADER = "touch_retrieval"
-_PARTS = ("config", "split", "calibration", "provenance")
+_PARTS = ("config", "split", "provenance")
 _JUDGE = ("head.second.weight", "head.second.bias", "head.out.weight", "head.out.bias")
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A checkpoint's file. digest: its SHA-256. provenance: step, seed, data digest, metrics and so on."""
+    """A checkpoint's file. digest: its SHA-256. provenance: step, seed, data digest, metrics and so on. gel_check:
+    thresholds for what its gel head reads; None without one."""
 
     path: Path
     digest: str
     config: Config
     provenance: dict[str, Any]
+    gel_check: GelCheck | None
 
 
 def fingerprint(checkpoint: Stored) -> dict[str, str]:
@@ -38,7 +41,16 @@ def read_stored(path: Path) -> Stored:
     """Read what a checkpoint says of itself. Its weights are neither read nor checked: whoever knows the digest that
     the file must have compares it. Raises CheckpointError."""
     header = matcher_header(path, read_header(path))
-    return Stored(path, file_digest(path), config_of(path, header), header["provenance"])
+    return stored_of(path, file_digest(path), header)
+
+
+def stored_of(path: Path, digest: str, header: dict[str, Any]) -> Stored:
+    """What a matcher's header says. Raises CheckpointError."""
+    try:
+        check = None if header.get("gel_check") is None else GelCheck.from_dict(header["gel_check"])
+    except BadInput as error:
+        raise unusable(path, error) from error
+    return Stored(path, digest, config_of(path, header), header["provenance"], check)
 
 
 def read_judge(path: Path) -> Judge:

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 from torch.autograd.graph import increment_version
 
 from retrieval import distributed
 from retrieval.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
-from retrieval.calibration import Calibration, fit_calibration, pair_accuracy, pair_auc
+from retrieval.calibration import fit_calibration, pair_accuracy, pair_auc
 from retrieval.check import require_fit
 from retrieval.checkpoint import (
     Checkpoint,
@@ -29,12 +27,12 @@ from retrieval.checkpoint import (
     read_tensors,
     require_writable,
     save_checkpoint,
+    store_checkpoint,
     write_tensors,
 )
 from retrieval.config import Config, TrainingConfig
 from retrieval.dataset import (
     Grasp,
-    PairBatch,
     PairSampler,
     Split,
     data_digest,
@@ -49,8 +47,9 @@ from retrieval.errors import CheckpointError, Interrupted, NumericalError
 from retrieval.features import Features, by_image
 from retrieval.fusion import Matcher
 from retrieval.interruption import interruption
-from retrieval.losses import contrastive_loss, listwise_loss, match_loss
+from retrieval.judgement import with_verdicts
 from retrieval.progress import Bar
+from retrieval.step import batch_loss, pair_logits, shuffle_fingers
 from retrieval.towers.weights import initialise_tower
 
 
@@ -123,6 +122,7 @@ class Trainer:
         self.device = default_device()
         torch.manual_seed(settings.seed)
         self.untaught = config.without_pruner()
+        self.has_images = known is None
         self.matcher = build_matcher(self.untaught).to(self.device)
         trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
@@ -175,23 +175,30 @@ class Trainer:
                     )
 
     def _finish(self, stop: threading.Event, quiet: bool) -> None:
-        """Add the pruner to the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
+        """Complete the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
         stopped = False
         if not distributed.rank():
             try:
-                self._add_pruner(stop, quiet)
+                self._complete(stop, quiet)
                 state_path(self.out).unlink(missing_ok=True)
             except Interrupted:
                 stopped = True
         if distributed.any_rank(stopped, self.device):  # and no rank leaves before the files are there
-            raise Interrupted(f"stopped before the pruner was taught; {self.out} is usable, --resume teaches it")
+            raise Interrupted(
+                f"stopped before the checkpoint was complete; {self.out} ranks photos, --resume adds the rest"
+            )
 
-    def _add_pruner(self, stop: threading.Event, quiet: bool) -> None:
-        if not self.config.matcher.pruner_width:
-            return
+    def _complete(self, stop: threading.Event, quiet: bool) -> None:
+        """Add to the best checkpoint what is fitted when all is learned: the pruner, the posterior, the gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
-        add_pruner(self.out, self.config, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        made = load_checkpoint(self.out)
+        made.matcher.to(self.device)
+        if self.config.matcher.pruner_width:
+            made = add_pruner(made, self.config, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        if self.has_images:
+            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        store_checkpoint(made, self.out)
 
     def _best_note(self) -> str:
         return "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
@@ -231,31 +238,28 @@ class Trainer:
 
     def _validate_and_save(self) -> None:
         distributed.average_buffers(self.matcher)
-        metrics, calibration = self.validate()
+        metrics = self.validate()
         better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
         self.best = max(self.best, metrics.get("validation_auc", -math.inf))
         if not distributed.rank():
             if better:
-                self._save_best(metrics, calibration)
-            if self.step < self.config.training.iterations or self.config.matcher.pruner_width:
-                self._save_state()
+                self._save_best(metrics)
+            self._save_state()
         distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
 
-    def validate(self) -> tuple[dict[str, float], Calibration | None]:
+    def validate(self) -> dict[str, float]:
         """Judge the fixed validation pairs; nothing where the split has no validation objects."""
         if self.validation is None:
-            return {}, None
+            return {}
         logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
         set_training_mode(self.matcher, self.config.training)
-        calibration = fit_calibration(logits, labels)
-        metrics = {
+        return {
             "validation_auc": pair_auc(logits, labels),
             "validation_pair_accuracy": pair_accuracy(logits, labels),
-            "validation_nll": calibration.nll_before,
+            "validation_nll": fit_calibration(logits, labels).nll_before,
         }
-        return metrics, calibration
 
-    def _save_best(self, metrics: dict[str, float], calibration: Calibration | None) -> None:
+    def _save_best(self, metrics: dict[str, float]) -> None:
         provenance = {
             "step": self.step,
             "source": self.source,
@@ -267,7 +271,6 @@ class Trainer:
             self.matcher,
             self.untaught,
             split=self.split,
-            calibration=calibration,
             provenance=provenance,
         )
 
@@ -348,48 +351,3 @@ def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
     for module in matcher.modules():
         if settings.freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
             module.eval()
-
-
-def batch_loss(
-    matcher: Matcher,
-    settings: TrainingConfig,
-    batch: PairBatch,
-    touch_features: Tensor,
-    photo_features: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Loss (scalar) and match logits (P,) of a batch from the features of its distinct touches and photos."""
-    device = touch_features.device
-    touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-    touch_index, photo_index = _on(device, batch.touch_index), _on(device, batch.photo_index)
-    logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
-    loss = match_loss(logits, _on(device, batch.labels))
-    objects = _on(device, batch.touch_objects), _on(device, batch.photo_objects)
-    if settings.contrastive_weight > 0:
-        apart = contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
-        loss = loss + settings.contrastive_weight * apart
-    if settings.listwise_weight > 0:
-        every = matcher.head(touch.half[:, None], photo.half[None])
-        loss = loss + settings.listwise_weight * listwise_loss(every, *objects)
-    return loss, logits
-
-
-def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
-    """Each touch's features (B, fingers * F) with its fingers in a random order, by PyTorch's seed on the CPU."""
-    each = touch_features.view(len(touch_features), fingers, -1)
-    order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
-    return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)
-
-
-def _on(device: torch.device, array: Any) -> Tensor:
-    return torch.from_numpy(array).to(device)
-
-
-@torch.inference_mode()
-def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> NDArray[np.float32]:
-    """Match logits (P,) of pairs, in evaluation mode, each image encoded once."""
-    matcher.eval()
-    touch_features, photo_features = source.eval_features(matcher, pairs)
-    with source.stepping():
-        touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-        logits = matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index])
-    return np.asarray(logits.cpu().numpy())

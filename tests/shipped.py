@@ -4,6 +4,9 @@
                                                          FOLDER/simulated-mobilenet.safetensors
     python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
                                                          recording and the features that `make` left in FOLDER
+    python -m tests.shipped verdicts FOLDER              fit the posterior and the gel check of the shipped checkpoint
+                                                         again, on its validation objects and as many training ones,
+                                                         collected into FOLDER/verdicts
     python -m tests.shipped score FOLDER                 collect other objects into FOLDER/recording, and evaluate the
                                                          shipped checkpoint on them: FOLDER/report
 
@@ -12,18 +15,23 @@ Simulated touches are no measure of what the method does on real sensors.
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
 
+import robot.collect
+import robot.rig
 from retrieval import cli, defaults, distil
-from retrieval.checkpoint import Checkpoint, load_checkpoint
+from retrieval.batches import FrozenFeatures
+from retrieval.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.config import load_config
 from retrieval.dataset import Grasp, Split, data_digest, load_grasps, recording_source
-from retrieval.encode import one_thread
-from retrieval.features import Features, encode_recording
+from retrieval.encode import default_device, one_thread
+from retrieval.features import Features, by_image, encode_recording
+from retrieval.judgement import with_verdicts
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
 from retrieval.train import build_matcher
@@ -33,6 +41,8 @@ SEED_TRAINED, SEED_SCORED = 10_000, 30_000
 RIG = Path(__file__).with_name("shipped_rig.toml")
 VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
+VERDICT_GRASPS = 4
+"""Of each object on which the posterior and the gel check are fitted."""
 DISTIL_STEPS = 1500
 """Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
 FITTED = 10
@@ -52,15 +62,18 @@ def main(argv: list[str] | None = None) -> int:
     pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
     pruner.add_argument("folder", type=Path)
     pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
+    verdicts = jobs.add_parser("verdicts", help="fit its posterior and its gel check again, and nothing else of it")
+    verdicts.add_argument("folder", type=Path)
     score = jobs.add_parser("score", help="judge it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, score):
+    for job in (make, verdicts, score):
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    return {"make": make_shipped, "distil": distil_shipped, "score": score_shipped}[arguments.job](arguments)
+    run = {"make": make_shipped, "distil": distil_shipped, "verdicts": judge_shipped, "score": score_shipped}
+    return run[arguments.job](arguments)
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
@@ -78,8 +91,38 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     made = trained_checkpoint(Setting(config, folder=arguments.folder, quiet=False), *parts)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
     made = dataclasses.replace(made, provenance=made.provenance | about)
-    store(taught(made, features, DISTIL_STEPS), arguments.folder / defaults.SHIPPED)
+    made = taught(made, features, DISTIL_STEPS)
+    store(judging(made, grasps, features), arguments.folder / defaults.SHIPPED)
     return 0
+
+
+def judge_shipped(arguments: argparse.Namespace) -> int:
+    """All weights stay; of the recording that `make` would collect only the objects that are looked at are made."""
+    shipped = load_checkpoint(defaults.shipped_model())
+    assert shipped.split is not None
+    recording = arguments.folder / "verdicts"
+    names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
+    robot.collect.collect(
+        functools.partial(robot.rig.load_rig, str(RIG), seed=SEED_TRAINED),
+        recording,
+        objects=names,
+        seed=SEED_TRAINED,
+        settings=robot.collect.CollectSettings(grasps=VERDICT_GRASPS),
+        jobs=arguments.jobs,
+    )
+    grasps = load_grasps(recording)
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED)
+    return 0
+
+
+def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
+    """A checkpoint with its posterior and its gel check."""
+    assert made.split is not None
+    device = default_device()
+    with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
+        parts = (made.split.select(grasps, part) for part in ("train", "validation"))
+        return with_verdicts(made, source, *parts)
 
 
 def distil_shipped(arguments: argparse.Namespace) -> int:
@@ -105,9 +148,8 @@ def taught(made: Checkpoint, features: Features, steps: int) -> Checkpoint:
 def store(made: Checkpoint, out: Path) -> None:
     """Write a checkpoint once more, as float16; where its first weights lay on this machine concerns nobody."""
     training = dataclasses.replace(made.config.training, init="imagenet")
-    distil.store(
-        dataclasses.replace(made, config=dataclasses.replace(made.config, training=training)), out, float16=True
-    )
+    made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
+    store_checkpoint(made, out, float16=True)
 
 
 def score_shipped(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,8 @@ from retrieval.batches import TrainedFeatures
 from retrieval.dataset import PairSampler, load_grasps
 from retrieval.fusion import Matcher
 from retrieval.losses import match_loss
-from retrieval.train import batch_loss, set_training_mode
+from retrieval.step import batch_loss
+from retrieval.train import set_training_mode
 from tests.conftest import TINY
 
 # The paper's loss and numbers, on small pictures.

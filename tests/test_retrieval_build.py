@@ -72,7 +72,7 @@ def changed_model(checkpoint, path):
     """A checkpoint with other weights."""
     with torch.no_grad():
         checkpoint.matcher.head.out.bias += 0.5
-    save_checkpoint(path, checkpoint.matcher, checkpoint.config, split=None, calibration=None, provenance=PROVENANCE)
+    save_checkpoint(path, checkpoint.matcher, checkpoint.config, split=None, provenance=PROVENANCE)
     return load_checkpoint(path)
 
 
@@ -426,7 +426,7 @@ def queried(checkpoint, tmp_path):
     matcher.load_state_dict(checkpoint.matcher.state_dict(), strict=False)
     halves = np.random.default_rng(3).normal(size=(30, config.matcher.hidden)).astype(np.float16)
     path = tmp_path / "queried.safetensors"
-    save_checkpoint(path, matcher, config, split=None, calibration=None, provenance=PROVENANCE, queries=halves)
+    save_checkpoint(path, matcher, config, split=None, provenance=PROVENANCE, queries=halves)
     return load_checkpoint(path)
 
 

@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
@@ -15,16 +16,27 @@ from safetensors.torch import save_file
 import indexes
 import retrieval
 import robot
-from retrieval.calibration import Calibration
-from retrieval.checkpoint import file_digest, load_checkpoint, read_tensors, save_checkpoint, write_tensors
+from retrieval.checkpoint import (
+    file_digest,
+    load_checkpoint,
+    read_tensors,
+    save_checkpoint,
+    store_checkpoint,
+    write_tensors,
+)
 from retrieval.dataset import Split
 from retrieval.errors import CheckpointError
 from retrieval.fusion import Matcher
+from retrieval.gel_check import GelCheck
+from retrieval.gel_head import GelHead
+from retrieval.posterior import Posterior
+from retrieval.stored import read_stored
 from retrieval.version import __version__
 from tests.conftest import TINY
 
 SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))
-CALIBRATION = Calibration(1.25, -0.5, 0.1, 40, 60, 0.7, 0.65, 0.125, 0.0625)
+POSTERIOR = Posterior(slope=1.25, offset=-0.5, dependence=0.375, tests=40)
+GEL_CHECK = GelCheck(foreign_above=1.5, contact_above=-2.0, level_above=None, shares={"touches_called_foreign": 0.0625})
 PROVENANCE = {
     "step": 4,
     "source": "a rig",
@@ -36,7 +48,9 @@ PROVENANCE = {
 def save(path, **changes):
     torch.manual_seed(0)
     matcher = Matcher(TINY.matcher)
-    given = {"split": SPLIT, "calibration": CALIBRATION, "provenance": PROVENANCE} | changes
+    if changes.get("gel_check"):
+        matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
+    given = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE} | changes
     save_checkpoint(path, matcher, TINY, **given)
     return matcher
 
@@ -71,7 +85,8 @@ def test_every_tensor_and_everything_said_comes_back(tmp_path):
         assert tensor.dtype == after[name].dtype
     assert loaded.config == TINY
     assert loaded.split == SPLIT
-    assert loaded.calibration == CALIBRATION
+    assert loaded.posterior == POSTERIOR
+    assert loaded.gel_check is None
     assert loaded.provenance == PROVENANCE
     assert loaded.path == tmp_path / "deep" / "er" / "m.safetensors"
 
@@ -92,17 +107,45 @@ def test_a_weight_that_float16_cannot_hold_is_refused_before_a_file_is_there(tmp
     matcher = Matcher(TINY.matcher)
     with torch.no_grad():
         next(matcher.parameters()).fill_(1e6)
-    given = {"split": SPLIT, "calibration": CALIBRATION, "provenance": PROVENANCE}
+    given = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE}
     with pytest.raises(CheckpointError, match="float16"):
         save_checkpoint(tmp_path / "m.safetensors", matcher, TINY, float16=True, **given)
     assert not (tmp_path / "m.safetensors").exists()
 
 
-def test_a_checkpoint_without_split_and_calibration_says_none(tmp_path):
-    save(tmp_path / "m.safetensors", split=None, calibration=None)
+def test_a_checkpoint_without_split_posterior_and_gel_check_says_none(tmp_path):
+    save(tmp_path / "m.safetensors", split=None, posterior=None)
     loaded = load_checkpoint(tmp_path / "m.safetensors")
     assert loaded.split is None
-    assert loaded.calibration is None
+    assert loaded.posterior is None
+    assert loaded.gel_check is None
+    assert loaded.matcher.gel_head is None
+
+
+def test_the_check_of_gel_images_comes_back_with_its_layer_and_is_known_without_the_weights(tmp_path):
+    path = tmp_path / "m.safetensors"
+    layer = save(path, gel_check=GEL_CHECK).gel_head.kinds
+    loaded = load_checkpoint(path)
+    assert torch.equal(loaded.matcher.gel_head.kinds.weight, layer.weight)
+    assert torch.equal(loaded.matcher.gel_head.kinds.bias, layer.bias)
+    assert loaded.gel_check == read_stored(path).gel_check == GEL_CHECK
+
+
+def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
+    """Its header has a calibration of pairs, which says nothing of a catalogue."""
+    state, header = read_tensors(saved)
+    older = {name: value for name, value in header.items() if name not in ("posterior", "gel_check")}
+    write_tensors(saved, state, older | {"calibration": {"slope": 1.0}})
+    loaded = load_checkpoint(saved)
+    assert (loaded.posterior, loaded.gel_check) == (None, None)
+    assert loaded.split == SPLIT
+
+
+def test_what_is_held_is_stored_as_it_was_read(tmp_path):
+    queries = np.ones((2, TINY.matcher.hidden), np.float16)
+    save(tmp_path / "a.safetensors", gel_check=GEL_CHECK, queries=queries)
+    store_checkpoint(load_checkpoint(tmp_path / "a.safetensors"), tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 def test_a_loaded_matcher_is_ready_for_use_and_gives_the_same_logits(saved):
@@ -168,16 +211,23 @@ def test_the_model_card_says_what_the_model_is(saved):
         "* Objects: 2 train, 2 validation, 2 test",
         "* validation auc: 0.9877",
         "* pairs: 12",
-        "* Probabilities: calibrated on 40 true and 60 false validation pairs, expected calibration error 0.062 on the "
-        "same pairs",
+        "* Probabilities: fitted on 40 sets of validation touches; slope 1.250, offset -0.500, dependence of grasps "
+        "0.375",
     ]
 
 
+def test_the_model_card_says_what_the_check_of_gel_images_refuses(tmp_path):
+    save(tmp_path / "m.safetensors", gel_check=GEL_CHECK)
+    last = (tmp_path / "m.md").read_text().splitlines()[-1]
+    assert last == "* Check of gel images, on validation objects: touches called foreign 0.062"
+
+
 def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
-    save(tmp_path / "m.safetensors", split=None, calibration=None, provenance=PROVENANCE | {"metrics": {}})
+    save(tmp_path / "m.safetensors", split=None, posterior=None, provenance=PROVENANCE | {"metrics": {}})
     card = (tmp_path / "m.md").read_text()
     assert "Objects" not in card
     assert "Probabilities" not in card
+    assert "Check of gel images" not in card
 
 
 def test_a_checkpoint_is_not_written_where_its_model_card_goes(tmp_path):
@@ -297,7 +347,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
         load_checkpoint(saved)
 
 
-@pytest.mark.parametrize("name", ["config", "split", "calibration", "provenance"])
+@pytest.mark.parametrize("name", ["config", "split", "provenance"])
 def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
     state, header = read_tensors(saved)
     write_tensors(saved, state, {key: value for key, value in header.items() if key != name})
@@ -313,7 +363,12 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
         ({"config": [1]}, "configuration must be tables"),
         ({"split": {"train": ["a"]}}, "a split must be"),
         ({"split": []}, "a split must be"),
-        ({"calibration": {"slope": 1.0}}, "calibration must hold exactly"),
+        ({"posterior": {"slope": 1.0}}, "a posterior must hold dependence, offset, slope, tests and the formula"),
+        ({"posterior": POSTERIOR.to_dict() | {"formula": "another"}}, "the formula of this version"),
+        ({"posterior": POSTERIOR.to_dict() | {"slope": None}}, "must hold finite numbers; slope is None"),
+        ({"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}}, "a dependence within 0 and 1; got 1.25 and 1.5"),
+        ({"gel_check": {"shares": {}}}, "a check of gel images must hold foreign_above, contact_above, level_above"),
+        ({"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}}, "must hold finite numbers; level_above is '1'"),
     ],
 )
 def test_a_header_of_another_version_is_refused_by_what_is_in_it(saved, entry, message):

@@ -24,20 +24,57 @@ def workplace(tmp_path, catalogue, touch, monkeypatch):
 
 
 def test_the_two_commands_work_exactly_as_written(workplace, capsys):
-    """With nothing trained before: the shipped model serves, and the output says so."""
+    """With nothing trained before: the shipped model serves, and the output says so.
+
+    Drawn pictures are nothing that it knows, and that is said as well, in words and by the exit code.
+    """
     assert main(["build-index", "catalog/"]) == 0
     said = capsys.readouterr()
     assert said.out == ""
     assert f"model: {defaults.shipped_model()} (shipped; trained on the simulated rig" in said.err
-    assert main(["query", "--gelsight", "a.png", "b.png"]) == 0
+    assert main(["query", "--gelsight", "a.png", "b.png"]) == 3
     said = capsys.readouterr()
     assert "Which object is in the hand?" in said.out
     assert "simulated rig" in said.err
+    assert said.err.splitlines()[-1].startswith("none of these: that the catalogue lacks the object has probability 0.")
+
+
+EVERY_OBJECT_IS_KNOWN = ("--none-prior", "0")
+"""What a query is given where its verdict is not the point; the fixture's model can tell nothing apart."""
+
+
+def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    query = ["query", "--gelsight", "a.png", "b.png"]
+    assert main([*query, "--none-prior", "0.999", "--json"]) == 3
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert document["verdict"] == "none of these"
+    assert document["none_probability"] > 0.99
+    assert len(document["results"]) == 8
+    assert said.err.splitlines()[-1].startswith("none of these: ")
+    assert main([*query, *EVERY_OBJECT_IS_KNOWN, "--json"]) == 0
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert (document["verdict"], document["none_probability"]) == ("match", 0.0)
+    best = document["results"][0]
+    last = f"match: {best['object_id']}, probability {best['probability']:.2f}; none of these: 0.00"
+    assert said.err.splitlines()[-1] == last
+
+
+@pytest.mark.parametrize("prior", ["1", "-0.1", "nan"])
+def test_a_prior_that_is_no_probability_below_1_is_wrong_use(prior, workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    capsys.readouterr()
+    assert main(["query", "--gelsight", "a.png", "b.png", f"--none-prior={prior}"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert f'the prior of "none of these" must be at least 0 and less than 1; got {float(prior)}' in said.err
 
 
 def test_an_index_built_elsewhere_is_found_again_from_where_it_was_built_only(workplace, model, capsys, monkeypatch):
     assert main(["build-index", "catalog/", "--model", str(model), "--out", "away/index"]) == 0
-    assert main(["query", "--gelsight", "a.png", "b.png"]) == 0
+    assert main(["query", "--gelsight", "a.png", "b.png", *EVERY_OBJECT_IS_KNOWN]) == 0
     assert f"index: {workplace / 'away/index'} (the last one built from this folder)" in capsys.readouterr().err
     monkeypatch.chdir(workplace / "away" / "index")
     assert main(["query", "--gelsight", "../../a.png", "../../b.png"]) == 2
@@ -67,9 +104,18 @@ def test_a_built_index_is_built_again_with_its_own_model(workplace, model, capsy
 def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model), "--json"])
     assert json.loads(capsys.readouterr().out)["photos"] == 24
-    assert main(["query", "--gelsight", "a.png", "b.png", "--gelsight", "a.png", "b.png", "--top", "3", "--json"]) == 0
+    query = ["query", "--gelsight", "a.png", "b.png", "--gelsight", "a.png", "b.png", "--top", "3", "--json"]
+    assert main([*query, *EVERY_OBJECT_IS_KNOWN]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert document["query"] == {"touches": [["a.png", "b.png"], ["a.png", "b.png"]]}
+    assert set(document) == {
+        *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
+    }
+    touches = [["a.png", "b.png"], ["a.png", "b.png"]]
+    assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
+    assert set(document["posterior"]) == {
+        *("formula", "slope", "offset", "dependence", "tests"),
+        *("none_prior", "grasps", "objects", "judged_objects", "unjudged_probability"),
+    }
     assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
     assert [match["rank"] for match in document["results"]] == [1, 2, 3]
     assert set(document["results"][0]) == {"rank", "object_id", "logit", "probability", "photo", "metadata"}
@@ -77,7 +123,7 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
 
 def test_html_is_written_beside_the_table(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model)])
-    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html"]) == 0
+    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html", *EVERY_OBJECT_IS_KNOWN]) == 0
     assert "data:image/jpeg;base64," in Path("out.html").read_text()
 
 
@@ -164,7 +210,7 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     assert "kept step 2" in capsys.readouterr().err
     assert main(["build-index", "catalog"]) == 0
     assert f"model: {workplace / 'm.safetensors'} (the last one trained in this folder)" in capsys.readouterr().err
-    assert main(["query", "--gelsight", "a.png", "b.png", "--json"]) == 0
+    assert main(["query", "--gelsight", "a.png", "b.png", "--json", *EVERY_OBJECT_IS_KNOWN]) == 0
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 
 
@@ -258,7 +304,7 @@ def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
 def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(workplace, model):
     """Python's print falls back to stdout where stderr is closed."""
     main(["build-index", "catalog/", "--model", str(model)])
-    query = f"{sys.executable} -m retrieval.cli query --gelsight a.png b.png --index index --json"
+    query = f"{sys.executable} -m retrieval.cli query --gelsight a.png b.png --index index --json --none-prior 0"
     done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
     assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)
     assert subprocess.run(f"{query} >&- 2>&-", shell=True, check=False).returncode == 0

@@ -131,6 +131,6 @@ def test_a_killed_build_leaves_the_old_or_the_new_index_whole(catalogue, model, 
 
 def objects_by_command_line(index, touch):
     """The objects that `retrieve query` ranks, in alphabetical order."""
-    query = command("query", "--gelsight", *touch, "--index", index, "--top", 100, "--json")
+    query = command("query", "--gelsight", *touch, "--index", index, "--top", 100, "--none-prior", 0, "--json")
     done = subprocess.run(query, capture_output=True, text=True, check=True)
     return sorted(match["object_id"] for match in json.loads(done.stdout)["results"])

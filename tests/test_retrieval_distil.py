@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from retrieval import distil
-from retrieval.checkpoint import Checkpoint, load_checkpoint
+from retrieval.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.config import Config, MatcherConfig, TrainingConfig
 from retrieval.dataset import load_grasps, make_split
 from retrieval.errors import Interrupted, NumericalError
@@ -193,7 +193,7 @@ def checkpoint(matcher, tmp_path):
         matcher=matcher,
         config=Config(UNTAUGHT),
         split=None,
-        calibration=None,
+        gel_check=None,
         provenance=about,
     )
 
@@ -206,7 +206,7 @@ def test_a_checkpoint_gets_a_pruner_queries_and_the_pruners_own_measure(checkpoi
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
     path = checkpoint.path
-    distil.store(distil.with_pruner(checkpoint, wanted(), halves, held_out, quiet=True), path)
+    store_checkpoint(distil.with_pruner(checkpoint, wanted(), halves, held_out, quiet=True), path)
     made = load_checkpoint(path)
     assert made.config == wanted()
     assert made.config.has_embeddings

@@ -16,10 +16,11 @@ from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.cli import main
 from retrieval.config import Config, MatcherConfig
-from retrieval.encode import TorchEncoder, encode_touches
+from retrieval.encode import TorchEncoder, encode_touches, touch_features
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
 from retrieval.export import export
 from retrieval.fusion import Matcher
+from retrieval.gel_head import GelHead
 from retrieval.images import Preprocessing
 from retrieval.onnx_encoder import OnnxEncoder, sealed, unsealed
 from retrieval.search import Searcher
@@ -60,15 +61,17 @@ def touches_of(count, fingers, px):
     return np.random.default_rng(3).random((count, fingers, px, px, 3), dtype=np.float32)
 
 
-def exported(path, config, seed=0):
+def exported(path, config, seed=0, *, gel_head=False):
     """A matcher with random weights, and its exported encoder."""
     torch.manual_seed(seed)
     matcher = Matcher(config.matcher)
+    if gel_head:
+        matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
     for module in matcher.modules():
         if isinstance(module, torch.nn.BatchNorm2d | torch.nn.BatchNorm1d):
             module.running_mean.uniform_(-0.1, 0.1)
             module.running_var.uniform_(0.5, 1.5)
-    save_checkpoint(path, matcher, config, split=None, calibration=None, provenance=PROVENANCE)
+    save_checkpoint(path, matcher, config, split=None, provenance=PROVENANCE)
     checkpoint = load_checkpoint(path)
     path.with_suffix(".onnx").write_bytes(sealed(exporting.graph_of(checkpoint)))
     return checkpoint.matcher, OnnxEncoder(path.with_suffix(".onnx"), checkpoint.digest)
@@ -88,7 +91,8 @@ def test_the_exported_encoder_gives_pytorchs_numbers_for_any_number_of_touches(t
     matcher, encoder = exported(tmp_path / "m.safetensors", config)
     for count in (1, 3):
         touches = touches_of(count, 2, 32)
-        code, (half, embedding) = encode_touches(matcher, touches), encoder.encode(touches)
+        code, (half, embedding, readings, levels) = encode_touches(matcher, touches), encoder.encode(touches)
+        assert readings is levels is None  # without a gel head, and without no-contact frames
         # float32 in another order; random weights are worse conditioned than trained ones.
         assert np.abs(half - code.half.numpy()).max() <= 1e-4 * float(code.half.abs().max())
         np.testing.assert_allclose(embedding, code.embedding.numpy(), atol=1e-4)
@@ -100,15 +104,31 @@ def test_a_matcher_of_another_make_is_exported_too(changes, tmp_path):
     config = Config(MatcherConfig(**settings | changes), preprocessing=Preprocessing(touch_px=32))
     matcher, encoder = exported(tmp_path / "m.safetensors", config)
     touches = touches_of(2, config.matcher.fingers, 32)
-    code, (half, embedding) = encode_touches(matcher, touches), encoder.encode(touches)
+    code, (half, embedding, *_) = encode_touches(matcher, touches), encoder.encode(touches)
     np.testing.assert_allclose(half, code.half.numpy(), atol=1e-5)
     np.testing.assert_allclose(embedding, code.embedding.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("fingers", [1, 2])
+def test_what_tells_gel_images_from_others_is_exported_too(fingers, tmp_path):
+    config = Config(
+        MatcherConfig(tower="small", tower_output="pooled", hidden=8, fingers=fingers),
+        preprocessing=Preprocessing(touch_px=32),
+    )
+    matcher, encoder = exported(tmp_path / "m.safetensors", config, gel_head=True)
+    for count in (1, 3):
+        touches = touches_of(count, fingers, 32)
+        with torch.inference_mode():
+            expected = matcher.gel_readings(touch_features(matcher, touches)).numpy()
+        assert expected.shape == (count, fingers, 2)
+        for ours in (encoder, TorchEncoder(matcher)):
+            np.testing.assert_allclose(ours.encode(touches).readings, expected, atol=1e-5)
 
 
 def test_the_encoder_in_pytorch_gives_what_encode_touches_gives(model):
     matcher = load_checkpoint(model).matcher
     touches = touches_of(2, 2, 32)
-    half, embedding = TorchEncoder(matcher).encode(touches)
+    half, embedding, *_ = TorchEncoder(matcher).encode(touches)
     code = encode_touches(matcher, touches)
     assert np.array_equal(half, code.half.numpy())
     assert np.array_equal(embedding, code.embedding.numpy())
@@ -129,7 +149,7 @@ def test_a_query_takes_the_export_that_lies_beside_the_model_and_ranks_the_same(
 
 def test_a_query_runs_with_torch_blocked_where_there_is_an_export(own, index, touch, onnx_wins, tmp_path):
     files = [str(path) for path in touch]
-    arguments = ["query", "--gelsight", *files, "--index", str(index), "--json"]
+    arguments = ["query", "--gelsight", *files, "--index", str(index), "--none-prior", "0", "--json"]
     code = f"import sys\nfrom retrieval.cli import main\nsys.exit(main({arguments!r}))"
     refused = run_blocked(code, ("torch",))
     assert refused.returncode == 1
@@ -145,7 +165,7 @@ def test_a_query_runs_with_torch_blocked_where_there_is_an_export(own, index, to
 def test_a_stale_export_is_not_used_and_a_warning_says_so(own, index, touch, onnx_wins, catalogue, tmp_path, caplog):
     export(load_checkpoint(own))
     checkpoint = load_checkpoint(own)
-    save_checkpoint(own, checkpoint.matcher, checkpoint.config, split=None, calibration=None, provenance=PROVENANCE)
+    save_checkpoint(own, checkpoint.matcher, checkpoint.config, split=None, provenance=PROVENANCE)
     build_index(catalogue, load_checkpoint(own), tmp_path / "index", quiet=True)
     assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
     assert "m.onnx is the export of another checkpoint" in caplog.text
@@ -197,9 +217,9 @@ def test_without_onnx_runtime_pytorch_serves(own, onnx_wins, monkeypatch):
 @pytest.mark.parametrize("part", ["half", "embedding"])
 def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, own, index, touch, monkeypatch):
     searcher = Searcher.open(index)
-    half, embedding = searcher.encoder.encode(touches_of(2, 2, 32))
-    (half if part == "half" else embedding)[1, 3] = np.nan
-    monkeypatch.setattr(searcher.encoder, "encode", lambda touches: (half, embedding))
+    codes = searcher.encoder.encode(touches_of(2, 2, 32))
+    (codes.halves if part == "half" else codes.embeddings)[1, 3] = np.nan
+    monkeypatch.setattr(searcher.encoder, "encode", lambda touches: codes)
     with pytest.raises(NumericalError, match=f"the {part} of touch 2 holds a NaN"):
         searcher.query([touch, touch])
 

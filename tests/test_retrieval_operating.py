@@ -24,7 +24,7 @@ def checkpoint_of(pruner_width=8, queries=TOUCHES):
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=pruner_width))
     halves = np.random.default_rng(1).normal(size=(queries, config.matcher.hidden)).astype(np.float16)
     matcher = Matcher(config.matcher).eval()
-    return Checkpoint(Path("m"), "0" * 64, config, {}, matcher=matcher, split=None, calibration=None, queries=halves)
+    return Checkpoint(Path("m"), "0" * 64, config, {}, gel_check=None, matcher=matcher, split=None, queries=halves)
 
 
 @pytest.fixture

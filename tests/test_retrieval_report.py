@@ -13,6 +13,7 @@ import pytest
 from retrieval.answer import Match, QueryResult
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
+from retrieval.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
 from retrieval.search import Searcher
@@ -22,12 +23,30 @@ SCRIPT = "<script>alert(1)</script>"
 ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
 
 
-def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match"):
+POSTERIOR = Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9).to_dict() | {
+    "none_prior": 0.5,
+    "grasps": 1,
+    "objects": 1,
+    "judged_objects": 1,
+    "unjudged_probability": 0.0,
+}
+
+
+def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match", none=0.2, posterior=POSTERIOR, grasps=None):
     """A result with these (object, logit, probability, photo, metadata)."""
     index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
     index |= {"catalogue": "catalog", "model": "m.safetensors", "trained_on": "nothing"}
     ranked = [Match(rank, *match, Path("catalog", match[3])) for rank, match in enumerate(matches, start=1)]
-    return QueryResult([list(touch) for touch in touches], index, {"decode": 1.0, "total": 2.0}, verdict, ranked)
+    return QueryResult(
+        touches=[list(touch) for touch in touches],
+        grasps=grasps or ["contact"] * len(touches),
+        index=index,
+        timing_ms={"decode": 1.0, "total": 2.0},
+        verdict=verdict,
+        none_probability=none,
+        posterior=posterior,
+        results=ranked,
+    )
 
 
 ONE = ("mug", 1.5, 0.8, "mug/1.jpg", {})
@@ -73,7 +92,16 @@ def test_the_page_names_rank_probability_logit_photo_and_metadata(answer):
         for words in (f"{match.rank}. {match.object_id}", f"{match.logit:+.2f}", match.photo, "shelf: B4"):
             assert words in text
     assert "2 grasps against 24 photos of 8 objects" in text
-    assert "The grasps are taken as independent: their logits add." in text
+    assert "several grasps of one object are known to be alike" in text
+
+
+def test_the_page_tells_the_formula_its_numbers_and_what_was_not_judged(tmp_path):
+    posterior = POSTERIOR | {"grasps": 2, "objects": 500, "judged_objects": 80, "unjudged_probability": 0.125}
+    text = Page(query_html(made_up(ONE, posterior=posterior), tmp_path)).text
+    assert POSTERIOR["formula"] in text
+    assert "slope 0.750, offset -1.250, dependence 0.500, grasps 2, none_prior 0.5, objects 500" in text
+    assert "420 of 500 objects, which share 12.5 %" in text
+    assert "add up to 1" in text
 
 
 @pytest.mark.parametrize("place", ["object", "photo", "key", "value", "touch"])
@@ -128,17 +156,47 @@ def test_a_probability_is_never_shown_as_certain(probability, words, tmp_path):
 
 
 def test_the_verdict_is_said(tmp_path):
-    assert "Most likely mug, probability 80.0 %." in Page(query_html(made_up(ONE), tmp_path)).text
-    rejected = Page(query_html(made_up(ONE, verdict="no match"), tmp_path))
-    assert "may not be in the catalogue" in rejected.text
+    accepted = Page(query_html(made_up(ONE), tmp_path))
+    assert "Most likely mug, probability 80.0 %; none of these: 20.0 %." in accepted.text
+    assert firsts(accepted)
+    rejected = Page(query_html(made_up(ONE, verdict="none of these", none=0.9), tmp_path))
+    assert "None of these, most likely: that the catalogue lacks the object has probability 90.0 %." in rejected.text
     assert "Most likely" not in rejected.text
-    assert not [tag for tag in rejected.all("div") if "first" in tag.get("class", "")]
+    assert "1. mug" in rejected.text
+    assert not firsts(rejected)
+
+
+def firsts(page):
+    """The cards that are marked as the answer."""
+    return [tag for tag in page.all("div") if "first" in tag.get("class", "").split()]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words"),
+    [
+        ("no contact", "No contact. The gels look untouched"),
+        ("not a gel image", "Not a gel image. What is marked below"),
+    ],
+)
+def test_where_nothing_was_ranked_the_page_says_why_marks_the_grasps_and_shows_no_photo(verdict, words, tmp_path):
+    touches = [["a.png", "b.png"], ["c.png", "d.png"]]
+    shown = [verdict, "contact" if verdict == "not a gel image" else verdict]
+    result = made_up(touches=touches, verdict=verdict, none=None, posterior=None, grasps=shown)
+    page = Page(query_html(result, tmp_path))
+    assert words in page.text
+    assert f"grasp 1: {verdict}, not judged" in page.text
+    assert ("grasp 2: " in page.text) == (verdict == "no contact")
+    assert "Most likely" not in page.text
+    assert "Photos" not in page.text
+    assert not firsts(page)
 
 
 def test_a_model_without_calibration_shows_no_probability(tmp_path):
-    page = Page(query_html(made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated"), tmp_path))
+    result = made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None)
+    page = Page(query_html(result, tmp_path))
     assert "Most likely mug." in page.text
     assert "never calibrated" in page.text
+    assert "none of these" not in page.text
     assert not [tag for tag in page.all("div") if tag.get("class") == "bar"]
 
 
@@ -161,6 +219,19 @@ def test_the_table_has_a_line_for_each_object(answer, stdout):
         line = next(line for line in out.splitlines() if match.photo in line)
         assert match.object_id in line
         assert f"{match.probability:.3f}" in line
+    assert f"{result.none_probability:.3f}" in next(line for line in out.splitlines() if "none of these" in line)
+
+
+def test_no_table_is_printed_where_nothing_was_ranked(capsys):
+    print_table(made_up(verdict="no contact", none=None, posterior=None, grasps=["no contact"]))
+    assert capsys.readouterr().out == ""
+
+
+def test_a_model_without_calibration_has_no_line_for_none_of_these(capsys):
+    print_table(made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None))
+    out = capsys.readouterr().out
+    assert "mug" in out
+    assert "none of these" not in out
 
 
 @pytest.mark.parametrize("name", ["[bold]mug[/bold]", "[/red]", ":smile:", "[link=x]y"])

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 import shutil
 from functools import cache
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.special import expit
 
 from indexes.errors import MismatchedIndex, NoIndex
 from indexes.generation import Generation
@@ -18,11 +18,15 @@ from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.encode import to_batch, touch_batch
 from retrieval.errors import BadInput, CheckpointError, ImageError
+from retrieval.objects import JudgedObjects
+from retrieval.posterior import Posterior
 from retrieval.search import Searcher
 from tests import synthetic
 
 HALF_STEP = 2**-11
 """Largest relative rounding of a float16 number."""
+STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
+"""Of a model that tells objects apart, which the fixture's, hastily trained, does not: its own slope is near 0."""
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +77,10 @@ def variant(model, path, **changes):
         part, name = key.split("__")
         config = dataclasses.replace(config, **{part: dataclasses.replace(getattr(config, part), **{name: value})})
     provenance = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
-    calibration = checkpoint.calibration
-    save_checkpoint(path, checkpoint.matcher, config, split=None, calibration=calibration, provenance=provenance)
+    posterior, check = checkpoint.posterior, checkpoint.gel_check
+    save_checkpoint(
+        path, checkpoint.matcher, config, split=None, provenance=provenance, posterior=posterior, gel_check=check
+    )
     return load_checkpoint(path)
 
 
@@ -93,18 +99,39 @@ def oracle(searcher, matcher, catalogue):
     return lambda touches: {name: sum(of_touch(touch)[name] for touch in touches) for name in photos}
 
 
-def best_by_object(logits):
-    """[(object, photo, logit)] by two plain loops, best first; ties by object, then by photo."""
-    best = {}
+def weight(posterior, grasps):
+    """What a sum of match logits over so many grasps is worth, by hand."""
+    return posterior.slope / (1 + posterior.dependence * (grasps - 1))
+
+
+def best_by_object(logits, posterior, grasps, photos=3):
+    """[(object, best photo, log mean exp of its photos' logits)] by plain loops, best first; ties by object.
+
+    photos: of each object; one that `logits` leaves out counts as no match at all.
+    """
+    by_object, worth = {}, weight(posterior, grasps)
     for photo in sorted(logits):
-        name = photo.split("/")[0]
-        if name not in best or logits[photo] > logits[best[name]]:
-            best[name] = photo
-    return sorted(((name, photo, logits[photo]) for name, photo in best.items()), key=lambda item: (-item[2], item[0]))
+        by_object.setdefault(photo.split("/")[0], []).append(photo)
+    found = []
+    for name, own in by_object.items():
+        mean = math.fsum(math.exp(worth * logits[photo]) for photo in own) / photos
+        found.append((name, max(own, key=lambda photo: logits[photo]), math.log(mean) / worth))
+    return sorted(found, key=lambda item: (-item[2], item[0]))
+
+
+@pytest.fixture(params=["the model's own", "steep"])
+def meaning(request, searcher, monkeypatch):
+    """The posterior by which the searcher judges."""
+    if request.param == "steep":
+        monkeypatch.setattr(searcher, "posterior", STEEP)
+    return searcher.posterior
 
 
 def half_tolerance(searcher, grasps):
-    """How far rounding the halves can move a logit: through |second| and |out|, as ReLU never enlarges a change."""
+    """How far rounding the halves can move a logit: through |second| and |out|, as ReLU never enlarges a change.
+
+    Neither does a log mean exp: an object's logit moves no further than its photos'.
+    """
     moved = np.abs(np.asarray(searcher.generation.arrays["halves"], np.float32)).max(axis=0) * HALF_STEP
     return grasps * float(np.abs(searcher.judge.out) @ (np.abs(searcher.judge.second) @ moved)) + 1e-5
 
@@ -113,26 +140,29 @@ def half_tolerance(searcher, grasps):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, searcher, grasps, oracle):
+def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, meaning, searcher, grasps, oracle):
     touches = grasps[:count]
-    expected = oracle(touches)
+    photos = oracle(touches)
     result = searcher.query(touches)
     tolerance = half_tolerance(searcher, count)
     assert tolerance < 0.01
-    for match in result.results:
-        assert match.logit == pytest.approx(expected[match.photo], abs=tolerance)
-    ours = [(match.object_id, match.photo) for match in result.results]
-    theirs = best_by_object(expected)
-    assert len(ours) == len(theirs) == 8
+    theirs = best_by_object(photos, meaning, count)
+    logits = {name: logit for name, _, logit in theirs}
+    best = {name: photo for name, photo, _ in theirs}
+    assert len(result.results) == len(theirs) == 8
     # Where logits differ by more than the rounding, the order is theirs; closer ones may change places.
-    for (name, photo), (_, _, logit) in zip(ours, theirs, strict=True):
-        assert photo.startswith(f"{name}/")
-        assert expected[photo] == pytest.approx(logit, abs=2 * tolerance)
+    for match, (_, _, logit) in zip(result.results, theirs, strict=True):
+        assert match.logit == pytest.approx(logits[match.object_id], abs=tolerance)
+        assert logits[match.object_id] == pytest.approx(logit, abs=2 * tolerance)
+        assert match.photo.startswith(f"{match.object_id}/")
+        assert photos[match.photo] == pytest.approx(photos[best[match.object_id]], abs=2 * tolerance)
 
 
-def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, matcher, grasps, oracle, catalogue, monkeypatch):
+def test_with_exact_halves_the_order_is_exactly_the_oracles(
+    meaning, searcher, matcher, grasps, oracle, catalogue, monkeypatch
+):
     """The rounding taken away, what is left is ranking: no tie, no tolerance."""
-    expected = best_by_object(oracle(grasps[:1]))
+    expected = best_by_object(oracle(grasps[:1]), meaning, 1)
     logits = np.array([logit for _, _, logit in expected])
     assert np.diff(-logits).min() > 1e-6  # the drawn pictures give no near ties
     checkpoint, rows = searcher.checkpoint, searcher.generation.rows
@@ -146,27 +176,24 @@ def test_with_exact_halves_the_order_is_exactly_the_oracles(searcher, matcher, g
     np.testing.assert_allclose([match.logit for match in result.results], logits, atol=1e-5)
 
 
-def test_several_grasps_add_their_logits(searcher, grasps):
-    """On one photo an object, the sum over grasps is the sum of the single answers."""
-    generation = searcher.generation
-    rows = np.array(
-        [generation.row_number(f"{name}/1.jpg") for name in sorted({r["object_id"] for r in generation.rows})]
-    )
-    single = [scores(searcher, [grasp], rows) for grasp in grasps]
-    np.testing.assert_allclose(scores(searcher, grasps, rows), np.sum(single, axis=0), atol=1e-6)
+@pytest.mark.parametrize("posterior", [None, STEEP])
+def test_several_grasps_add_their_logits(posterior, catalogue, model, grasps, tmp_path, monkeypatch):
+    """Of an object with one photo, the sum over grasps is the sum of the single answers, whatever it is worth."""
+    for path in sorted(catalogue.rglob("1.jpg")):
+        (tmp_path / "catalog" / path.parent.name).mkdir(parents=True)
+        shutil.copy(path, tmp_path / "catalog" / path.parent.name)
+    build_index(tmp_path / "catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
+    searcher = Searcher.open(tmp_path / "index")
+    monkeypatch.setattr(searcher, "posterior", posterior)
+    single = [logits_by_object(searcher.query([grasp])) for grasp in grasps]
+    np.testing.assert_allclose(logits_by_object(searcher.query(grasps)), np.sum(single, axis=0), atol=1e-6)
     assert np.ptp(single, axis=0).max() > 1e-4  # the grasps are told apart at all
 
 
-def scores(searcher, touches, rows):
-    found = {match.photo: match.logit for match in only(searcher, rows).query(touches).results}
-    return [found[searcher.generation.rows[row]["path"]] for row in rows]
-
-
-def only(searcher, rows):
-    """A searcher that judges these rows and no others."""
-    limited = copy.copy(searcher)
-    limited._candidates = lambda embeddings, k: rows
-    return limited
+def logits_by_object(result):
+    """Logits of all 8 objects, in the order of their names."""
+    assert len(result.results) == 8
+    return [match.logit for match in sorted(result.results, key=lambda match: match.object_id)]
 
 
 def test_the_order_of_the_grasps_does_not_matter(searcher, grasps):
@@ -266,20 +293,29 @@ def test_the_classifier_judges_at_least_as_many_photos_as_objects_are_wanted(sea
     assert searches == [5]
 
 
+@pytest.mark.parametrize(("candidates", "completed"), [(5, 1), (2, 1), (2, 20)])
 @torch.inference_mode()
-def test_the_candidates_are_the_nearest_photos_of_each_grasp(searcher, matcher, grasps, oracle):
-    """Two plain loops: the 5 best inner products of each grasp, then the full network on their union."""
+def test_the_candidates_are_the_nearest_photos_of_each_grasp(
+    candidates, completed, meaning, searcher, matcher, grasps, oracle, monkeypatch
+):
+    """Plain loops: the best inner products of each grasp, the full network on their union, and on the other photos of
+    the objects that come first by these."""
+    monkeypatch.setattr("retrieval.search.COMPLETED", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, near = checkpoint.config.preprocessing.load_touch, set()
     for grasp in grasps:
         touch = matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
         products = generation.embeddings[generation.slots] @ matcher.touch_entry(touch).embedding[0].numpy()
-        near |= {generation.rows[row]["path"] for row in np.argsort(-products)[:5]}
+        near |= {generation.rows[row]["path"] for row in np.argsort(-products)[:candidates]}
     logits = oracle(grasps)
-    expected = best_by_object({photo: logits[photo] for photo in near})
-    result = searcher.query(grasps, candidates=5, top=5)
-    assert result.index["scored"] == len(near) < 24
-    assert [match.object_id for match in result.results] == [name for name, _, _ in expected][:5]
+    first = best_by_object({photo: logits[photo] for photo in near}, meaning, 3)
+    whole = {name for name, _, _ in first[: max(2, completed)]}
+    judged = {photo: logit for photo, logit in logits.items() if photo in near or photo.split("/")[0] in whole}
+    expected = best_by_object(judged, meaning, 3)
+    result = searcher.query(grasps, candidates=candidates, top=2)
+    assert result.index["scored"] == len(judged) < 24
+    assert result.posterior["judged_objects"] == len(expected) < 8
+    assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected[:2]]
 
 
 def test_a_model_without_trained_embeddings_never_runs_a_candidate_stage(catalogue, model, touch, tmp_path, searches):
@@ -293,47 +329,73 @@ def test_a_model_without_trained_embeddings_never_runs_a_candidate_stage(catalog
 # Probability and verdict -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("none_prior", [0.5, 0.2, 0.0])
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_probability_is_the_calibrated_logit_and_follows_its_order(count, searcher, grasps):
-    results = searcher.query(grasps[:count]).results
-    fitted = searcher.calibration
-    for match in results:
-        expected = expit(fitted.slope * match.logit + count * fitted.intercept)
-        assert match.probability == pytest.approx(expected, abs=1e-12)
-    probabilities = [match.probability for match in results]
+def test_the_probability_is_the_objects_share_beside_none_of_these_and_follows_the_logits_order(
+    count, none_prior, meaning, searcher, grasps
+):
+    """Of 8 objects, each with the prior (1 - p) / 8: its likelihood ratio times the prior, over the sum of all."""
+    result = searcher.query(grasps[:count], none_prior=none_prior)
+    worth = weight(meaning, count)
+    terms = [(1 - none_prior) / 8 * math.exp(worth * match.logit + meaning.offset) for match in result.results]
+    total = none_prior + math.fsum(terms)
+    probabilities = [match.probability for match in result.results]
+    assert probabilities == pytest.approx([term / total for term in terms], abs=1e-12)
+    assert result.none_probability == pytest.approx(none_prior / total, abs=1e-12)
+    assert math.fsum([result.none_probability, *probabilities]) == pytest.approx(1, abs=1e-12)
     assert probabilities == sorted(probabilities, reverse=True)
 
 
-def test_objects_with_saturated_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
-    """float32 sigmoids of logits beyond 17 all equal 1: ranked by probability, they would be one tie."""
-    plain, head = searcher.query([touch]).results, searcher.judge
-    larger = dataclasses.replace(head, out=100 * head.out, out_bias=100 * head.out_bias + 100)
+def test_the_answer_says_by_what_numbers_its_probabilities_came_about(searcher, grasps, monkeypatch):
+    monkeypatch.setattr(searcher, "posterior", STEEP)
+    said = searcher.query(grasps, none_prior=0.25).to_dict()["posterior"]
+    assert said.pop("formula").startswith("P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset)")
+    numbers = {"slope": 2.0, "offset": -1.5, "dependence": 0.25, "tests": 1}
+    about = {"none_prior": 0.25, "grasps": 3, "objects": 8, "judged_objects": 8, "unjudged_probability": 0.0}
+    assert said == numbers | about
+
+
+def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
+    """float64 shares of logits that lie 745 behind all equal 0: ranked by probability, they would be one tie."""
+    head, halves = searcher.judge, searcher.encode(touch).halves
+    larger = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
     monkeypatch.setattr(searcher, "judge", larger)
-    large = searcher.query([touch]).results
-    naive = torch.sigmoid(torch.tensor([match.logit for match in large]))
-    assert len(set(naive.tolist())) == 1
-    assert [match.object_id for match in large] == [match.object_id for match in plain]
+    monkeypatch.setattr(searcher, "posterior", Posterior(slope=100.0))
+    result = searcher.query([touch])
+    assert [match.probability for match in result.results[-2:]] == [0.0, 0.0]
+    # With so large a slope an object's logit is its best photo's, less log 3 / 100 for each alike.
+    best, logits = {}, head.logits(halves, searcher.generation.arrays["halves"])
+    for row, logit in zip(searcher.generation.rows, logits, strict=True):
+        best[row["object_id"]] = max(float(logit), best.get(row["object_id"], -math.inf))
+    assert [match.object_id for match in result.results] == sorted(best, key=best.get, reverse=True)
 
 
-@pytest.mark.parametrize(("threshold", "verdict"), [(-1e9, "match"), (1e9, "no match")])
-def test_the_verdict_compares_the_best_with_the_reject_threshold(threshold, verdict, searcher, touch, monkeypatch):
-    fitted = dataclasses.replace(searcher.calibration, reject_log_odds=threshold)
-    monkeypatch.setattr(searcher, "calibration", fitted)
+@pytest.mark.parametrize(("offset", "verdict"), [(50.0, "match"), (-50.0, "none of these")])
+def test_the_verdict_compares_the_best_with_none_of_these(offset, verdict, searcher, touch, monkeypatch):
+    monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=offset))
     result = searcher.query([touch])
     assert result.verdict == verdict
     assert len(result.results) == 8  # the nearest are shown all the same
 
 
+def test_with_a_prior_of_0_the_object_is_always_one_of_these(searcher, touch, monkeypatch):
+    monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=-50.0))
+    result = searcher.query([touch], none_prior=0)
+    assert (result.verdict, result.none_probability) == ("match", 0.0)
+
+
 def test_a_model_that_was_never_calibrated_gives_no_probability(searcher, touch, monkeypatch):
-    monkeypatch.setattr(searcher, "calibration", None)
+    monkeypatch.setattr(searcher, "posterior", None)
     result = searcher.query([touch])
     assert result.verdict == "uncalibrated"
     assert {match.probability for match in result.results} == {None}
+    assert (result.none_probability, result.posterior) == (None, None)
 
 
 def test_the_document_says_what_was_asked_of_what_and_how_long_it_took(searcher, grasps, index):
     document = searcher.query(grasps).to_dict()
-    assert document["query"] == {"touches": [[str(path) for path in touch] for touch in grasps]}
+    touches = [[str(path) for path in touch] for touch in grasps]
+    assert document["query"] == {"touches": touches, "grasps": ["contact"] * 3}
     assert list(document["timing_ms"]) == ["decode", "encode", "candidates", "rerank", "total"]
     stages = list(document["timing_ms"].values())
     assert 0 < sum(stages[:-1]) <= stages[-1]
@@ -471,28 +533,66 @@ def test_a_model_trained_again_at_the_same_path_is_refused(moved, model):
 # The best of each object -----------------------------------------------------------------------------------------
 
 
-def by_two_loops(names, rows, logits, top):
-    """[(row, logit)] of the best photo of each object, ties by the object's name, then by row."""
-    best = {}
+def by_plain_loops(owners, rows, logits, worth):
+    """{object's number: (row of its best photo, log mean exp over all its photos)}; the first of equal photos."""
+    best, terms = {}, {}
     for row, logit in zip(rows.tolist(), logits.tolist(), strict=True):
-        if names[row] not in best or logit > best[names[row]][1]:
-            best[names[row]] = (row, logit)
-    ordered = sorted(best.items(), key=lambda item: (-item[1][1], item[0]))
-    return [pair for _, pair in ordered[:top]]
+        owner = owners[row]
+        terms.setdefault(owner, []).append(math.exp(worth * logit))
+        if owner not in best or logit > best[owner][1]:
+            best[owner] = (row, logit)
+    return {
+        owner: (row, math.log(math.fsum(terms[owner]) / owners.count(owner)) / worth)
+        for owner, (row, _) in best.items()
+    }
+
+
+def made_up_objects(searcher, rng):
+    """500 photos of 40 objects that are named in another order than they are numbered."""
+    names = [f"object-{number:02}" for number in rng.permutation(40)]
+    owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
+    made_up = copy.copy(searcher.objects)
+    made_up._rows = [{"object_id": names[owner]} for owner in owners]
+    made_up._of_row, made_up._photos = owners, np.bincount(owners)
+    return made_up, names
+
+
+@pytest.mark.parametrize("grasps", [1, 3])
+@pytest.mark.parametrize("levels", [1, 3, 10_000])
+def test_the_logit_and_the_best_photo_of_each_object_are_those_of_plain_loops(levels, grasps, searcher):
+    rng = np.random.default_rng(levels)
+    made_up, _ = made_up_objects(searcher, rng)
+    rows = np.sort(rng.choice(500, 300, replace=False))
+    logits = rng.integers(0, levels, 300).astype(np.float32) / levels
+    found = made_up.judged(rows, logits, STEEP, grasps)
+    expected = by_plain_loops(made_up._of_row.tolist(), rows, logits, weight(STEEP, grasps))
+    assert found.numbers.tolist() == sorted(expected)
+    assert found.rows.tolist() == [expected[number][0] for number in sorted(expected)]
+    np.testing.assert_allclose(found.logits, [expected[number][1] for number in sorted(expected)], atol=1e-9)
+
+
+@pytest.mark.parametrize("photos", [1, 2, 3, 7, 24, 29])
+def test_equal_photos_give_an_object_the_same_logit_however_many_it_has(photos, searcher):
+    """Their mean is any one of them; a rounding in the last bit would put the later of two names first."""
+    made_up = copy.copy(searcher.objects)
+    made_up._of_row = np.array([0] * photos + [1])
+    made_up._photos = np.bincount(made_up._of_row)
+    logits = np.full(photos + 1, 1.3, dtype=np.float32)
+    many, one = made_up.judged(np.arange(photos + 1), logits, Posterior(slope=0.9), 1).logits
+    assert many == one
 
 
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
 @pytest.mark.parametrize("top", [1, 2, 7, 40, 1000])
-def test_the_best_of_each_object_are_those_of_two_plain_loops(top, levels, searcher):
+def test_the_best_objects_are_those_of_a_plain_sort(top, levels, searcher):
+    """By logit, then by name."""
     rng = np.random.default_rng(top + levels)
-    names = [f"object-{number}" for number in rng.integers(0, 40, 500)]
-    made_up = copy.copy(searcher.objects)
-    made_up._rows = [{"object_id": name} for name in names]
-    seen = list(dict.fromkeys(names))
-    made_up._of_row = np.array([seen.index(name) for name in names])
-    rows = np.sort(rng.choice(500, 300, replace=False))
-    logits = rng.integers(0, levels, 300).astype(np.float32)
-    assert made_up.best(rows, logits, top) == by_two_loops(names, rows, logits, top)
+    made_up, names = made_up_objects(searcher, rng)
+    numbers = np.sort(rng.choice(40, 30, replace=False))
+    logits = rng.integers(0, levels, 30).astype(np.float64)
+    judged = JudgedObjects(numbers, logits, numbers)  # the photo of row n is one of object n
+    expected = sorted(range(30), key=lambda place: (-logits[place], names[numbers[place]]))
+    assert made_up.best(judged, top).tolist() == expected[:top]
 
 
 def test_photos_of_equal_bytes_get_the_logit_of_the_first_of_them_among_the_judged(searcher):

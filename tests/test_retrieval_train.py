@@ -16,16 +16,10 @@ from retrieval.checkpoint import load_checkpoint, read_tensors
 from retrieval.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.fusion import Matcher
+from retrieval.judgement import with_verdicts
 from retrieval.losses import match_loss
-from retrieval.train import (
-    Trainer,
-    batch_loss,
-    build_matcher,
-    set_training_mode,
-    shuffle_fingers,
-    state_path,
-    train,
-)
+from retrieval.step import batch_loss, shuffle_fingers
+from retrieval.train import Trainer, build_matcher, set_training_mode, state_path, train
 from tests.conftest import TINY
 from tests.waiting import running, until
 
@@ -137,7 +131,7 @@ def test_a_pruner_changes_nothing_else_that_training_makes(recording, tmp_path):
     assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"pruner"}
 
 
-def power_cut(*_):
+def power_cut(*_, **__):
     raise RuntimeError("power cut")
 
 
@@ -179,11 +173,57 @@ def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_on
         return taught(*given)
 
     monkeypatch.setattr("retrieval.distil.order_loss", interrupted)
-    with pytest.raises(Interrupted, match=r"before the pruner was taught; .* is usable, --resume teaches it"):
+    with pytest.raises(
+        Interrupted, match=r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
+    ):
         train(recording, out, PRUNED, quiet=True)
-    assert load_checkpoint(out).config == TINY_UNTAUGHT
+    left = load_checkpoint(out)
+    assert left.config == TINY_UNTAUGHT
+    assert left.posterior is None
     monkeypatch.undo()
-    assert train(recording, out, PRUNED, resume=True, quiet=True).config == PRUNED
+    made = train(recording, out, PRUNED, resume=True, quiet=True)
+    assert made.config == PRUNED
+    assert made.posterior is not None
+
+
+def test_ctrl_c_while_the_posterior_is_fitted_leaves_a_checkpoint_that_resuming_completes(
+    recording, tmp_path, monkeypatch
+):
+    whole, broken = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    train(recording, whole, TINY, quiet=True)
+    with monkeypatch.context() as interrupting:
+        interrupting.setattr("retrieval.train.with_verdicts", interrupted_before(with_verdicts))
+        with pytest.raises(Interrupted, match=r"before the checkpoint was complete; .* ranks photos"):
+            train(recording, broken, TINY, quiet=True)
+    assert load_checkpoint(broken).posterior is None
+    assert state_path(broken).exists()
+    assert train(recording, broken, TINY, resume=True, quiet=True).posterior is not None
+    assert whole.read_bytes() == broken.read_bytes()
+    assert not state_path(broken).exists()
+
+
+def interrupted_before(function):
+    """The same function, which is called with a Ctrl-C under way."""
+
+    def interrupted(*given, **named):
+        os.kill(os.getpid(), signal.SIGINT)
+        return function(*given, **named)
+
+    return interrupted
+
+
+def test_a_power_cut_while_the_posterior_is_fitted_changes_no_bit(recording, tmp_path, monkeypatch):
+    trainer_for(recording, tmp_path / "a.safetensors").run(quiet=True)
+    broken = trainer_for(recording, tmp_path / "b.safetensors")
+    with monkeypatch.context() as cut:
+        cut.setattr("retrieval.train.with_verdicts", power_cut)
+        with pytest.raises(RuntimeError, match="power cut"):
+            broken.run(quiet=True)
+    resumed = trainer_for(recording, broken.out)
+    resumed.resume()
+    assert resumed.step == TINY.training.iterations
+    resumed.run(quiet=True)
+    assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
 
 
 def stop_after(trainer, steps):
@@ -300,7 +340,8 @@ from retrieval import distributed
 from retrieval.batches import TrainedFeatures
 from retrieval.dataset import PairSampler, load_grasps
 from retrieval.losses import contrastive_loss
-from retrieval.train import batch_loss, build_matcher, set_training_mode
+from retrieval.step import batch_loss
+from retrieval.train import build_matcher, set_training_mode
 from tests.conftest import TINY
 
 torch.set_num_threads(1)

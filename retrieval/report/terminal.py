@@ -14,7 +14,9 @@ MEASURES = ("pair_accuracy", "guesses_k5", "guesses_k10", "map")
 
 
 def print_table(result: QueryResult) -> None:
-    """Print the ranking of a query."""
+    """Print the ranking of a query, with "none of these" at its end; nothing where there is no ranking."""
+    if not result.results:
+        return
     rows = [
         (
             str(match.rank),
@@ -25,6 +27,8 @@ def print_table(result: QueryResult) -> None:
         )
         for match in result.results
     ]
+    if result.none_probability is not None:
+        rows.append(("-", "none of these", f"{result.none_probability:.3f}", "", ""))
     header = ("rank", "object", "probability", "logit", "photo")
     print_columns("Which object is in the hand?", header, rows, words=(1, 4))
 

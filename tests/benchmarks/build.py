@@ -32,7 +32,7 @@ def measure(config: Config, photos: int | None = None, photo_px: int = 512, repe
         catalogue = _write_catalogue(folder / "catalog", number, photo_px)
         provenance = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
         model, matcher = folder / "random.safetensors", matcher_of(config)
-        save_checkpoint(model, matcher, config, split=None, calibration=None, provenance=provenance)
+        save_checkpoint(model, matcher, config, split=None, provenance=provenance)
         checkpoint, fresh = load_checkpoint(model), count()
         images = [config.preprocessing.load_photo(path) for path in sorted(catalogue.rglob("*.jpg"))]
 

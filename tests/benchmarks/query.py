@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 
 from indexes.store import IndexStore
-from retrieval.calibration import Calibration
 from retrieval.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.config import Config
 from retrieval.defaults import shipped_model
@@ -21,6 +20,7 @@ from retrieval.encoded import Encoder
 from retrieval.export import graph_of
 from retrieval.fusion import Matcher
 from retrieval.onnx_encoder import OnnxEncoder, sealed
+from retrieval.posterior import Posterior
 from retrieval.search import Searcher
 from retrieval.stored import fingerprint, read_judge
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
@@ -107,7 +107,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
     """The matcher as a file, read again."""
     about = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
     path = folder / "model.safetensors"
-    save_checkpoint(path, matcher, config, split=None, calibration=None, provenance=about)
+    save_checkpoint(path, matcher, config, split=None, provenance=about)
     return load_checkpoint(path)
 
 
@@ -125,7 +125,7 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
         ],
         embeddings,
         {"halves": halves},
-        {"calibration": Calibration(1.0, 0.0, 0.0, 10, 10, 0.5, 0.5, 0.1, 0.1).to_dict()},
+        {"calibration": Posterior().to_dict()},
         fingerprint=fingerprint(checkpoint),
         about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},
     )

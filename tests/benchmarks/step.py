@@ -18,7 +18,8 @@ from torch import Tensor
 from retrieval.config import Config
 from retrieval.dataset import PairBatch
 from retrieval.encode import to_batch, touch_batch
-from retrieval.train import batch_loss, set_training_mode
+from retrieval.step import batch_loss
+from retrieval.train import set_training_mode
 from tests.benchmarks.common import Line, as_text, duration, in_turns, matcher_of, random_images
 
 Index = np.ndarray

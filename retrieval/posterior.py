@@ -1,0 +1,289 @@
+"""P(object | touches, catalogue), with "none of these" among the hypotheses: the one formula of every probability.
+
+    w = slope / (1 + dependence * (grasps - 1))        what a sum of match logits over so many grasps is worth
+    l(o) = 1 / w * log mean exp(w * z)                 logit of object o: over the summed match logits z of its photos
+    P(o)    proportional to  (1 - p) / O * exp(w * l(o) + offset)
+    P(none) proportional to  p
+
+O is the number of objects in the catalogue and p the prior probability that the object in the hand is none of them;
+the others are taken as alike. `w * l(o) + offset` is the log of a likelihood ratio: how much likelier these touches
+are of object o than of one that the catalogue lacks. A photo is one view of its object, each as likely, so their
+likelihoods are averaged; an object with one photo has just its match logit.
+
+slope, offset and dependence have the greatest likelihood of "which object was it, or none" over catalogues of
+validation objects, drawn with the true object and without. Grasps of one object are alike: n of them, correlated by
+`dependence` (0: independent, their logits add; 1: more grasps tell nothing new), weigh as n / (1 + dependence (n - 1))
+independent ones (the design effect of cluster sampling; Kish 1965, section 5.4).
+
+Objects that were not judged keep their share of the probability, estimated from a sample of them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from retrieval.errors import BadInput, NumericalError
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+NONE_PRIOR = 0.5
+"""That the catalogue lacks the object, where a user says nothing: as likely as not."""
+SLOPE_BOUNDS = (0.01, 100.0)
+FORMULA = (
+    "P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset), P(none of these) ~ none_prior, "
+    "w = slope / (1 + dependence * (grasps - 1)), logit = log mean exp(w * z) / w over the photos of o, "
+    "z = match logits summed over grasps"
+)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of one object in the hand; `none`, `objects` and `unjudged` add up to 1.
+
+    none: that it is none of the catalogue's. objects (J,): that it is each of the judged ones, in the order given.
+    unjudged: that it is one of those that were not judged.
+    """
+
+    none: float
+    objects: Floats
+    unjudged: float
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The formula's numbers, and how many catalogues they were fitted on."""
+
+    slope: float = 1.0
+    offset: float = 0.0
+    dependence: float = 1.0
+    tests: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if type(value) not in (int, float) or not math.isfinite(value):
+                raise BadInput(f"a posterior must hold finite numbers; {name} is {value!r}")
+        if not SLOPE_BOUNDS[0] <= self.slope <= SLOPE_BOUNDS[1] or not 0 <= self.dependence <= 1:
+            raise BadInput(
+                f"a posterior must have a slope within {SLOPE_BOUNDS} and a dependence within 0 and 1; got "
+                f"{self.slope} and {self.dependence}"
+            )
+
+    def weight(self, grasps: int) -> float:
+        """What the sum of the match logits of so many grasps is multiplied by."""
+        return self.slope / (1 + self.dependence * (grasps - 1))
+
+    def object_logits(self, logits: ArrayLike, owner: Numbers, counts: Numbers, grasps: int = 1) -> Floats:
+        """Logit (J,) of each object from the summed match logits (N,) of its judged photos.
+
+        owner (N,): number of each photo's object, 0 to J - 1, each with a photo at least. counts (J,): photos that
+        each object has; those that were not judged count as no match at all, which the search for candidates makes
+        nearly true. Raises NumericalError for a logit that is not finite.
+        """
+        weight = self.weight(grasps)
+        scaled = weight * _finite(logits, "every logit")
+        top = np.full(len(counts), -np.inf)
+        np.maximum.at(top, owner, scaled)
+        total = np.bincount(owner, np.exp(scaled - top[owner]), len(counts))
+        return np.asarray((top + np.log(total / counts)) / weight)  # equal photos: exactly log 1, however many
+
+    def believe(
+        self,
+        logits: ArrayLike,
+        grasps: int = 1,
+        *,
+        none_prior: float = NONE_PRIOR,
+        unjudged: int = 0,
+        sample: ArrayLike = (),
+    ) -> Belief:
+        """The posterior over judged objects, those not judged, and none.
+
+        logits (J,) of the judged objects, J >= 1 (`object_logits`). unjudged: how many objects were not judged.
+        sample (S,): logits of some of these, drawn at random; needed where there are any. Raises BadInput, and
+        NumericalError for a logit that is not finite.
+        """
+        judged, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
+        require_prior(none_prior)
+        if not len(judged) or unjudged < 0 or (unjudged and not len(drawn)):
+            raise BadInput(
+                "a posterior needs a judged object, and a sample where others were not judged; got "
+                f"{len(judged)} judged, {unjudged} not, and a sample of {len(drawn)}"
+            )
+        weight = self.weight(grasps)
+        each = math.log1p(-none_prior) - math.log(len(judged) + unjudged) + self.offset
+        others = each + math.log(unjudged) + _log_mean_exp(weight * drawn) if unjudged else -math.inf
+        none = math.log(none_prior) if none_prior else -math.inf
+        # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN.
+        terms = np.concatenate([[none, others], each + weight * judged])
+        shares = np.exp(terms - terms.max())
+        shares /= shares.sum()
+        return Belief(float(shares[0]), shares[2:], float(shares[1]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
+        return {"formula": FORMULA, **dataclasses.asdict(self)}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Posterior":
+        """Inverse of `to_dict`. Raises BadInput for anything else."""
+        names = {field.name for field in dataclasses.fields(cls)}
+        if not isinstance(data, Mapping) or set(data) != names | {"formula"} or data["formula"] != FORMULA:
+            raise BadInput(f"a posterior must hold {', '.join(sorted(names))} and the formula of this version")
+        return cls(**{name: data[name] for name in names})
+
+
+def require_prior(none_prior: float) -> None:
+    """Raises BadInput for what is no prior probability of "none of these"."""
+    if not 0 <= none_prior < 1:
+        raise BadInput(f'the prior of "none of these" must be at least 0 and less than 1; got {none_prior}')
+
+
+def _finite(values: ArrayLike, what: str) -> Floats:
+    array = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise NumericalError(f"{what} must be finite; got {array[~np.isfinite(array)][0]}")
+    return array
+
+
+def _log_mean_exp(values: Floats) -> float:
+    top = values.max()
+    return float(top + np.log(np.mean(np.exp(values - top))))
+
+
+# Fitting ---------------------------------------------------------------------------------------------------
+
+CATALOGUE_SIZES = (20, 1000)
+"""Objects of the catalogues that the numbers are fitted on; at most all but one of the validation objects."""
+_MOST_GRASPS, _SETS = 5, 4
+_SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Match logits (T, N) of touches with photos; whose they are (T,), (N,); own (T, N): photos that were taken in a
+    grasp of that very touch and are not shown to it."""
+
+    logits: NDArray[np.floating[Any]]
+    touch_owner: Numbers
+    photo_owner: Numbers
+    own: NDArray[np.bool_]
+
+
+def fit_posterior(judged: Judged, *, seed: int = 0) -> Posterior:
+    """Fit on single touches of validation objects and, where an object has more, on sets of up to 5 grasps of it.
+
+    With one grasp of each object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than
+    three objects, or where no touch has another photo of its object.
+    """
+    sets = [_sets(judged, grasps, seed) for grasps in range(1, _MOST_GRASPS + 1)]
+    return fit_questions([Questions.of(judged, rows, seed) for rows in sets if len(rows)])
+
+
+def _sets(judged: Judged, grasps: int, seed: int) -> Numbers:
+    """(S, grasps) touches of one object each, which leave that object a photo; of one grasp every touch."""
+    rng = np.random.default_rng([seed, grasps])
+    found = []
+    for name in np.unique(judged.touch_owner):
+        mine = np.flatnonzero(judged.touch_owner == name)
+        draws = mine[:, None] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(_SETS)]
+        photos = judged.photo_owner == name
+        found += [rows for rows in draws if len(rows) == grasps and (photos & ~judged.own[rows].any(0)).any()]
+    return np.array(found, dtype=np.int64).reshape(-1, grasps)
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """Which object was it, or none? Asked of catalogues with the true object and without it.
+
+    scores (T, N): summed match logits, photos sorted by object, -inf for one that is not shown; counts (T, O): photos
+    shown of each object; starts (O,): each object's first photo. catalogues: (T, K + 1) objects, the true one first;
+    the first K are a catalogue with it, the last K one without.
+    """
+
+    grasps: int
+    scores: Floats
+    counts: Numbers
+    starts: Numbers
+    catalogues: tuple[Numbers, ...]
+
+    @classmethod
+    def of(cls, judged: Judged, sets: Numbers, seed: int = 0) -> "Questions":
+        """Of sets of touches (S, G). Raises BadInput where there are none, or fewer than three objects."""
+        objects, owner = np.unique(judged.photo_owner, return_inverse=True)
+        if len(objects) < 3 or not len(sets):
+            raise BadInput(
+                "a posterior is fitted on three objects at least, and on touches that have another photo of theirs; "
+                f"got {len(objects)} objects and {len(sets)} such touches"
+            )
+        order = np.argsort(owner, kind="stable")
+        starts = np.searchsorted(owner[order], np.arange(len(objects)))
+        shown = ~np.asarray(judged.own[sets].any(axis=1))[:, order]
+        scores = np.where(shown, judged.logits[:, order].astype(np.float64)[sets].sum(1), -np.inf)
+        counts = np.add.reduceat(shown.astype(np.int64), starts, axis=1)
+        true = np.searchsorted(objects, judged.touch_owner[sets[:, 0]])
+        keys = np.random.default_rng([seed, 100 + sets.shape[1]]).random(counts.shape)
+        keys[np.arange(len(sets)), true] = -1
+        ranked = np.argsort(keys, axis=1)
+        sizes = sorted({min(size, len(objects) - 1) for size in CATALOGUE_SIZES})
+        return cls(sets.shape[1], scores, counts, starts, tuple(ranked[:, : size + 1] for size in sizes))
+
+    def log_ratios(self, posterior: Posterior) -> Floats:
+        """(T, O) logs of the likelihood ratios of the objects."""
+        scaled = posterior.weight(self.grasps) * self.scores
+        shown = np.maximum(self.counts, 1)  # an object without a photo stands in no catalogue
+        top = np.maximum.reduceat(scaled, self.starts, axis=1)
+        base = np.where(np.isfinite(top), top, 0.0)
+        owner = np.repeat(np.arange(len(self.starts)), np.diff(np.append(self.starts, scaled.shape[1])))
+        sums = np.add.reduceat(np.exp(scaled - base[:, owner]), self.starts, axis=1)
+        with np.errstate(divide="ignore"):
+            return np.asarray(base + np.log(sums) - np.log(shown) + posterior.offset)
+
+    def loss(self, posterior: Posterior, smooth: float) -> float:
+        """Mean over catalogues of the cross-entropy with the truth, at even odds of "none of these".
+
+        smooth: of the target, the share that is spread evenly over all hypotheses.
+        """
+        ratios, losses = self.log_ratios(posterior), []
+        for catalogue in self.catalogues:
+            chosen = np.take_along_axis(ratios, catalogue, 1) - math.log(catalogue.shape[1] - 1)
+            for part, truth in ((chosen[:, :-1], 1), (chosen[:, 1:], 0)):
+                logs = np.column_stack([np.zeros(len(part)), part])
+                logs = logs - np.logaddexp.reduce(logs, axis=1, keepdims=True)
+                losses.append(-((1 - smooth) * logs[:, truth] + smooth * logs.mean(1)).mean())
+        return float(np.mean(losses))
+
+
+def fit_questions(asked: Sequence[Questions]) -> Posterior:
+    """The likeliest posterior. Numbers of grasps count by their questions.
+
+    Targets are smoothed as Platt's are (1999, section 2.2), so that logits that never err have a finite optimum too,
+    and the slope stays within `SLOPE_BOUNDS`.
+    """
+    from scipy.optimize import minimize  # slow to import, and no query needs it
+
+    count = sum(len(part.scores) for part in asked)
+    several = any(part.grasps > 1 for part in asked)
+    finite = np.concatenate([part.scores[np.isfinite(part.scores)] / part.grasps for part in asked])
+    # Told from the middle of the logits, the offset does not hang on the slope, and the search finds both.
+    middle, unit = float(np.median(finite)), float(np.std(finite))
+    low, high = np.log(SLOPE_BOUNDS)
+    start = float(np.clip(-math.log(unit) if unit > 0 else 0.0, low, high))
+
+    def made(parameters: Floats) -> Posterior:
+        slope = float(np.clip(np.exp(parameters[0]), *SLOPE_BOUNDS))
+        dependence = float(parameters[2]) if several else 1.0
+        return Posterior(slope, float(parameters[1]) - slope * middle, dependence, count)
+
+    def loss(parameters: Floats) -> float:
+        posterior = made(parameters)
+        return sum(len(part.scores) * part.loss(posterior, 1 / (count + 2)) for part in asked) / count
+
+    bounds = [(low, high), (-1e6, 1e6), (0.0, 1.0)]
+    first = np.array([start, 0.0, 0.5])
+    simplex = np.vstack([first, first + np.diag([-0.5 if start > 0 else 0.5, 0.5, 0.25])])
+    found = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options={**_SEARCH, "initial_simplex": simplex})
+    return made(found.x)

@@ -1,0 +1,159 @@
+"""Is it a gel image, and is there a contact? Thresholds by hand, and what a fit on made-up features finds."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from retrieval.errors import BadInput
+from retrieval.foreign import DRAWN, draw_foreign
+from retrieval.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.judgement import Pictures, contact_threshold, fit_gel_check, fit_gel_head
+
+CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, shares={"touches_called_foreign": 0.0})
+
+
+def readings(*grasps):
+    """Readings (G, 2 fingers, 2) from ((foreign, contact), (foreign, contact)) of each."""
+    return np.array(grasps, dtype=np.float32)
+
+
+def test_one_finger_in_contact_is_a_contact_and_one_foreign_picture_is_none():
+    felt, untouched, foreign = (-3, 2), (-3, -2), (5, 2)
+    judged = CHECK.judge(
+        readings((felt, felt), (untouched, felt), (untouched, untouched), (felt, foreign), (foreign, untouched))
+    )
+    assert judged == [CONTACT, CONTACT, NO_CONTACT, NOT_A_GEL, NOT_A_GEL]
+
+
+def test_what_lies_at_a_threshold_is_a_gel_in_contact():
+    assert CHECK.judge(readings(((1.0, 0.5), (1.0, 0.5)))) == [CONTACT]
+
+
+def test_a_no_contact_frame_decides_over_what_the_features_say():
+    said_felt, said_untouched = ((-3, 2), (-3, 2)), ((-3, -2), (-3, -2))
+    levels = np.array([[0.9, 1.1], [0.8, 30.0]], dtype=np.float32)
+    assert CHECK.judge(readings(said_felt, said_untouched), levels) == [NO_CONTACT, CONTACT]
+
+
+def test_what_the_recording_could_not_teach_refuses_nothing():
+    blind = GelCheck(None, None, None, {})
+    assert blind.judge(readings(((9, -9), (9, -9)))) == [CONTACT]
+
+
+def test_the_level_is_the_largest_difference_of_block_means_in_grey_levels():
+    untouched = np.full((32, 32, 3), 0.5, dtype=np.float32)
+    touch = untouched.copy()
+    touch[4:6, 8:10, 1] += 20 / 255  # a whole block of 2 x 2
+    touch[20, 20, 0] -= 40 / 255  # a quarter of one
+    assert contact_level(touch, untouched) == pytest.approx(20, abs=1e-3)
+    assert contact_level(untouched, untouched) == 0
+    # The two files may have different sizes.
+    assert contact_level(touch, untouched[:16]) == pytest.approx(20, abs=1e-3)
+
+
+def test_contact_begins_above_untouched_gels_and_as_far_up_as_it_costs_few_touches():
+    untouched, touches = np.arange(201.0), np.arange(500.0, 601.0)
+    assert contact_threshold(untouched, touches) == pytest.approx(502)  # 2 % of the touches lie below
+    assert contact_threshold(untouched, np.arange(101.0)) == pytest.approx(199)  # .5 % of the untouched lie above
+
+
+def test_it_is_written_and_read_back():
+    assert GelCheck.from_dict(CHECK.to_dict()) == CHECK
+    assert GelCheck.from_dict(GelCheck(None, None, None, {}).to_dict()) == GelCheck(None, None, None, {})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"foreign_above": math.nan},
+        {"contact_above": "0"},
+        {"level_above": 1e300},
+        {"shares": []},
+        {"shares": {"a": math.inf}},
+        {"shares": {"a": None}},
+        {"more": 1},
+    ],
+)
+def test_forged_thresholds_are_refused(change):
+    with pytest.raises(BadInput, match="a check of gel images must hold"):
+        GelCheck.from_dict(CHECK.to_dict() | change)
+
+
+@given(st.recursive(st.none() | st.booleans() | st.floats() | st.text(), lambda inner: st.lists(inner)))
+def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
+    with pytest.raises(BadInput):
+        GelCheck.from_dict(data)
+
+
+# Foreign pictures ------------------------------------------------------------------------------------------
+
+
+def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_again():
+    photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
+    drawn = list(draw_foreign(21, 16, [photo], [gel], seed=3))
+    assert [name for name, _ in drawn[:7]] == [*DRAWN, "photo", "false colours"]
+    for _, picture in drawn:
+        assert picture.shape == (16, 16, 3)
+        assert picture.dtype == np.float32
+        assert (picture >= 0).all()
+        assert (picture <= 1).all()
+    again = list(draw_foreign(21, 16, [photo], [gel], seed=3))
+    assert all((one == other).all() for (_, one), (_, other) in zip(drawn, again, strict=True))
+    assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(DRAWN)
+
+
+@pytest.mark.parametrize(("count", "px"), [(0, 16), (5, 4)])
+def test_nothing_and_specks_are_not_drawn(count, px):
+    with pytest.raises(BadInput, match="count must be at least 1 and px at least 8"):
+        list(draw_foreign(count, px, [], []))
+
+
+# Fitting ---------------------------------------------------------------------------------------------------
+
+
+def pictures(seed, untouched=60):
+    """Features (8) around three far places: touches, untouched gels, foreign pictures, half of these in false colours
+    and lying among the touches."""
+    rng = np.random.default_rng(seed)
+
+    def around(place, *shape):
+        return torch.from_numpy(place + rng.normal(size=(*shape, 8))).float()
+
+    places = np.eye(8)[:3] * 9
+    foreign = torch.cat([around(places[2], 40), around(places[0], 40)])
+    plainly = np.repeat([True, False], 40)
+    return Pictures(around(places[0], 80, 2), around(places[1], untouched, 2), foreign, plainly)
+
+
+def test_kinds_that_lie_apart_are_told_apart_on_others_of_their_kind():
+    head = fit_gel_head(pictures(0))
+    check = fit_gel_check(head, pictures(1), levels=([0.5, 0.7, 0.9], [12.0, 30.0]))
+    assert check.shares["foreign_called_so"] == 1
+    assert check.shares["touches_called_foreign"] <= 0.02
+    assert check.shares["touches_called_untouched"] == 0.025  # 2 of 80, as many as may be lost
+    assert check.shares["untouched_called_touches"] == 0
+    assert check.level_above == pytest.approx(12.36)  # 2 % of the way from 12 to 30
+    with torch.inference_mode():
+        others = pictures(2)
+        assert check.judge(head(others.touch).numpy()).count(CONTACT) >= 78
+        assert check.judge(head(others.untouched).numpy()).count(NO_CONTACT) >= 58
+
+
+def test_where_nothing_was_recorded_before_a_contact_every_gel_counts_as_touched():
+    head = fit_gel_head(pictures(0, untouched=0))
+    check = fit_gel_check(head, pictures(1, untouched=0), levels=([], []))
+    assert (check.contact_above, check.level_above) == (None, None)
+    with torch.inference_mode():
+        assert set(check.judge(head(pictures(2).touch).numpy())) <= {CONTACT, NOT_A_GEL}
+    assert check.shares["foreign_called_so"] == 1
+
+
+def test_a_feature_that_never_varies_gives_no_infinite_weight():
+    lesson = pictures(0)
+    for part in (lesson.touch, lesson.untouched, lesson.foreign):
+        part[..., 7] = 3.0
+    assert bool(torch.isfinite(fit_gel_head(lesson).kinds.weight).all())

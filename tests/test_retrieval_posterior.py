@@ -1,0 +1,217 @@
+"""The posterior: probabilities by hand, the naive formulas that fail, and planted numbers that the fit finds again."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.posterior import SLOPE_BOUNDS, Judged, Posterior, fit_posterior
+
+ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
+
+
+def test_logits_of_nothing_leave_the_prior():
+    belief = ADDING.believe([0.0, 0.0], none_prior=0.5)
+    assert belief.none == pytest.approx(0.5)
+    assert belief.objects == pytest.approx([0.25, 0.25])
+    assert belief.unjudged == 0
+
+
+def test_probabilities_are_those_reckoned_by_hand():
+    # Weights: none 1/2; objects 1/4 * 3 and 1/4; together 3/2.
+    belief = ADDING.believe([math.log(3), 0.0], none_prior=0.5)
+    assert belief.none == pytest.approx(1 / 3)
+    assert belief.objects == pytest.approx([1 / 2, 1 / 6])
+    # A prior of 1/5: 1/5, 4/10 * 3 and 4/10; together 9/5.
+    belief = ADDING.believe([math.log(3), 0.0], none_prior=0.2)
+    assert (belief.none, *belief.objects) == pytest.approx((1 / 9, 6 / 9, 2 / 9))
+
+
+def test_what_was_not_judged_keeps_its_share():
+    # Four objects, two of them judged: 1/8 * 4 and 1/8; the two others like the sample, whose ratios 1 and 3 mean 2.
+    belief = ADDING.believe([math.log(4), 0.0], none_prior=0.5, unjudged=2, sample=[0.0, math.log(3)])
+    total = 4 / 8 + 4 / 8 + 1 / 8 + 2 * 2 / 8
+    assert belief.none == pytest.approx(0.5 / total)
+    assert belief.unjudged == pytest.approx(0.5 / total)
+    assert belief.objects == pytest.approx([0.5 / total, 0.125 / total])
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30),
+    st.floats(0, 0.99),
+    st.integers(1, 9),
+    st.lists(st.floats(-1e6, 1e6), max_size=5),
+)
+def test_all_that_may_be_adds_up_to_one_and_ranks_as_the_logits_do(logits, prior, grasps, sample):
+    posterior = Posterior(slope=0.7, offset=-0.3, dependence=0.6)
+    belief = posterior.believe(logits, grasps, none_prior=prior, unjudged=7 if sample else 0, sample=sample)
+    assert belief.none + belief.unjudged + belief.objects.sum() == pytest.approx(1)
+    order = np.argsort(logits)
+    assert (np.diff(belief.objects[order]) >= 0).all()
+
+
+def test_large_logits_are_right_where_the_obvious_formula_is_not_a_number():
+    logits = np.array([1000.0, 999.0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        naive = np.exp(logits) / (np.exp(logits).sum() + 1)
+    assert np.isnan(naive).all()
+    belief = ADDING.believe(logits, none_prior=0.5)
+    assert belief.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
+    assert ADDING.believe(-logits, none_prior=0.5).none == 1.0
+
+
+def test_grasps_that_are_alike_weigh_less_than_independent_ones():
+    alike, apart = Posterior(2.0, 0.0, dependence=1.0), Posterior(2.0, 0.0, dependence=0.0)
+    assert [alike.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 1.0, 0.5]  # the sum of four becomes their mean
+    assert [apart.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 2.0, 2.0]
+    assert Posterior(2.0, 0.0, dependence=0.5).weight(3) == 1.0
+
+
+def test_an_object_with_one_photo_has_its_match_logit():
+    logits = Posterior(0.37, 1.0, 0.4).object_logits([1.25, -3.5], np.array([0, 1]), np.array([1, 1]), grasps=3)
+    assert logits == pytest.approx([1.25, -3.5], abs=1e-12)
+
+
+def test_an_objects_logit_is_the_mean_of_its_photos_likelihoods():
+    posterior = Posterior(0.8, 0.3, 0.5)
+    scores, owner, counts = np.array([2.0, -1.0, 0.5, 3.0]), np.array([0, 1, 0, 1]), np.array([2, 3])
+    weight = 0.8 / 1.5
+    expected = [
+        math.log((math.exp(2 * weight) + math.exp(0.5 * weight)) / 2) / weight,
+        math.log((math.exp(-weight) + math.exp(3 * weight) + 0) / 3) / weight,  # its third photo was not judged
+    ]
+    assert posterior.object_logits(scores, owner, counts, grasps=2) == pytest.approx(expected)
+    # exp(900) is infinite in float64.
+    assert posterior.object_logits([900.0, 900.0], np.array([0, 0]), np.array([2])) == pytest.approx([900.0])
+
+
+def normal_logits(objects, touches, photos, apart, alike, seed=0):
+    """Log likelihood ratios of two normal distributions, d apart in units of their deviation: calibrated as they are.
+
+    alike: the share of the noise of a touch that all touches of its object have in common.
+    """
+    rng = np.random.default_rng(seed)
+    owner, photo_owner = np.repeat(np.arange(objects), touches), np.repeat(np.arange(objects), photos)
+    same = owner[:, None] == photo_owner
+    common = rng.normal(size=(objects, len(photo_owner)))[owner]
+    noise = math.sqrt(alike) * common + math.sqrt(1 - alike) * rng.normal(size=same.shape)
+    logits = apart * (noise + np.where(same, apart / 2, -apart / 2))
+    return Judged(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
+
+
+def changed(judged, scale, shift):
+    return Judged(scale * judged.logits + shift, judged.touch_owner, judged.photo_owner, judged.own)
+
+
+def test_the_fit_finds_planted_numbers_again():
+    true = normal_logits(300, 1, 1, apart=2.5, alike=0)
+    found = fit_posterior(changed(true, 4, 10))  # log ratio = logit / 4 - 10 / 4
+    assert found.slope == pytest.approx(1 / 4, rel=0.1)
+    for log_ratio in (-1.0, 0.0, 2.0):
+        assert found.slope * (4 * log_ratio + 10) + found.offset == pytest.approx(log_ratio, abs=0.3)
+    assert found.dependence == 1.0  # nothing is known of it
+
+
+def test_independent_grasps_are_found_to_be_so_and_equal_ones_too():
+    apart = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=0))
+    assert apart.dependence < 0.12
+    alike = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=1))
+    assert alike.dependence > 0.9
+    assert (apart.slope, alike.slope) == pytest.approx((1, 1), abs=0.15)
+
+
+@pytest.mark.parametrize(("touches", "unit", "shift"), [(2, 20, 0), (2, 0.05, 0), (1, 20, 1000), (1, 1, -300)])
+def test_the_unit_of_the_logits_makes_no_difference_and_for_one_grasp_neither_does_their_middle(touches, unit, shift):
+    judged = normal_logits(60, touches, 1, apart=2, alike=0.3)
+    plain, other = fit_posterior(judged), fit_posterior(changed(judged, unit, shift))
+    assert other.slope == pytest.approx(plain.slope / unit, rel=1e-2)
+    assert other.dependence == pytest.approx(plain.dependence, abs=0.02)
+    for logit in (-2.0, 0.0, 3.0):
+        ours, theirs = plain.believe([logit]).none, other.believe([unit * logit + shift]).none
+        assert ours == pytest.approx(theirs, abs=5e-3)
+
+
+def test_logits_that_never_err_have_a_finite_slope():
+    owner = np.arange(20)
+    judged = Judged(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
+    found = fit_posterior(judged)
+    assert SLOPE_BOUNDS[0] < found.slope < 3
+    assert 0.5 < found.believe([5.0] + [-5.0] * 18).objects[0] < 1
+
+
+def test_logits_that_say_nothing_leave_the_prior():
+    owner = np.arange(20)
+    for noise in (0.0, 1.0):
+        scores = noise * np.random.default_rng(0).normal(size=(20, 20))
+        found = fit_posterior(Judged(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
+        assert found.believe(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
+
+
+def test_a_photo_of_the_touchs_own_grasp_is_never_counted():
+    judged = normal_logits(30, 2, 2, apart=2, alike=0)
+    own = np.zeros_like(judged.own)
+    own[np.arange(60), np.arange(60)] = True
+    with_secret = np.where(own, 1e6, judged.logits)
+    hidden = Judged(with_secret, judged.touch_owner, judged.photo_owner, own)
+    plain = Judged(np.where(own, 0.0, judged.logits), judged.touch_owner, judged.photo_owner, own)
+    assert fit_posterior(hidden) == fit_posterior(plain)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_logit_that_is_no_number_is_refused(bad):
+    with pytest.raises(NumericalError, match="every logit must be finite"):
+        ADDING.believe([0.0, bad])
+
+
+@pytest.mark.parametrize("prior", [-0.1, 1.0, math.nan])
+def test_a_prior_that_is_none_is_refused(prior):
+    with pytest.raises(BadInput, match="must be at least 0 and less than 1"):
+        ADDING.believe([0.0], none_prior=prior)
+
+
+def test_without_a_sample_what_was_not_judged_cannot_be_estimated():
+    with pytest.raises(BadInput, match="a sample where others were not judged"):
+        ADDING.believe([0.0], unjudged=3)
+
+
+def test_two_objects_are_too_few_to_fit_on():
+    owner = np.array([0, 1])
+    with pytest.raises(BadInput, match="three objects at least"):
+        fit_posterior(Judged(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
+
+
+def test_it_is_written_and_read_back():
+    posterior = Posterior(0.9, -0.1, 0.7, tests=321)
+    assert Posterior.from_dict(posterior.to_dict()) == posterior
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"slope": math.nan},
+        {"slope": -1.0},
+        {"slope": "1"},
+        {"dependence": 2.0},
+        {"offset": None},
+        {"tests": True},
+        {"formula": "another"},
+        {"more": 1},
+    ],
+)
+def test_forged_numbers_are_refused(change):
+    with pytest.raises(BadInput, match="a posterior must"):
+        Posterior.from_dict(ADDING.to_dict() | change)
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    )
+)
+def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
+    with pytest.raises(BadInput):
+        Posterior.from_dict(data)

@@ -1,0 +1,171 @@
+"""Verdicts of the shipped checkpoint: untouched gels, black images, noise and photos name no object, on any way in."""
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from retrieval.answer import EXIT_CODES, in_words
+from retrieval.cli import main
+from retrieval.dataset import load_grasps
+from retrieval.posterior import Posterior
+from retrieval.search import Searcher
+from robot.collect import CollectSettings, collect
+from robot.rig import load_rig
+
+SEED = 41_000  # a world of its own
+
+
+@pytest.fixture(scope="module")
+def grasps(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdicts") / "recording"
+    collect(partial(load_rig, "sim", seed=SEED), folder, objects=4, seed=SEED, settings=CollectSettings(grasps=2))
+    return load_grasps(folder)
+
+
+@pytest.fixture(scope="module")
+def index(grasps, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdicts")
+    for number, grasp in enumerate(grasps):
+        shown = folder / "catalog" / grasp.object_id / f"{number}{grasp.photo.suffix}"
+        shown.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(grasp.photo, shown)
+    assert main(["build-index", str(folder / "catalog"), "--out", str(folder / "index")]) == 0
+    return folder / "index"
+
+
+@pytest.fixture(scope="module")
+def searcher(index):
+    with Searcher.open(index) as opened:
+        yield opened
+
+
+def picture(kind):
+    rng = np.random.default_rng(1)
+    samples = {
+        "black": np.zeros((240, 320, 3)),
+        "white": np.full((240, 320, 3), 255),
+        "noise": rng.integers(0, 256, (240, 320, 3)),
+    }
+    return samples[kind].astype(np.uint8)
+
+
+def test_a_touch_is_judged_and_all_that_may_be_adds_up_to_one(searcher, grasps):
+    for grasp in grasps:
+        result = searcher.query(grasp.touches, top=99)
+        assert result.grasps == ["contact"], grasp.grasp_id
+        assert result.none_probability + sum(match.probability for match in result.results) == pytest.approx(1)
+        best = result.results[0].probability
+        assert result.verdict == ("match" if best > result.none_probability else "none of these")
+
+
+def test_the_answer_holds_all_that_its_probabilities_are_made_of(searcher, grasps):
+    own = [grasp for grasp in grasps if grasp.object_id == grasps[0].object_id]
+    result = searcher.query([grasp.touches for grasp in own], top=99, none_prior=0.3)
+    said = result.to_dict()["posterior"]
+    weight = said["slope"] / (1 + said["dependence"] * (said["grasps"] - 1))
+    odds = [0.7 / said["objects"] * np.exp(weight * match.logit + said["offset"]) for match in result.results]
+    assert [match.probability for match in result.results] == pytest.approx(np.array(odds) / (0.3 + sum(odds)))
+    assert (said["grasps"], said["objects"], said["judged_objects"], said["unjudged_probability"]) == (2, 4, 4, 0.0)
+    assert "exp(w * logit + offset)" in said["formula"]
+
+
+def test_untouched_gels_name_nobody(searcher, grasps):
+    for grasp in grasps:
+        result = searcher.query(grasp.backgrounds)
+        assert (result.verdict, result.results, result.none_probability) == ("no contact", [], None)
+        assert result.top is None
+        assert in_words(result).startswith("no contact: the gels look untouched")
+
+
+@pytest.mark.parametrize("kind", ["black", "white", "noise"])
+def test_pictures_that_are_no_gel_images_name_nobody(searcher, kind):
+    result = searcher.query([picture(kind)] * 2)
+    assert (result.verdict, result.results, result.grasps) == ("not a gel image", [], ["not a gel image"])
+
+
+def test_a_photo_given_as_gel_images_names_nobody(searcher, grasps):
+    assert searcher.query([grasps[0].photo] * 2).verdict == "not a gel image"
+
+
+def test_one_foreign_picture_among_good_grasps_refuses_them_all_and_is_named(searcher, grasps):
+    good = grasps[0].touches
+    result = searcher.query([good, (good[0], picture("black"))])
+    assert (result.verdict, result.grasps) == ("not a gel image", ["contact", "not a gel image"])
+    assert "grasp 2 does not look like a gel" in in_words(result)
+
+
+def test_a_grasp_that_felt_nothing_is_left_out_of_the_others(searcher, grasps):
+    grasp = grasps[0]
+    alone, with_air = searcher.query(grasp.touches), searcher.query([grasp.touches, grasp.backgrounds])
+    assert with_air.grasps == ["contact", "no contact"]
+    assert [match.object_id for match in with_air.results] == [match.object_id for match in alone.results]
+    assert [match.logit for match in with_air.results] == pytest.approx(
+        [match.logit for match in alone.results], abs=1e-4
+    )
+    assert "left out: 2" in in_words(with_air)
+
+
+def test_a_no_contact_frame_tells_contact_by_itself(searcher, grasps):
+    grasp, later = grasps[0], grasps[1]
+    assert searcher.query(grasp.touches, background=grasp.backgrounds).grasps == ["contact"]
+    # The same gels, untouched, at another moment.
+    assert searcher.query(later.backgrounds, background=grasp.backgrounds).grasps == ["no contact"]
+
+
+def test_several_objects_at_once_have_each_their_own_verdict(searcher, grasps):
+    results = searcher.query_many([grasps[0].touches, grasps[0].backgrounds, [picture("black")] * 2])
+    assert [result.verdict for result in results][1:] == ["no contact", "not a gel image"]
+    assert results[0].results
+
+
+def test_a_prior_of_zero_rules_out_that_the_catalogue_lacks_it(searcher, grasps):
+    result = searcher.query(grasps[0].touches, none_prior=0)
+    assert (result.none_probability, result.verdict) == (0.0, "match")
+
+
+def test_the_command_says_the_verdict_by_its_exit_code_in_json_and_on_the_page(index, grasps, tmp_path, capsys):
+    Image.fromarray(picture("black")).save(tmp_path / "black.png")
+    black = [str(tmp_path / "black.png")] * 2
+    for files, verdict in (
+        (grasps[0].backgrounds, "no contact"),
+        (black, "not a gel image"),
+        ([str(grasps[0].photo)] * 2, "not a gel image"),
+    ):
+        page = tmp_path / "page.html"
+        words = ["query", "--gelsight", *map(str, files), "--index", str(index), "--json", "--html", str(page)]
+        assert main(words) == EXIT_CODES[verdict]
+        said = json.loads(capsys.readouterr().out)
+        assert (said["verdict"], said["results"], said["none_probability"]) == (verdict, [], None)
+        assert verdict in page.read_text("utf-8").lower()
+        assert "Most likely" not in page.read_text("utf-8")
+
+
+def test_objects_that_were_not_judged_keep_their_share(index, grasps):
+    """With two candidates the answer is near the one that judges every photo, as the rest is estimated."""
+    with Searcher.open(index) as searcher:
+        whole, pruned = (searcher.query(grasps[0].touches, candidates=count, top=2) for count in (99, 2))
+        assert pruned.posterior["judged_objects"] < whole.posterior["judged_objects"] == 4
+        assert pruned.none_probability == pytest.approx(whole.none_probability, abs=0.05)
+        total = pruned.none_probability + sum(match.probability for match in pruned.results)
+        assert total + pruned.posterior["unjudged_probability"] == pytest.approx(1)
+
+
+def test_the_shipped_checkpoint_says_how_often_its_check_errs():
+    card = (Path("retrieval") / "shipped" / "simulated-mobilenet.md").read_text("utf-8")
+    assert "Check of gel images, on validation objects: touches called foreign 0.0" in card
+
+
+def test_a_model_without_a_posterior_ranks_and_says_that_it_is_uncalibrated(index, grasps, monkeypatch):
+    with Searcher.open(index) as searcher:
+        calibrated = searcher.query(grasps[0].touches)
+        searcher.posterior = None
+        result = searcher.query(grasps[0].touches)
+    assert (result.verdict, result.none_probability, result.posterior) == ("uncalibrated", None, None)
+    assert all(match.probability is None for match in result.results)
+    assert Posterior().weight(1) == 1
+    assert {match.object_id for match in result.results} == {match.object_id for match in calibrated.results}
