@@ -158,6 +158,8 @@ def _log_mean_exp(values: Floats) -> float:
 
 CATALOGUE_SIZES = (20, 1000)
 """Objects of the catalogues that the numbers are fitted on; at most all but one of the validation objects."""
+LEAST_OBJECTS = 3
+"""That a posterior is fitted on: a catalogue of two has one of two without the true object beside it."""
 _MOST_GRASPS, _SETS = 5, 4
 _SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 
@@ -214,7 +216,7 @@ class Questions:
     def of(cls, judged: Judged, sets: Numbers, seed: int = 0) -> "Questions":
         """Of sets of touches (S, G). Raises BadInput where there are none, or fewer than three objects."""
         objects, owner = np.unique(judged.photo_owner, return_inverse=True)
-        if len(objects) < 3 or not len(sets):
+        if len(objects) < LEAST_OBJECTS or not len(sets):
             raise BadInput(
                 "a posterior is fitted on three objects at least, and on touches that have another photo of theirs; "
                 f"got {len(objects)} objects and {len(sets)} such touches"
@@ -240,7 +242,7 @@ class Questions:
         owner = np.repeat(np.arange(len(self.starts)), np.diff(np.append(self.starts, scaled.shape[1])))
         sums = np.add.reduceat(np.exp(scaled - base[:, owner]), self.starts, axis=1)
         with np.errstate(divide="ignore"):
-            return np.asarray(base + np.log(sums) - np.log(shown) + posterior.offset)
+            return np.asarray(base + (np.log(sums) - np.log(shown)) + posterior.offset)
 
     def loss(self, posterior: Posterior, smooth: float) -> float:
         """Mean over catalogues of the cross-entropy with the truth, at even odds of "none of these".
@@ -275,15 +277,16 @@ def fit_questions(asked: Sequence[Questions]) -> Posterior:
 
     def made(parameters: Floats) -> Posterior:
         slope = float(np.clip(np.exp(parameters[0]), *SLOPE_BOUNDS))
-        dependence = float(parameters[2]) if several else 1.0
+        dependence = float(parameters[2]) if several else 1.0  # of which single grasps say nothing
         return Posterior(slope, float(parameters[1]) - slope * middle, dependence, count)
 
     def loss(parameters: Floats) -> float:
         posterior = made(parameters)
         return sum(len(part.scores) * part.loss(posterior, 1 / (count + 2)) for part in asked) / count
 
-    bounds = [(low, high), (-1e6, 1e6), (0.0, 1.0)]
-    first = np.array([start, 0.0, 0.5])
-    simplex = np.vstack([first, first + np.diag([-0.5 if start > 0 else 0.5, 0.5, 0.25])])
+    searched = slice(3 if several else 2)
+    bounds = [(low, high), (-1e6, 1e6), (0.0, 1.0)][searched]
+    first = np.array([start, 0.0, 0.5])[searched]
+    simplex = np.vstack([first, first + np.diag([-0.5 if start > 0 else 0.5, 0.5, 0.25][searched])])
     found = minimize(loss, first, method="Nelder-Mead", bounds=bounds, options={**_SEARCH, "initial_simplex": simplex})
     return made(found.x)

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from retrieval.config import Config, load_config
 from retrieval.dataset import data_digest, load_grasps
-from retrieval.evaluation.calibrate import calibrate
+from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import main_measures, summaries
 from retrieval.evaluation.table import ScoreTable
@@ -112,7 +112,7 @@ def first_grasps(features: Features, most: int) -> Features:
 
 def judge(method: Method, validation: Features, unseen: Features) -> dict[str, Any]:
     """Summaries of the measures on unseen objects, by name."""
-    fitted = calibrate({1: scored(method, validation)}, [], seed=0)
+    fitted = calibrate_pairs(scored(method, validation), seed=0)
     return summaries([main_measures(scored(method, unseen), fitted, seed=0)], DRAWS, seed=0)
 
 

@@ -1,9 +1,9 @@
-"""Probabilities of pairs, of sums of grasps and of K-way choices: fitted on validation objects, judged on test objects.
+"""Probabilities of pairs, of objects and of none: fitted on validation objects, judged on test objects.
 
-Ranking needs none of this. Even odds: `log_odds = slope * score + intercept`, fitted for each number of grasps on
-its own, for grasps of one object are alike and the sum of their logits is over-confident. Among K candidates of which
-one is true, the prior 1/K moves the log-odds of each by -log(K - 1), and knowing that exactly one is true makes them
-a softmax; its one parameter, the temperature, is fitted as well.
+Ranking needs none of this. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`; which
+object it is, and whether it is any, has the posterior that queries have (`retrieval.posterior`). Both are fitted for
+each number of grasps on its own: a method scores a set of grasps in its own way, so a set counts as one grasp whose
+score is the set's.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-from scipy.special import expit, log_softmax, softmax
 
-from retrieval.calibration import SLOPE_BOUNDS, Calibration, fit_calibration
-from retrieval.errors import BadInput, NumericalError
+from retrieval.calibration import Calibration, fit_calibration
+from retrieval.errors import BadInput
 from retrieval.evaluation.protocols import asked
 from retrieval.evaluation.table import ScoreTable, object_scores
+from retrieval.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
 
 BINS = 15
 _PAIRS_OF_A_ROW = 8  # of each kind
@@ -40,38 +39,51 @@ class Choice(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibrations:
-    """What validation objects say of a method's scores.
+    """What validation objects say of a method's scores, by the number of grasps that a row of its tables is.
 
-    pairs: calibration of a touch with a photo, by the number of grasps whose scores are summed; slopes: what scores
-    are multiplied by before the softmax of a choice, 1 / temperature.
+    pairs: log-odds of a touch with a photo; posteriors: which object it is, or none.
     """
 
     pairs: dict[int, Calibration]
-    slopes: dict[Choice, float]
+    posteriors: dict[int, Posterior]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types: {"pairs": {"1": {...}}, "choices": {"k5": {"grasps", "photos", "temperature"}}}."""
-        pairs = {str(grasps): fitted.to_dict() for grasps, fitted in self.pairs.items()}
-        choices = {
-            choice.name: {"grasps": choice.grasps, "photos": choice.photos, "temperature": 1 / slope}
-            for choice, slope in self.slopes.items()
+        """JSON types: {"pairs": {"1": {...}}, "posteriors": {"1": {...}}}."""
+        return {
+            kind: {str(grasps): one.to_dict() for grasps, one in fitted.items()}
+            for kind, fitted in (("pairs", self.pairs), ("posteriors", self.posteriors))
         }
-        return {"pairs": pairs, "choices": choices}
 
 
-def calibrate(validation: Mapping[int, ScoreTable], choices: Sequence[Choice], *, seed: int = 0) -> Calibrations:
+def calibrate(validation: Mapping[int, ScoreTable], *, seed: int = 0) -> Calibrations:
     """Fit on validation objects; `validation` holds a table for each number of grasps.
 
-    A choice among more candidates than there are validation objects is fitted on as many as there are: the slope of
-    a softmax does not hang on their number. A choice whose number of grasps has no table is left out.
+    Of fewer than three objects there are no posteriors (`enough_objects`).
     """
-    pairs = {grasps: fit_calibration(*drawn_pairs(table, seed)) for grasps, table in validation.items()}
-    slopes = {
-        choice: fit_slope(drawn_choices(validation[choice.grasps], choice, seed))
-        for choice in choices
-        if choice.grasps in validation
-    }
-    return Calibrations(pairs, slopes)
+    pairs = {grasps: calibrate_pairs(table, seed=seed) for grasps, table in validation.items()}
+    asked_of = {grasps: questions(table, seed) for grasps, table in validation.items() if enough_objects(table)}
+    return Calibrations(pairs, {grasps: fit_questions([one]) for grasps, one in asked_of.items()})
+
+
+def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
+    """Log-odds of a row of the table with a photo, fitted on drawn pairs."""
+    return fit_calibration(*drawn_pairs(validation, seed))
+
+
+def enough_objects(table: ScoreTable) -> bool:
+    """Whether "which object, or none" can be asked: of two catalogues of two objects, with the true one and without."""
+    return len(table.objects) >= LEAST_OBJECTS
+
+
+def questions(table: ScoreTable, seed: int = 0) -> Questions:
+    """ "Which object, or none?" for every row that has a photo to find; a row counts as one grasp.
+
+    Objects stand in the order of `table.objects`, rows in that of `asked(table)`. Raises BadInput for fewer than
+    three objects.
+    """
+    kept = asked(table)
+    judged = Judged(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
+    return Questions.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
 
 
 def drawn_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -101,13 +113,16 @@ def _other_photos(table: ScoreTable, count: int, rng: np.random.Generator) -> ND
     return np.asarray(order[start[other] + (rng.random(other.shape) * counts[other]).astype(np.int64)])
 
 
-def drawn_choices(table: ScoreTable, choice: Choice, seed: int) -> NDArray[np.float64]:
+def drawn_choices(
+    table: ScoreTable, choice: Choice, seed: int, posterior: Posterior | None = None
+) -> NDArray[np.float64]:
     """Scores (Q, k) of candidates, the true one first; rivals drawn uniformly, 4 tests a row.
 
-    Raises BadInput for fewer than two objects; with fewer than k there are as many candidates as objects.
+    posterior: what makes one logit of a candidate's photos, in place of their mean. Raises BadInput for fewer than
+    two objects; with fewer than k there are as many candidates as objects.
     """
     kept = asked(table)
-    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed)
+    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior)
     count = min(choice.k, len(kept.objects))
     if count < 2:
         raise BadInput(f"a choice needs two objects at least; got {len(kept.objects)}")
@@ -117,59 +132,28 @@ def drawn_choices(table: ScoreTable, choice: Choice, seed: int) -> NDArray[np.fl
     return np.take_along_axis(scores, np.argsort(keys, axis=2)[..., :count], 2).reshape(-1, count)
 
 
-def fit_slope(scores: ArrayLike) -> float:
-    """Factor of the scores (Q, k), the true one first, for which the softmax is likeliest: 1 / temperature.
+def reliability(
+    calibrations: Calibrations, test: Mapping[int, ScoreTable], choices: Sequence[Choice], *, seed: int = 0
+) -> dict[str, Any]:
+    """How often what was said came true, on test objects: {"pairs": ..., "k5": ..., "k5_g5": ...}.
 
-    Targets are smoothed as Platt's are, a test more for every candidate: (Q + 1) / (Q + k) for the true one, so that
-    scores that never err still have a finite optimum. The loss is convex in the factor: the root of its derivative,
-    within `SLOPE_BOUNDS`. Raises NumericalError for a score that is not finite.
-    """
-    z = np.asarray(scores, dtype=np.float64)
-    if not np.isfinite(z).all():
-        row = int(np.flatnonzero(~np.isfinite(z).all(axis=1))[0])
-        raise NumericalError(f"every score of a choice must be finite; choice {row} holds a NaN or infinite one")
-    z = z - z[:, :1]
-    tests, k = z.shape
-    targets = np.append((tests + 1) / (tests + k), np.full(k - 1, 1 / (tests + k)))
-
-    def derivative(log_slope: float) -> float:
-        return float((z * (softmax(np.exp(log_slope) * z, axis=1) - targets)).sum())
-
-    low, high = np.log(SLOPE_BOUNDS)
-    if derivative(low) >= 0:
-        return SLOPE_BOUNDS[0]
-    return SLOPE_BOUNDS[1] if derivative(high) <= 0 else float(np.exp(brentq(derivative, low, high)))
-
-
-def log_odds_among(log_odds: ArrayLike, k: int) -> NDArray[np.float64]:
-    """Log-odds that a candidate is the true one of k, from its log-odds at even odds: less log(k - 1)."""
-    return np.asarray(np.asarray(log_odds, dtype=np.float64) - np.log(k - 1))
-
-
-def reliability(calibrations: Calibrations, test: Mapping[int, ScoreTable], *, seed: int = 0) -> dict[str, Any]:
-    """How often what was said came true, on test objects: {"pairs": ..., "k5": ..., "calibration": {...}}.
-
-    "pairs" (even odds, one grasp): probability and truth of pairs. A choice: probability of the first guess and
-    whether it was right (equals share it); there "ece_of_pairs" is the error of the pairs' calibration moved by the
-    prior, which does not know that exactly one candidate is true. A choice among more candidates than there are test
-    objects is left out.
+    "pairs" (even odds, one grasp): probability and truth of pairs. A choice: the posterior's probability of the first
+    guess where one candidate is known to be true (a prior of none of 0), and whether it was right (equals share it).
+    A choice without a posterior, or among more candidates than there are test objects, is left out.
     """
     scores, labels = drawn_pairs(test[1], seed)
     found = {"pairs": reliability_bins(calibrations.pairs[1].probability(scores), labels)}
-    for choice, slope in calibrations.slopes.items():
-        if choice.grasps in test and len(test[choice.grasps].objects) >= choice.k:
-            pairs = calibrations.pairs[choice.grasps]
-            found[choice.name] = _choice_reliability(drawn_choices(test[choice.grasps], choice, seed), slope, pairs)
-    return {**found, "calibration": calibrations.to_dict()}
+    for choice in choices:
+        table, posterior = test.get(choice.grasps), calibrations.posteriors.get(choice.grasps)
+        if table and posterior and len(table.objects) >= choice.k:
+            found[choice.name] = _choice_reliability(drawn_choices(table, choice, seed, posterior), posterior)
+    return found
 
 
-def _choice_reliability(scores: NDArray[np.float64], slope: float, pairs: Calibration) -> dict[str, Any]:
-    best = scores.max(1)
-    tied = scores == best[:, None]
-    right = tied[:, 0] / tied.sum(1)
-    said = np.exp(log_softmax(slope * (scores - best[:, None]), axis=1).max(1))
-    alone = expit(log_odds_among(pairs.log_odds(best), scores.shape[1]))
-    return {**reliability_bins(said, right), "ece_of_pairs": reliability_bins(alone, right)["ece"]}
+def _choice_reliability(logits: NDArray[np.float64], posterior: Posterior) -> dict[str, Any]:
+    tied = logits == logits.max(1, keepdims=True)
+    said = [posterior.believe(row, none_prior=0).objects.max() for row in logits]
+    return reliability_bins(said, tied[:, 0] / tied.sum(1))
 
 
 def reliability_bins(probability: ArrayLike, came_true: ArrayLike) -> dict[str, Any]:

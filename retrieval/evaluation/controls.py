@@ -10,6 +10,7 @@ import numpy as np
 
 from retrieval.dataset import Grasp
 from retrieval.evaluation.bench import Bench
+from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Judged, main_measures, summaries
@@ -63,5 +64,6 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
 def score_control(name: str, bench: Bench, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
     """A control's entry of results.json."""
     judged = Judged(bench.queries, bench.predictions(METHOD, training_seed), seed)
-    measures = main_measures(judged.touches("test", "test"), judged.calibrations(), seed)
+    pairs = calibrate_pairs(judged.touches("validation", "validation"), seed=seed)
+    measures = main_measures(judged.touches("test", "test"), pairs, seed)
     return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}

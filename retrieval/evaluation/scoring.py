@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.calibration import Calibration
 from retrieval.evaluation import protocols
-from retrieval.evaluation.calibrate import Calibrations, Choice, calibrate, reliability
+from retrieval.evaluation.calibrate import Calibrations, Choice, calibrate, enough_objects, reliability
 from retrieval.evaluation.intervals import summarise
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import SHOWN_PHOTOS, Queries
-from retrieval.evaluation.reject import fit_gate, reject
+from retrieval.evaluation.reject import Rejection, reject
 from retrieval.evaluation.table import Measure, ScoreTable
 
 CHOICES = (Choice(5), Choice(10), Choice(5, 5, SHOWN_PHOTOS))
@@ -67,16 +68,16 @@ class Judged:
 
     def calibrations(self) -> Calibrations:
         """Fitted on validation objects."""
-        return calibrate(self.by_grasps("validation"), CHOICES, seed=self.seed)
+        return calibrate(self.by_grasps("validation"), seed=self.seed)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
     return np.arange(len(owner)) if part is None else queries.of_part(owner, part)
 
 
-def main_measures(test: ScoreTable, calibrations: Calibrations, seed: int) -> Measures:
+def main_measures(test: ScoreTable, pairs: Calibration, seed: int) -> Measures:
     """Pair accuracy and guess curves of single touches; a curve needs as many objects as candidates."""
-    found = {"pair_accuracy": protocols.pair_accuracy(test, calibrations.pairs[1])}
+    found = {"pair_accuracy": protocols.pair_accuracy(test, pairs)}
     for k in (5, 10):
         found |= _guesses(f"guesses_k{k}", test, k, seed)
     return found
@@ -85,7 +86,7 @@ def main_measures(test: ScoreTable, calibrations: Calibrations, seed: int) -> Me
 def all_measures(judged: Judged, calibrations: Calibrations) -> Measures:
     """Every measure of results.json."""
     test = judged.touches("test", "test")
-    found = main_measures(test, calibrations, judged.seed) | {"pair_auc": protocols.pair_auc(test)}
+    found = main_measures(test, calibrations.pairs[1], judged.seed) | {"pair_auc": protocols.pair_auc(test)}
     for size, table in judged.sets("test").items():
         found |= _guesses(f"guesses_k5_g{size}_p{SHOWN_PHOTOS}", table, 5, judged.seed, SHOWN_PHOTOS)
     found |= _guesses("all_objects_k5", judged.touches("test", None), 5, judged.seed)
@@ -113,21 +114,20 @@ def score_method(
 ) -> tuple[dict[str, Any], list[Measures]]:
     """A method's entry of results.json, and its measures by training seed for comparisons.
 
-    Values are means over the training seeds; reliability, reject's curve and threshold, and the examples are those of
-    the first.
+    Values are means over the training seeds; reliability, reject's curves and the examples are those of the first.
+    "reject" is None where validation or test objects are fewer than three.
     """
     judged = [Judged(queries, predictions, seed) for predictions in by_seed]
     calibrations = [one.calibrations() for one in judged]
     measures = [all_measures(one, fitted) for one, fitted in zip(judged, calibrations, strict=True)]
-    diagrams = reliability(calibrations[0], judged[0].by_grasps("test"), seed=seed)
     entry = {
         "chosen": [predictions.chosen for predictions in by_seed],
         "measures": summaries(measures, draws, seed),
         "per_object": _per_object(queries, judged, measures, seed),
         "confusions": _confusions(queries, judged, seed),
-        "calibration": diagrams.pop("calibration"),
-        "reliability": diagrams,
-        "reject": _reject(judged, draws, seed),
+        "calibration": calibrations[0].to_dict(),
+        "reliability": reliability(calibrations[0], judged[0].by_grasps("test"), CHOICES, seed=seed),
+        "reject": _reject(judged, calibrations, draws, seed),
         "examples": _examples(judged[0].touches("test", "test"), queries, grasp_ids),
     }
     return entry, measures
@@ -166,16 +166,34 @@ def _confusions(queries: Queries, judged: Sequence[Judged], seed: int) -> list[d
     ]
 
 
-def _reject(judged: Sequence[Judged], draws: int, seed: int) -> dict[str, Any]:
-    found = []
-    for one in judged:
-        gate = fit_gate(one.touches("validation", "validation"), seed=seed)
-        found.append(reject(gate, one.touches("test", "test"), seed=seed))
+def _reject(
+    judged: Sequence[Judged], calibrations: Sequence[Calibrations], draws: int, seed: int
+) -> dict[str, Any] | None:
+    """Of single grasps all, and by number of grasps how well the two are parted."""
+    found = [_rejections(one, fitted, seed) for one, fitted in zip(judged, calibrations, strict=True)]
+    if not found[0]:
+        return None
+
+    def summary(name: str, grasps: int = 1) -> dict[str, Any]:
+        return summarise([getattr(one[grasps], name) for one in found], draws=draws, seed=seed)
+
+    parted = ("auroc", "false_accepts_at_95")
     return {
-        "auroc": summarise([one.auroc for one in found], draws=draws, seed=seed),
-        "balanced_accuracy": summarise([one.balanced_accuracy for one in found], draws=draws, seed=seed),
-        "threshold": found[0].threshold,
-        "roc": found[0].roc,
+        **{name: summary(name) for name in (*parted, "balanced_accuracy")},
+        "roc": found[0][1].roc,
+        "risk_coverage": found[0][1].risk_coverage,
+        "by_grasps": {str(grasps): {name: summary(name, grasps) for name in parted} for grasps in found[0]},
+    }
+
+
+def _rejections(judged: Judged, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
+    """By number of grasps, where validation objects gave a posterior and test objects can be missed."""
+    tables = judged.by_grasps("test").items()
+    fitted = calibrations.posteriors
+    return {
+        grasps: reject(fitted[grasps], table, seed=seed)
+        for grasps, table in tables
+        if grasps in fitted and enough_objects(table)
     }
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
+from retrieval.posterior import Posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +125,15 @@ def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.asarray(1 / (counts[place] * len(counts)))
 
 
-def object_scores(table: ScoreTable, photos: int, draws: int, seed: int) -> NDArray[np.float64]:
-    """Scores (draws, T, O) of rows with objects: the mean over `photos` photos of each, drawn without replacement.
+def object_scores(
+    table: ScoreTable, photos: int, draws: int, seed: int, posterior: Posterior | None = None
+) -> NDArray[np.float64]:
+    """Scores (draws, T, O) of rows with objects, each shown by `photos` photos drawn without replacement.
 
-    Columns stand in the order of `table.objects`. Own photos are never drawn; an object with fewer photos shows all
-    that it has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the
-    same. Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
+    Their mean, or where a posterior is given the logit that it gives the object (`Posterior.object_logits`). Columns
+    stand in the order of `table.objects`. Own photos are never drawn; an object with fewer photos shows all that it
+    has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the same.
+    Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
     """
     if not (table.askable | ~table.relevant.any(1)).all():
         raise BadInput("every row must leave its object a photo to show; one has none but its own: leave the row out")
@@ -139,25 +143,36 @@ def object_scores(table: ScoreTable, photos: int, draws: int, seed: int) -> NDAr
         for place, name in enumerate(table.objects):
             columns = rng.permutation(np.flatnonzero(table.photo_owner == name))
             mine = np.flatnonzero(table.touch_owner == name)
-            found[draw, :, place] = _window_means(table.scores, columns, photos, rng)
-            found[draw, mine, place] = _means_without_own(table, mine, columns, photos, rng)
+            found[draw, :, place] = _of_photos(*_window(table.scores, columns, photos, rng), posterior)
+            found[draw, mine, place] = _of_photos(*_without_own(table, mine, columns, photos, rng), posterior)
     return found
 
 
-def _window_means(
-    scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
+Shown = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Scores (T, p) of rows with photos of one object, and which of these are shown to them."""
+
+
+def _window(scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator) -> Shown:
     """Every row sees a window of its own over the shuffled columns: without replacement, and cheap."""
     start = rng.integers(len(columns), size=len(scores))
     window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
-    return np.asarray(scores[np.arange(len(scores))[:, None], columns[window]].mean(1, dtype=np.float64))
+    found = scores[np.arange(len(scores))[:, None], columns[window]].astype(np.float64)
+    return found, np.ones(found.shape, dtype=bool)
 
 
-def _means_without_own(
+def _without_own(
     table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
+) -> Shown:
     """The object's own rows: a random order of the photos for each, its own ones last and never counted."""
     own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
     order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
-    shown = ~np.take_along_axis(own, order, 1)
-    return np.asarray((np.take_along_axis(scores, order, 1) * shown).sum(1) / shown.sum(1))
+    return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
+
+
+def _of_photos(
+    scores: NDArray[np.float64], shown: NDArray[np.bool_], posterior: Posterior | None
+) -> NDArray[np.float64]:
+    """(T,) from the photos that each row is shown."""
+    if posterior is None:
+        return np.asarray((scores * shown).sum(1) / shown.sum(1))
+    return posterior.object_logits(scores[shown], np.nonzero(shown)[0], shown.sum(1))

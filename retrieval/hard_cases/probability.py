@@ -7,25 +7,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit, softmax
 
-from retrieval.calibration import Calibration, fit_calibration
-from retrieval.evaluation.calibrate import fit_slope, reliability_bins
-from retrieval.evaluation.reject import statistics
+from retrieval.calibration import fit_calibration
+from retrieval.evaluation.calibrate import reliability_bins
+from retrieval.evaluation.reject import galleries, statistic
 from retrieval.hard_cases.case import HardCase, refused
+from retrieval.posterior import Judged, Posterior, fit_posterior
 
 Matrix = NDArray[np.float64]
 _LOGITS, _CALIBRATION = "logits", "calibration"
-_NONE = Calibration(
-    slope=1.0,
-    intercept=0.0,
-    reject_log_odds=0.0,
-    positives=1,
-    negatives=1,
-    nll_before=0.0,
-    nll_after=0.0,
-    ece_before=0.0,
-    ece_after=0.0,
-)
-"""Says a logit as it is."""
+_ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
+"""Takes logits as they are, and grasps as independent."""
 
 
 def hard_cases() -> Iterator[HardCase]:
@@ -69,16 +60,15 @@ def _sure_and_wrong() -> HardCase:
 
 
 def _many_grasps() -> HardCase:
-    """Eight grasps of two objects, the second a little less unlikely: it must come first."""
+    """Eight grasps of two objects, the second a little less unlikely: e^0.8 to 1 that it is that one."""
     logits = np.array([[-100.0] * 8, [-99.9] * 8])
     naive = expit(logits.astype(np.float32)).prod(axis=1)
-    ours = _NONE.log_odds(logits.sum(axis=1), grasps=8)
-    said = f"log-odds {ours[0]:.6g} and {ours[1]:.6g}"
+    ours = _ADDING.believe(logits.sum(axis=1), grasps=8, none_prior=0).objects
+    said = f"probabilities {ours[0]:.3f} and {ours[1]:.3f}"
     products = f"products {naive[0]:g} and {naive[1]:g}"
-    wanted = "the second object above the first"
-    return HardCase(
-        _LOGITS, "8 grasps at logit -100", wanted, products, said, bool(ours[1] > ours[0]), bool(naive[1] > naive[0])
-    )
+    must = float(expit(0.8))
+    holds = [abs(float(pair[1] / pair.sum()) - must) < 1e-9 for pair in (ours, naive)]
+    return HardCase(_LOGITS, "8 grasps at logit -100", f"the second object with {must:.3f}", products, said, *holds)
 
 
 # Calibration -----------------------------------------------------------------------------------------------
@@ -156,17 +146,26 @@ def naive_slope(scores: Matrix) -> float:
 def _choices_that_never_err() -> HardCase:
     """Thirty choices among five, all right: the larger the factor the likelier, until the arithmetic ends."""
     scores = np.tile([2.0, 1.0, 0.0, -1.0, -2.0], (30, 1))
-    wrong = [float(1 - softmax(slope * scores[0])[0]) for slope in (naive_slope(scores), fit_slope(scores))]
+    fitted = fit_posterior(judged_choices(scores))
+    shares = [softmax(naive_slope(scores) * scores[0]), fitted.believe(scores[0]).objects]
+    wrong = [float(1 - share[0]) for share in shares]
     naive, ours = (f"wrong with probability {share:.2g}" for share in wrong)
     wanted = "wrong once in 100, or more often"
     return HardCase("softmax", "30 of 30 choices right", wanted, naive, ours, wrong[1] > 0.01, wrong[0] > 0.01)
+
+
+def judged_choices(scores: Matrix) -> Judged:
+    """The choices (Q, k), the true one first, as touches of k objects with one photo each; objects take turns."""
+    owner = np.arange(len(scores)) % scores.shape[1]
+    logits = np.stack([np.roll(row, place) for row, place in zip(scores, owner, strict=True)])
+    return Judged(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
 
 
 def _odds_of_a_gallery() -> HardCase:
     """Log of the mean odds over 2 objects of 3, of which one has log-odds 1000: 1000 - log 2."""
     log_odds, own = np.array([[1000.0, -3.0, -3.0]]), np.array([[True, False, False]])
     naive = float(np.log(np.mean(np.exp(log_odds[0, :2]))))
-    ours = float(statistics(log_odds, own)[0][0])
+    ours = float(statistic(galleries(log_odds, own).present)[0])
     must = 1000 - np.log(2)
     right = [abs(value - must) < 1e-9 for value in (naive, ours)]
     return HardCase(
