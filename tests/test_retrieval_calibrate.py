@@ -1,25 +1,25 @@
-"""Calibration of pairs, of sums of grasps and of choices: true odds found again, and hard scores."""
+"""Calibration of pairs, of sums of grasps and of objects: true odds found again, and hard scores."""
 
 import json
 import math
 
 import numpy as np
 import pytest
-from scipy.special import softmax
 
-from retrieval.calibration import SLOPE_BOUNDS, fit_calibration
+from retrieval.calibration import fit_calibration
 from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.calibrate import (
     Choice,
     calibrate,
+    calibrate_pairs,
     drawn_choices,
     drawn_pairs,
-    fit_slope,
-    log_odds_among,
+    questions,
     reliability,
     reliability_bins,
 )
 from retrieval.evaluation.table import ScoreTable
+from retrieval.posterior import SLOPE_BOUNDS, Posterior
 
 
 def table_of(scores, owner, rows=None, own=None):
@@ -92,7 +92,7 @@ def test_with_few_objects_a_choice_is_among_those_that_there_are():
 
 def test_true_odds_of_pairs_are_found_again_at_any_scale():
     for scale in (1.0, 5.0, 0.2):
-        fitted = calibrate({1: planted(scale=scale)}, ()).pairs[1]
+        fitted = calibrate_pairs(planted(scale=scale))
         assert fitted.slope * scale == pytest.approx(1, abs=0.08)
         assert fitted.intercept == pytest.approx(0, abs=0.15)
 
@@ -101,68 +101,74 @@ def test_sums_of_grasps_that_err_alike_get_a_smaller_slope_than_the_sum_of_log_o
     """Errors wholly shared: the sum of 5 is 5 times one, and its slope a fifth; wholly apart: log-odds add up."""
     one = planted()
     for shared, slope in ((1.0, 0.2), (0.0, 1.0), (0.5, 1 / 3)):
-        tables = {1: one, 5: sets_of(one, 5, shared)}
-        fitted = calibrate(tables, ())
-        assert fitted.pairs[5].slope == pytest.approx(slope, rel=0.15)
+        fitted = calibrate_pairs(sets_of(one, 5, shared))
+        assert fitted.slope == pytest.approx(slope, rel=0.15)
     # Naively, by one grasp's calibration, a sum of alike ones is far too sure of itself.
     sums = sets_of(one, 5, 1.0, seed=1)
     scores, labels = drawn_pairs(sums, seed=0)
-    naive = reliability_bins(fitted.pairs[1].probability(scores, grasps=5), labels)["ece"]
-    ours = reliability_bins(calibrate({1: one, 5: sets_of(one, 5, 1.0)}, ()).pairs[5].probability(scores), labels)[
-        "ece"
-    ]
+    said = (
+        calibrate_pairs(one).probability(scores, grasps=5),
+        calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores),
+    )
+    naive, ours = (reliability_bins(probability, labels)["ece"] for probability in said)
     assert ours < 0.04 < 0.08 < naive
 
 
-# Choices ---------------------------------------------------------------------------------------------------
+# Objects, and none -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("k", [2, 5, 10])
-@pytest.mark.parametrize("slope", [0.05, 1.0, 7.0])
-def test_the_temperature_that_made_choices_is_found_again(k, slope):
-    rng = np.random.default_rng(0)
-    scores = rng.normal(size=(4000, k)) * 2 / slope
-    chances = softmax(slope * scores, axis=1)
-    true = (rng.random((4000, 1)) > np.cumsum(chances, axis=1)).sum(1)
-    order = np.argsort(np.arange(k) != true[:, None], axis=1, kind="stable")
-    assert fit_slope(np.take_along_axis(scores, order, 1)) == pytest.approx(slope, rel=0.1)
+def views(objects=20, grasps=10, seed=0, scale=1.0, shift=0.0):
+    """As `planted`, the photos of an object alike to a row: one tells what all do, and the posterior is as planted."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), grasps)
+    noise = rng.normal(size=(len(owner), objects))[:, owner]
+    return table_of(scale * (np.where(owner[:, None] == owner, 1, -1) + np.sqrt(2) * noise) + shift, owner)
 
 
-def smoothed_loss(scores, slope):
-    """What the fit makes small, one test at a time."""
-    total, (tests, k) = 0.0, scores.shape
-    for row in scores:
-        peak = max(slope * row)
-        log_sum = peak + math.log(sum(math.exp(value - peak) for value in slope * row))
-        for place, value in enumerate(slope * row):
-            target = (tests + 1 if place == 0 else 1) / (tests + k)
-            total += target * (log_sum - value)
-    return total
+@pytest.mark.parametrize(("scale", "shift"), [(1, 0), (5, 0), (0.2, 1000)])
+def test_true_odds_of_objects_are_found_again_in_any_unit(scale, shift):
+    fitted = calibrate({1: views(objects=40, scale=scale, shift=shift)}).posteriors[1]
+    assert fitted.slope * scale == pytest.approx(1, abs=0.15)
+    for log_ratio in (-1.0, 0.0, 2.0):
+        assert fitted.slope * (scale * log_ratio + shift) + fitted.offset == pytest.approx(log_ratio, abs=0.3)
 
 
-def test_no_slope_of_a_fine_grid_has_a_smaller_loss():
-    scores = np.random.default_rng(0).normal([1, 0, 0, 0], size=(30, 4))
-    best = smoothed_loss(scores, fit_slope(scores))
-    assert best <= min(smoothed_loss(scores, slope) for slope in np.geomspace(*SLOPE_BOUNDS, 200)) + 1e-9
+def test_a_set_of_grasps_counts_as_one_grasp_with_a_posterior_of_its_own():
+    """What the method made of five grasps is five times what it made of one: a fifth of the slope."""
+    fitted = calibrate({1: views(), 5: views(scale=5)}).posteriors
+    assert fitted[5].slope == pytest.approx(fitted[1].slope / 5, rel=1e-2)
+    assert fitted[5].dependence == 1.0  # a row is not taken apart
 
 
-def test_scores_that_never_err_still_have_a_finite_slope_where_the_plain_likelihood_has_none():
-    scores = np.tile([3.0, 0, 0, 0, 0], (100, 1))
-    slope = fit_slope(scores)
-    said = softmax(slope * scores[0])[0]
-    assert said == pytest.approx(101 / 105)
-    plain = [-np.log(softmax(factor * scores[0])[0]) for factor in (1, 3, 9)]
-    assert plain == sorted(plain, reverse=True)
+def test_a_candidate_is_shown_by_what_the_posterior_makes_of_its_photos():
+    """Photos of 3 and 0, and none is another's: log of the mean of e^3 and 1, where the mean is 1.5."""
+    owner = np.repeat([0, 1], 2)
+    table = table_of(np.tile([3.0, 0.0, 0.0, 3.0], (4, 1)), owner, own=np.zeros((4, 4), dtype=bool))
+    pooled = drawn_choices(table, Choice(2, photos=2), 0, Posterior())
+    assert pooled == pytest.approx(np.full((16, 2), math.log((math.exp(3) + 1) / 2)))
+    assert drawn_choices(table, Choice(2, photos=2), 0) == pytest.approx(np.full((16, 2), 1.5))
+    np.testing.assert_allclose(
+        drawn_choices(table, Choice(2), 0, Posterior()), drawn_choices(table, Choice(2), 0), atol=1e-12
+    )
+
+
+def test_choices_that_never_err_have_a_finite_slope_and_a_doubt():
+    owner = np.repeat(np.arange(6), 4)
+    table = table_of(np.where(owner[:, None] == owner, 3.0, 0.0), owner)
+    fitted = calibrate({1: table}).posteriors[1]
+    assert SLOPE_BOUNDS[0] < fitted.slope < 5
+    assert 0.001 < 1 - fitted.believe([3.0, 0, 0, 0, 0]).objects[0] < 0.1
 
 
 @pytest.mark.parametrize("value", [0.0, 1e6, -1e6, 3e38])
 def test_constant_scores_say_nothing_and_get_even_chances(value):
-    scores = np.full((50, 5), value)
-    assert fit_slope(scores) == SLOPE_BOUNDS[0]
-    found = reliability(calibrate({1: constant(value)}, [Choice(5)]), {1: constant(value)})
-    assert found["k5"]["ece"] == pytest.approx(0, abs=1e-12)
-    assert found["k5"]["bins"] == [{"probability": pytest.approx(0.2), "share": pytest.approx(0.2), "count": 4 * 24}]
-    assert found["pairs"]["ece"] == pytest.approx(0, abs=1e-12)
+    table = constant(value)
+    for photos in (1, 3):
+        found = reliability(calibrate({1: table}), {1: table}, [Choice(5, photos=photos)])
+        assert found["k5"]["ece"] == pytest.approx(0, abs=1e-12)
+        only = {"probability": pytest.approx(0.2), "share": pytest.approx(0.2), "count": 4 * 24}
+        assert found["k5"]["bins"] == [only]
+        assert found["pairs"]["ece"] == pytest.approx(0, abs=1e-12)
 
 
 def constant(value):
@@ -170,31 +176,38 @@ def constant(value):
     return table_of(np.full((24, 24), value), owner)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_choice_with_a_score_that_is_not_finite_is_refused_and_named(bad):
-    with pytest.raises(NumericalError, match="every score of a choice must be finite; choice 1"):
-        fit_slope([[1.0, 0.0], [bad, 0.0]])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_score_that_is_not_finite_never_reaches_a_posterior(bad):
+    scores = np.zeros((6, 6))
+    scores[4, 2] = bad
+    with pytest.raises(NumericalError, match="every score must be finite; row 4, column 2"):
+        table_of(scores, np.repeat([0, 1, 2], 2))
 
 
-def test_scores_that_say_the_opposite_get_the_smallest_slope():
-    assert fit_slope(np.tile([-3.0, 0, 0], (40, 1))) == SLOPE_BOUNDS[0]
+def test_scores_that_say_the_opposite_are_hardly_believed():
+    """The smaller the slope the better: every candidate is about as likely."""
+    owner = np.repeat(np.arange(6), 4)
+    fitted = calibrate({1: table_of(np.where(owner[:, None] == owner, -3.0, 0.0), owner)}).posteriors[1]
+    assert fitted.slope < 0.02
+    assert fitted.believe([-3.0, 0, 0, 0, 0], none_prior=0).objects[0] == pytest.approx(0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6, 1e37])
 def test_scores_of_any_size_give_finite_probabilities(scale):
-    table = planted(scale=scale)
-    fitted = calibrate({1: table}, [Choice(5), Choice(10)])
-    found = reliability(fitted, {1: planted(seed=1, scale=scale)})
-    json.dumps(found, allow_nan=False)
-    assert all(SLOPE_BOUNDS[0] <= slope <= SLOPE_BOUNDS[1] for slope in fitted.slopes.values())
+    fitted = calibrate({1: planted(scale=scale)})
+    found = reliability(fitted, {1: planted(seed=1, scale=scale)}, [Choice(5), Choice(10)])
+    json.dumps({**found, **fitted.to_dict()}, allow_nan=False)
+    assert SLOPE_BOUNDS[0] <= fitted.posteriors[1].slope <= SLOPE_BOUNDS[1]
     assert all(0 <= found[name]["ece"] <= 1 for name in ("pairs", "k5", "k10"))
 
 
-def test_the_prior_of_k_candidates_moves_log_odds_by_log_of_k_less_1():
-    """Evidence that doubles the odds, among 5: 2 to 4, so 1/3."""
-    odds = float(log_odds_among(math.log(2), 5))
-    assert 1 / (1 + math.exp(-odds)) == pytest.approx(1 / 3)
-    assert log_odds_among(0.7, 2) == 0.7
+def test_two_objects_leave_the_posterior_out_and_pairs_in():
+    fitted = calibrate({1: planted(objects=2)})
+    assert list(fitted.pairs) == [1]
+    assert fitted.posteriors == {}
+    assert set(reliability(fitted, {1: planted(objects=2)}, [Choice(2)])) == {"pairs"}
+    with pytest.raises(BadInput, match="three objects at least"):
+        questions(planted(objects=2))
 
 
 # Reliability -----------------------------------------------------------------------------------------------
@@ -228,19 +241,19 @@ def test_no_probabilities_and_impossible_ones_are_refused():
 
 
 def test_what_was_fitted_on_validation_objects_holds_on_others_where_scores_are_made_alike():
-    fitted = calibrate({1: planted(), 5: sets_of(planted(), 5, 0.5)}, [Choice(5), Choice(5, 5, 3)])
-    found = reliability(fitted, {1: planted(seed=7), 5: sets_of(planted(), 5, 0.5, seed=7)})
-    assert list(found) == ["pairs", "k5", "k5_g5", "calibration"]
-    assert all(found[name]["ece"] < 0.05 for name in ("pairs", "k5", "k5_g5"))
-    # That one candidate is true is knowledge, and pairs on their own do not have it.
-    assert found["k5"]["ece"] < found["k5"]["ece_of_pairs"]
-    assert found["calibration"]["choices"]["k5"]["temperature"] == pytest.approx(1, abs=0.15)
+    fitted = calibrate({1: views(), 5: views(scale=5)})
+    tests = {1: views(seed=7), 5: views(scale=5, seed=7)}
+    found = reliability(fitted, tests, [Choice(5), Choice(5, 5, 3)])
+    assert list(found) == ["pairs", "k5", "k5_g5"]
+    assert all(found[name]["ece"] < 0.05 for name in found)
+    assert set(fitted.to_dict()) == {"pairs", "posteriors"}
+    assert Posterior.from_dict(fitted.to_dict()["posteriors"]["5"]) == fitted.posteriors[5]
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_a_choice_that_the_test_objects_cannot_fill_is_left_out():
-    fitted = calibrate({1: planted(objects=4)}, [Choice(5), Choice(3), Choice(5, 8, 3)])
-    assert set(fitted.slopes) == {Choice(5), Choice(3)}
-    found = reliability(fitted, {1: planted(objects=4, seed=1)})
-    assert "k3" in found
-    assert "k5" not in found
+def test_a_choice_that_the_test_objects_cannot_fill_is_left_out_and_so_is_one_of_grasps_without_a_posterior():
+    fitted = calibrate({1: planted(objects=4)})
+    assert list(fitted.posteriors) == [1]
+    test = planted(objects=4, seed=1)
+    found = reliability(fitted, {1: test, 8: test}, [Choice(5), Choice(3), Choice(3, 8, 3)])
+    assert set(found) == {"pairs", "k3"}
