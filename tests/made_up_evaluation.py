@@ -7,6 +7,7 @@ import numpy as np
 
 from retrieval.dataset import load_grasps, make_split
 from retrieval.evaluation.audit import audit
+from retrieval.posterior import Posterior
 
 SKILL = {
     "late_fusion": 1.6,
@@ -70,13 +71,27 @@ def reliability(rng):
         {"probability": float(p), "share": float(s) if n else None, "count": int(n)}
         for p, s, n in zip(centres, shares, counts, strict=True)
     ]
-    return {"ece": float(np.abs(centres - shares).mean()), "ece_of_pairs": 0.123, "bins": bins}
+    return {"ece": float(np.abs(centres - shares).mean()), "bins": bins}
 
 
 def roc(skill):
     """Hits against false alarms."""
     alarms = np.linspace(0, 1, 60)
     return [[float(x), float(x ** (1 / (1 + skill)))] for x in alarms]
+
+
+def decision(rng, skill):
+    """How well "one of these" and "none of these" are parted."""
+    return {
+        "auroc": summary(rng, min(0.5 + 0.18 * skill, 1), 0.5),
+        "false_accepts_at_95": summary(rng, max(0.95 - 0.3 * skill, 0), 0.95),
+    }
+
+
+def risk_coverage(skill):
+    """Wrong first guesses against answers: more of them the more are answered, half of them where all are right."""
+    share = np.linspace(0.02, 1, 50)
+    return [[float(x), float((1 - 0.5 * curve(skill, 5)[0]) * x ** (0.5 * skill))] for x in share]
 
 
 def examples(rng, grasps, objects, best):
@@ -111,12 +126,16 @@ def method(rng, name, grasps, split):
             {"object_id": a, "mistaken_for": b, "share": float(s)} for (a, b), s in zip(pairs, shares, strict=True)
         ],
         "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
-        "calibration": {"slope": 0.9, "intercept": -0.1},
+        "calibration": {
+            "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},
+            "posteriors": {str(count): Posterior(slope=0.9 / count).to_dict() for count in (1, 3)},
+        },
         "reject": {
-            "auroc": summary(rng, 0.5 + 0.18 * skill, 0.5),
-            "threshold": 1.3,
+            **decision(rng, skill),
             "balanced_accuracy": summary(rng, 0.5 + 0.12 * skill, 0.5),
             "roc": roc(skill),
+            "risk_coverage": risk_coverage(skill),
+            "by_grasps": {str(count): decision(rng, skill * (1 + 0.35 * np.log(count))) for count in (1, 3)},
         },
         "examples": {"best": examples(rng, grasps, test, True), "worst": examples(rng, grasps, test, False)},
     }

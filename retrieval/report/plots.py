@@ -213,7 +213,7 @@ RELIABILITIES = {
     "pairs": "one touch, one photo, even odds",
     "k5": "5 candidates, one grasp",
     "k10": "10 candidates, one grasp",
-    "k5_g5": "5 candidates, five grasps",
+    "k5_g5": "5 candidates, 3 photos each, five grasps",
 }
 
 
@@ -254,21 +254,32 @@ def _diagram(panel: Axes, counts: Axes, diagram: Any, colour: str) -> None:
 
 
 def reject(results: Results) -> Figure:
-    """Hits against false alarms of the decision that an object is in the catalogue."""
-    figure = canvas(6.6, 4)
-    panel = figure.subplots()
-    names = [name for name in results.methods if "reject" in results.data["methods"][name]]
+    """True against false accepts of "it is one of these", and the risk of first guesses against their coverage."""
+    figure = canvas(10.5, 4.4)
+    accepts, risk = figure.subplots(1, 2)
+    names = [name for name in results.methods if results.data["methods"][name].get("reject")]
     for name in reversed(names):
-        points, style = 100 * np.array(results.data["methods"][name]["reject"]["roc"]), style_of(name)
-        panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
-        step = max(1, len(points) // 6)
-        panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
-    panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
-    panel.set(xlim=(-1, 101), ylim=(-1, 101), xlabel="accepted though its object is absent, %")
-    panel.set_ylabel("accepted where its object is there, %")
-    panel.set_aspect("equal", adjustable="box")
+        found = results.data["methods"][name]["reject"]
+        _decisions(accepts, name, found["roc"])
+        _decisions(risk, name, found["risk_coverage"])
+    accepts.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
+    accepts.axhline(95, color=FAINT, lw=0.8)
+    accepts.set(xlabel="accepted though its object is absent, %", ylabel="accepted where its object is there, %")
+    risk.axhline(50, color=FAINT, lw=0.8)
+    risk.set(xlabel="queries answered, the surest first, %", ylabel="wrong first guesses among these, %")
+    for panel in (accepts, risk):
+        panel.set(xlim=(-1, 101), ylim=(-1, 101))
+        panel.set_aspect("equal", adjustable="box")
     _legend(figure, names)
     return figure
+
+
+def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> None:
+    """A curve of many corners, with a few markers."""
+    points, style = 100 * np.array(corners), style_of(name)
+    panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
+    step = max(1, len(points) // 6)
+    panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
 
 
 # Time ------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from retrieval.posterior import FORMULA
 from retrieval.report.document import Table
 from retrieval.report.results import (
     NOTHING,
@@ -169,14 +170,39 @@ def rejects(results: Results) -> Table:
         (
             method_label(name),
             with_interval(one["auroc"]),
+            with_interval(one["false_accepts_at_95"]),
             with_interval(one["balanced_accuracy"]),
-            f"{one['threshold']:+.2f}",
         )
         for name, one in found.items()
     ]
     first = next(iter(found.values()))["auroc"]
-    header = ("method", "AUROC, %", "balanced accuracy, %", "threshold")
-    note = f"{basis(first)} Chance is 50 %. The threshold was chosen on validation objects."
+    header = ("method", "AUROC, %", "false accepts at 95 % true accepts, %", "balanced accuracy, %")
+    notes = (
+        f"{basis(first)} Chance is 50, 95 and 50 %.",
+        "Balanced accuracy is that of accepting where the posterior, fitted on validation objects, thinks one of the "
+        f"gallery's at least as likely as none: {FORMULA}.",
+    )
+    return Table(header, tuple(rows), notes)
+
+
+def rejects_by_grasps(results: Results) -> Table | None:
+    """What more grasps of the object in hand do for that decision; None where there are single ones only."""
+    found = {
+        name: results.data["methods"][name]["reject"]["by_grasps"]
+        for name in results.methods
+        if _has(results, name, "reject")
+    }
+    sizes = sorted({int(grasps) for one in found.values() for grasps in one})
+    if len(sizes) < 2:
+        return None
+    measures = {"auroc": "AUROC", "false_accepts_at_95": "false accepts at 95 %"}
+    rows = [
+        (f"{method_label(name)}, {label}", *(with_interval(one.get(str(size), {}).get(key)) for size in sizes))
+        for name, one in found.items()
+        for key, label in measures.items()
+    ]
+    header = ("%, by grasps in a query", *map(str, sizes))
+    note = "A set of grasps is asked as a whole; each number of grasps has a posterior of its own."
     return Table(header, tuple(rows), (note,))
 
 
@@ -188,22 +214,15 @@ def calibrations(results: Results, kinds: Mapping[str, str]) -> Table:
     """Expected calibration errors."""
     found = {name: results.data["methods"][name].get("reliability") for name in results.methods}
     rows = [
-        (method_label(name), *(_errors(diagrams.get(kind)) for kind in kinds))
+        (method_label(name), *(percent(diagrams.get(kind, {}).get("ece")) for kind in kinds))
         for name, diagrams in found.items()
         if diagrams
     ]
     note = (
-        "On test objects; fitted on validation objects. In brackets: the pairs' probability moved by the prior 1/K, "
-        "which does not know that exactly one candidate is true."
+        "On test objects; fitted on validation objects. Among candidates, of which one is known to be true, it is the "
+        "posterior's probability of the first guess, with a prior of none of 0."
     )
     return Table(("expected calibration error, %", *kinds.values()), tuple(rows), (note,))
-
-
-def _errors(diagram: Any) -> str:
-    if diagram is None:
-        return NOTHING
-    alone = diagram.get("ece_of_pairs")
-    return percent(diagram["ece"]) + (f" ({percent(alone)})" if alone is not None else "")
 
 
 def times(results: Results) -> Table:
