@@ -6,6 +6,7 @@ import json
 import numpy as np
 
 from retrieval.dataset import load_grasps, make_split
+from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import audit
 from retrieval.posterior import Posterior
 
@@ -154,7 +155,7 @@ def made_up(recording, methods=tuple(SKILL), seed=0):
     split = make_split(grasps, validation=0.16, test=0.2, seed=seed)
     found = {name: method(rng, name, grasps, split.to_dict()) for name in methods}
     results = {
-        "schema_version": 1,
+        "schema_version": SCHEMA_VERSION,
         "software": "0.1.0",
         "recording": {
             "path_name": recording.name,

@@ -91,6 +91,23 @@ def test_a_method_that_says_nothing_is_exactly_at_chance_in_every_measure(made):
         assert summary["value"] == pytest.approx(summary["chance"], abs=1e-12), name
 
 
+def test_whether_it_is_any_of_these_is_asked_of_single_grasps_and_by_the_number_of_grasps(made):
+    for name, method in made[0]["methods"].items():
+        found = method["reject"]
+        assert set(found) == {
+            "auroc", "false_accepts_at_95", "balanced_accuracy", "roc", "risk_coverage", "by_grasps"
+        }  # fmt: skip
+        single = found["by_grasps"]["1"]
+        assert single == {key: found[key] for key in ("auroc", "false_accepts_at_95")}, name
+        assert found["risk_coverage"][-1][0] == pytest.approx(1)
+        assert set(method["calibration"]) == {"pairs", "posteriors"}
+        assert set(method["reliability"]) == {"pairs", "k5"}
+    constant = made[0]["methods"]["constant"]["reject"]
+    said = [constant[key]["value"][0] for key in ("auroc", "false_accepts_at_95", "balanced_accuracy")]
+    assert said == pytest.approx([0.5, 0.95, 0.5], abs=1e-12)
+    assert constant["risk_coverage"] == [[pytest.approx(1), pytest.approx(0.9)]]  # one of five, of half
+
+
 def test_seeds_are_trained_where_they_make_a_difference(made):
     measures = {name: made[0]["methods"][name]["measures"]["pair_auc"] for name in FEW}
     assert [len(measures[name]["by_seed"]) for name in FEW] == [2, 2, 1, 1]
@@ -201,6 +218,9 @@ def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tm
     bare = synthetic.write_recording(tmp_path / "bare", synthetic.make_objects(12), 3, before=False)
     results = run(tmp_path / "out", recording=bare, methods=("chance",))
     assert set(results["controls"]) == {"shuffled", "blurred"}
+    assert len(results["split"]["validation"]) == 2  # too few for a posterior
+    assert results["methods"]["chance"]["reject"] is None
+    assert set(results["methods"]["chance"]["reliability"]) == {"pairs"}
 
 
 def test_grasps_are_thinned_evenly(grasped):

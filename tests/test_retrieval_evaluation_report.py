@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from retrieval.errors import BadInput, DatasetError
+from retrieval.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
 from retrieval.report.results import at_start, number, percent, short, with_interval
@@ -142,6 +143,44 @@ def test_a_control_says_whether_chance_lies_in_its_interval(made, tmp_path):
     rows = remake(made, tmp_path, change=change)[1].splitlines()
     assert next(row for row in rows if row.startswith("| before |")).endswith("| no |")
     assert next(row for row in rows if row.startswith("| shuffled |")).endswith("| yes |")
+
+
+@pytest.mark.usefixtures("words_only")
+def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(made, tmp_path):
+    def change(results):
+        found = results["methods"]["cca"]["reject"]
+        found["false_accepts_at_95"] |= {"value": [0.8123], "low": [0.7], "high": [0.9]}
+        found["by_grasps"]["3"]["auroc"] |= {"value": [0.9119], "low": [0.85], "high": [0.95]}
+
+    page, text, _ = remake(made, tmp_path, change=change)
+    words = Page(page).text
+    assert "81.2 [70.0, 90.0]" in words
+    assert "91.2 [85.0, 95.0]" in words
+    assert FORMULA in words
+    rows = text.splitlines()
+    assert next(row for row in rows if row.startswith("| CCA, AUROC |")).count("|") == 4  # one and three grasps
+    assert not any("threshold" in row for row in rows if row.startswith("| method | AUROC"))
+
+
+@pytest.mark.usefixtures("words_only")
+def test_single_grasps_alone_need_no_table_by_grasps(made, tmp_path):
+    def change(results):
+        for method in results["methods"].values():
+            method["reject"]["by_grasps"].pop("3")
+
+    assert "by grasps in a query" not in remake(made, tmp_path, change=change)[1]
+
+
+def test_too_few_objects_for_a_posterior_are_said(made, tmp_path):
+    def change(results):
+        for method in results["methods"].values():
+            method["reject"] = None
+            method["calibration"]["posteriors"] = {}
+            method["reliability"] = {"pairs": method["reliability"]["pairs"]}
+
+    _, text, files = remake(made, tmp_path, change=change)
+    assert "three validation objects at least" in text
+    assert "reject.png" not in {path.name for path in files}
 
 
 @pytest.mark.usefixtures("words_only")

@@ -1,4 +1,4 @@
 """How good a ranking is, with intervals and the level of chance."""
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Of results.json."""

@@ -132,7 +132,7 @@ def reject(builder: Builder) -> Iterator[Block | None]:
             f"ROC curves, and risk against coverage; areas under the former: {', '.join(told)}.",
             "Each query with its object in the gallery and with it taken out. Left: the decision that it is one of "
             "these; the grey line accepts 95 %. Right: first guesses that are wrong; half of the queries have no right "
-            "one, which is the grey line.",
+            "one, so that nothing that answers them all ends below the grey line.",
             plots.reject,
             builder.results,
         )
