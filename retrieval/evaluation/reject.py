@@ -149,7 +149,7 @@ def _risk_coverage(shown: Galleries, true: Bools, weights: Floats) -> list[list[
     share = np.tile(weights, 2) / 2
     levels, place = np.unique(-sure, return_inverse=True)
     answered, failed = (np.cumsum(np.bincount(place, part, len(levels))) for part in (share, share * wrong))
-    return _thinned(np.stack([answered, failed / answered], axis=1).tolist())
+    return _thinned(np.stack([answered / answered[-1], failed / answered], axis=1).tolist())
 
 
 def _thinned(points: list[list[float]]) -> list[list[float]]:
