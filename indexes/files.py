@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import RowError
+from indexes.regular import DEEPEST, is_deep, open_regular
 
 
 @contextmanager
@@ -58,8 +59,8 @@ def remove_folder(folder: Path) -> None:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as handle:
+    """SHA-256 of a regular file, in hexadecimal."""
+    with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
@@ -114,6 +115,8 @@ def encoded(document: Any, *, indent: int | None = None) -> bytes:
 
 def check_json(document: Any, what: str, row: str | None = None) -> None:
     """`document` can be stored as JSON and read back the same, or `RowError` naming `what`."""
+    if is_deep(document):
+        raise RowError(f"{what} must not be nested deeper than {DEEPEST} levels", row)
     try:
         same = json.loads(encoded(document)) == document
     except (ValueError, TypeError, RecursionError) as error:

@@ -4,7 +4,6 @@ A segment of records is three kinds of files: the rows as lines of JSON, the tab
 A record never changes; a generation is a list of segments and the order in which it shows their records.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +13,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.errors import CorruptIndex
+from indexes.errors import AGAIN, CorruptIndex
+from indexes.regular import parse_json
 from indexes.scores import Slots
 from indexes.stack import stacked
 
@@ -139,10 +139,9 @@ class Rows(Sequence[dict[str, Any]]):
 
     def _parsed(self, place: int) -> dict[str, Any]:
         try:
-            row = json.loads(self.records.line(place).decode())
-            row["id"]
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise CorruptIndex(
-                f"the row at place {place} of the index cannot be read ({error}); run `retrieve build-index` again"
-            ) from error
-        return row  # type: ignore[no-any-return]
+            row = parse_json(self.records.line(place))
+        except ValueError as error:
+            raise CorruptIndex(f"the row at place {place} of the index cannot be read ({error}); {AGAIN}") from error
+        if not isinstance(row, dict) or not isinstance(row.get("id"), str):
+            raise CorruptIndex(f"the row at place {place} of the index must be a plain object with an id; {AGAIN}")
+        return row

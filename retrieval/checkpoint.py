@@ -5,10 +5,10 @@ Nothing is unpickled. A file is written beside its place, flushed to disk, then 
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,13 @@ from torch import Tensor, nn
 from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.files import CARD, CHECKPOINT, HEADER, require_ours, write_atomically
 from retrieval.fusion import Matcher
 from retrieval.gel_check import GelCheck
 from retrieval.gel_head import GelHead
 from retrieval.posterior import Posterior
 from retrieval.stored import (
     FORMAT,
-    HEADER,
     Stored,
     file_digest,
     matcher_header,
@@ -40,6 +40,16 @@ from retrieval.version import __version__
 
 _QUERIES = "queries.touch_halves"
 _GEL_HEAD = "gel_head."
+_DTYPES = {
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+    torch.int32,
+    torch.int64,
+    torch.bool,
+    torch.uint8,
+}
 
 
 @dataclass(frozen=True)
@@ -119,10 +129,12 @@ def require_writable(path: Path) -> None:
         raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _temporary(path).touch()
-        _temporary(path).unlink()
+        with NamedTemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
+    require_ours(path, CHECKPOINT)
+    require_ours(beside(path, ".md"), CARD)
 
 
 def beside(path: Path, ending: str) -> Path:
@@ -144,24 +156,53 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         queries = state.pop(_QUERIES, None)
         matcher = _matcher(about.config, state)
+        kept = None if queries is None else _queries(about.config, queries)
     except BadInput as error:
         raise unusable(path, error) from error
-    kept = None if queries is None else queries.numpy()
     return Checkpoint(
         path, about.digest, about.config, about.provenance, about.gel_check, matcher, split, posterior, kept
     )
 
 
 def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    _require_fit(_without_memory(config, state), state)
+    matcher = _unloaded(config, state)
+    matcher.load_state_dict(state)
+    return matcher.eval()
+
+
+def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    """A matcher as it is configured; its gel head is there where the file has one."""
     matcher = Matcher(config.matcher)
     if any(name.startswith(_GEL_HEAD) for name in state):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
-    load_weights(matcher, state)
-    return matcher.eval()
+    return matcher
+
+
+def _without_memory(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    """The matcher with shapes alone: a header may ask for more memory than there is, or than can be counted."""
+    try:
+        with torch.device("meta"):
+            return _unloaded(config, state)
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
+
+
+def _queries(config: Config, queries: Tensor) -> NDArray[np.float16]:
+    if queries.dtype != torch.float16 or queries.ndim != 2 or queries.shape[1] != config.matcher.hidden:
+        raise CheckpointError(
+            f"{_QUERIES} must be float16 (touches, {config.matcher.hidden}); got {queries.dtype} {tuple(queries.shape)}"
+        )
+    return np.asarray(queries.numpy())
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
+    _require_fit(module, state)
+    module.load_state_dict(state)
+
+
+def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
     for name in sorted(got.keys() | wanted.keys()):
         if got.get(name) != wanted.get(name):
@@ -169,7 +210,6 @@ def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
                 f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
                 f"must be {wanted.get(name, 'absent')}"
             )
-    module.load_state_dict(state)
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -186,8 +226,11 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
     try:
         with safe_open(path, framework="pt") as file:
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, MemoryError) as error:
         raise unreadable(path, error) from error
+    for name, tensor in state.items():
+        if tensor.dtype not in _DTYPES:
+            raise CheckpointError(f"{path} holds {name} as {tensor.dtype}, which no checkpoint of ours does")
     checksum = header.pop("sha256", None)
     if check and checksum != _checksum(state, header):
         raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
@@ -209,23 +252,6 @@ def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before."""
-    temporary = _temporary(path)
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _model_card(name: str, header: Mapping[str, Any]) -> str:

@@ -12,7 +12,9 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from indexes.regular import read_json
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.files import write_atomically
 
 if TYPE_CHECKING:
     from indexes.manifest import Manifest
@@ -89,9 +91,7 @@ def remember(kind: str, path: Path) -> None:
         mine = {**notes.pop(here, {}), kind: str(path.resolve())}
         notes = {**dict(list(notes.items())[-MOST_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
-        beside = _state_file().with_suffix(f".{os.getpid()}.tmp")
-        beside.write_text(json.dumps(notes), "utf-8")
-        beside.replace(_state_file())
+        write_atomically(_state_file(), json.dumps(notes).encode())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
 
@@ -124,7 +124,7 @@ def _noted() -> dict[str, str]:
 def _notes() -> dict[str, dict[str, str]]:
     """By working folder, the one noted last at the end."""
     try:
-        notes = json.loads(_state_file().read_text("utf-8"))
+        notes = read_json(_state_file())
     except (OSError, RuntimeError, ValueError):
         return {}
     mine = notes.items() if isinstance(notes, dict) else ()

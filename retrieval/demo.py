@@ -6,7 +6,6 @@ make the catalogue, the touches of its last ones are the queries; no grasp gives
 
 import os
 import shutil
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from retrieval import cli
 from retrieval.answer import EXIT_CODES, MATCH
 from retrieval.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.output import say
 
 SEED = 20_000
 """Of the demo's objects; the shipped checkpoint was trained on other seeds."""
@@ -40,9 +40,9 @@ def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
         _retrieve("build-index", catalogue, "--out", index)
         gelsight = [word for grasp in queries[in_hand] for word in ("--gelsight", *grasp.touches)]
         _retrieve("query", *gelsight, "--index", index, "--html", folder / "query.html", "--top", 8)
-        _say(f"in the hand: {in_hand}, an object that the model was never trained on")
-        _say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
-        _say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
+        say(f"in the hand: {in_hand}, an object that the model was never trained on")
+        say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
+        say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
 
 
 def _check_folder(folder: Path) -> None:
@@ -101,12 +101,8 @@ def _first_places(index: Path, queries: dict[str, list[Grasp]]) -> str:
 def _retrieve(*arguments: object) -> None:
     """Say a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
-    _say("$ retrieve " + " ".join(words))
+    say("$ retrieve " + " ".join(words))
     code = cli.main(words)
     if code not in EXIT_CODES.values():  # "none of these" is an answer too
         failure = BadInput if code == BadInput.exit_code else RetrievalError
         raise failure(f"`retrieve {words[0]}` failed; what it said stands above")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

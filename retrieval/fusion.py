@@ -114,7 +114,10 @@ class Matcher(nn.Module):
 
     def gel_readings(self, features: Tensor) -> Tensor | None:
         """(B, fingers, 2) what touch features say of each finger's image (`GelHead`); None without a check."""
-        return None if self.gel_head is None else self.gel_head(features.unflatten(1, (self.config.fingers, -1)))
+        if self.gel_head is None:
+            return None
+        readings: Tensor = self.gel_head(features.view(-1, self.config.fingers, self.touch_tower.feature_count))
+        return readings
 
     def photo_entry(self, features: Tensor) -> Code:
         """Half and embedding for candidate search of photo features: what an index keeps."""

@@ -18,16 +18,17 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.regular import read_regular
 from retrieval.encoded import TouchCodes
 from retrieval.errors import CheckpointError
+from retrieval.files import SEAL
 from retrieval.resize import RgbImage
 from retrieval.stored import Stored
 
 log = logging.getLogger(__name__)
 ENDING = ".onnx"
 CHECKPOINT = "touch_retrieval.checkpoint"
-_SEAL = b"touch_retrieval.sha256"
-_SEAL_BYTES = 2 + 2 + len(_SEAL) + 2 + 64
+_SEAL_BYTES = 2 + 2 + len(SEAL) + 2 + 64
 Floats = NDArray[np.float32]
 
 
@@ -45,8 +46,20 @@ class OnnxEncoder:
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
         """Of touches, each its fingers' images in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
-        half, embedding, *readings = self._own_session().run(None, {"images": images})
-        return TouchCodes(half, embedding, readings[0] if readings else None)
+        try:
+            half, embedding, *more = self._own_session().run(None, {"images": images})
+        except Exception as error:  # its errors have no common base
+            raise CheckpointError(f"the export of this checkpoint cannot be run ({error}); export it again") from error
+        codes = TouchCodes(half, embedding, more[0] if more else None)
+        for name, values, axes in (("half", half, 2), ("embedding", embedding, 2), ("reading", codes.readings, 3)):
+            if values is None:
+                continue
+            if values.ndim != axes or len(values) != len(touches) or values.dtype != np.float32:
+                raise CheckpointError(
+                    f"the export must give a {name} of float32 for each touch, gives {values.dtype} {values.shape}; "
+                    "export the checkpoint again"
+                )
+        return codes
 
     def _own_session(self) -> Any:
         """The session of this process; a fork opens its own."""
@@ -107,13 +120,16 @@ def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:
 def sealed(model: bytes) -> bytes:
     """`model` with one more entry of metadata: `metadata_props` is field 14 of ONNX's ModelProto, a map entry has its
     key in field 1 and its value in field 2, and what stands last in a protocol buffer is merged with the rest."""
-    entry = _field(1, _SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
+    entry = _field(1, SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
     return model + _field(14, entry)
 
 
 def unsealed(path: Path) -> bytes:
     """The bytes of a sealed file. Raises CheckpointError where one of them changed."""
-    data = path.read_bytes()
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
     if len(data) <= _SEAL_BYTES or sealed(data[:-_SEAL_BYTES]) != data:
         raise CheckpointError(f"{path} is damaged or no export of `retrieve export`")
     return data

@@ -18,6 +18,7 @@ from retrieval.encoded import Encoded, Encoder, TouchCodes, TouchReader
 from retrieval.errors import BadInput
 from retrieval.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.judge import Judge
+from retrieval.listing import listed_photo, require_usable
 from retrieval.objects import JudgedObjects, Objects
 from retrieval.onnx_encoder import exported_beside
 from retrieval.posterior import NONE_PRIOR, Belief, Posterior, require_prior
@@ -62,6 +63,7 @@ class Searcher:
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
         _require(generation, stored)
+        require_usable(generation, stored.config.matcher.hidden)
         return cls(
             Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
         )
@@ -276,9 +278,9 @@ class Searcher:
         ]
 
     def _match(self, rank: int, row_number: int, logit: float, probability: float | None) -> Match:
-        row = self.generation.rows[row_number]
-        path = self.catalogue.absolute() / row["path"]
-        return Match(rank, row["object_id"], logit, probability, row["path"], row["metadata"], path)
+        photo = listed_photo(self.generation.rows[row_number])
+        path = self.catalogue.absolute() / photo.path
+        return Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path)
 
     def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
         """The formula of the probabilities, with the numbers of this answer."""

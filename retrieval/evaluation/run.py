@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from indexes.regular import read_json
 from retrieval.batches import BatchImages
-from retrieval.checkpoint import write_atomically
 from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.encode import one_thread, photo_features, touch_features
@@ -25,6 +25,7 @@ from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.features import encode_recording
+from retrieval.files import write_atomically
 from retrieval.methods import METHODS, require_known
 from retrieval.progress import Bar
 from retrieval.version import __version__
@@ -171,7 +172,7 @@ def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
     path, of = out / "audit.json", {"recording": material.digest, "split": material.split.to_dict()}
     if path.is_file():
         try:
-            kept = json.loads(path.read_text("utf-8"))
+            kept = read_json(path)
             if kept["of"] == json.loads(json.dumps(of)):
                 return dict(kept["audit"])
         except (ValueError, KeyError, TypeError):  # damaged: made again

@@ -15,10 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from indexes.regular import read_json
+from retrieval.checkpoint import Checkpoint, load_checkpoint
 from retrieval.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.features import Features, encode_recording
+from retrieval.files import write_atomically
 from retrieval.fusion import Code, score_halves
 from retrieval.progress import Bar
 
@@ -202,7 +204,7 @@ class Sample:
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, json.dumps(self._find_winners()).encode())
-        return np.array(json.loads(path.read_text("utf-8")), dtype=np.int64)
+        return np.array(read_json(path), dtype=np.int64)
 
     def _find_winners(self) -> list[int]:
         halves, found = self.queries["half"], list[int]()
