@@ -230,7 +230,6 @@ class Trainer:
             group["lr"] = settings.learning_rate * factor
 
     def _validate_and_save(self) -> None:
-        distributed.average_buffers(self.matcher)
         metrics, calibration = self.validate()
         better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
         self.best = max(self.best, metrics.get("validation_auc", -math.inf))
@@ -334,6 +333,7 @@ def build_matcher(config: Config) -> Matcher:
     for tower in (matcher.touch_tower, matcher.photo_tower):
         initialise_tower(tower, config.matcher.tower, config.training.init)
         tower.requires_grad_(not config.training.freeze_towers)
+        distributed.share_batch_statistics(tower)
     return matcher
 
 
