@@ -138,12 +138,14 @@ class Trainer:
     def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
         settings = self.config.training
         chosen = self.split.select(grasps, part)
+        # Features that are kept cost nothing to draw from all objects.
+        shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
         return PairSampler(
             chosen,
             seed=settings.seed,
             positives=settings.positives_per_touch,
             negatives=settings.negatives_per_touch,
-            share_photos=not settings.freeze_towers,  # features that are kept cost nothing to draw from all objects
+            share_photos=shared,
         )
 
     def run(self, quiet: bool = False) -> None:

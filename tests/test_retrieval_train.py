@@ -364,6 +364,24 @@ def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, 
     assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
 
 
+@pytest.mark.parametrize(
+    ("negatives", "frozen", "shared"),
+    [("auto", False, True), ("auto", True, False), ("dataset", False, False), ("batch", True, True)],
+)
+def test_negatives_come_from_the_batch_or_the_whole_set_as_set(recording, tmp_path, negatives, frozen, shared):
+    config = with_training(TINY, negatives=negatives, freeze_towers=frozen)
+    assert trainer_for(recording, tmp_path / "m.safetensors", config).sampler.share_photos is shared
+
+
+def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording, tmp_path):
+    config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
+    made = train(recording, tmp_path / "m.safetensors", config, quiet=True)
+    assert made.split.validation == ()
+    assert len(made.split.train) + len(made.split.test) == 12
+    assert made.provenance["step"] == 4
+    assert made.calibration is None
+
+
 BATCH_STATISTICS = """
 import sys, torch
 from torch import nn

@@ -139,8 +139,8 @@ def percent(share: float | None, digits: int = 1) -> str:
 
 FEW = " †"
 FEW_MEANS = (
-    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it held the truth in 50 % of "
-    "cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
+    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it held the truth in "
+    "50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
 
 

@@ -262,10 +262,12 @@ def audit(found: Any) -> Table:
     for kind, frames in found["frames"].items():
         for key, what in (("to_seen", "to training and validation objects"), ("within_object", "to its own object")):
             values = [f"{value:.2f}" for value in frames[key] or ()] or [NOTHING] * len(points)
-            close = f"{frames['close']} of {frames['test']:,}" if key == "to_seen" else ""
-            rows.append((f"{kind}, {what}", *values, close))
+            counts = (
+                (f"{frames['close']} of {frames['checked']:,}", f"{frames['test']:,}") if key == "to_seen" else ("", "")
+            )
+            rows.append((f"{kind}, {what}", *values, *counts))
     return Table(
-        ("nearest frame of each test frame", *points, f"closer than {found['threshold']}"),
+        ("nearest frame of each test frame", *points, "copies of those checked", "test frames"),
         tuple(rows),
-        (f"Quantiles of the distance, in {found['unit']}.",),
+        (f"Quantiles of the distance: {found['unit']}.",),
     )
