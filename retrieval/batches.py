@@ -89,11 +89,13 @@ class TrainedFeatures(BatchImages):
 
     def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
         """Pass each distinct image through its tower once."""
+        touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
         with autocast(self.device, self.config.training.precision):
-            touch = matcher.touch_features(loaded.touches)
-            photo = matcher.photo_features(loaded.photos)
-        batch = loaded.batch
-        return distributed.gather_rows(touch, len(batch.grasps)), distributed.gather_rows(photo, len(batch.photos))
+            with distributed.encoding(touches):
+                touch = matcher.touch_features(loaded.touches)
+            with distributed.encoding(photos):
+                photo = matcher.photo_features(loaded.photos)
+        return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
         """Encode the images of the pairs, each once."""

@@ -1,56 +1,50 @@
-"""Lint of a recording: what would spoil a training, or make its result too good to be true."""
+"""Lint of a recording: what would spoil a training, or make its result too good to be true.
+
+An ERROR is certain, or so far from the rest of the recording that nothing else explains it: do not train. A WARNING is
+a judgement by looks, or a lack: see for yourself. A NOTE says what could not be checked.
+"""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from retrieval.dataset import Grasp, Split, load_grasps
+from retrieval import doubts
+from retrieval.copies import thumbnail
+from retrieval.dataset import Attempt, Grasp, Split, load_all, require_accepted
 from retrieval.errors import DatasetError, ImageError
+from retrieval.findings import Files, Finding, Seen, named, some
 from retrieval.images import decode_rgb, read_bytes
 from retrieval.progress import Bar
 from retrieval.resize import resize
 
-_THUMBNAIL = (6, 8)
-_SHOWN = 5
+_SMALL, _PHOTO = (6, 8), (64, 64)
 
-
-@dataclass(frozen=True)
-class Finding:
-    """One remark. severity: "error" (do not train on this) or "warning". kind: short name for programs."""
-
-    severity: str
-    kind: str
-    message: str
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """What is kept of one image: the digest of its bytes and a thumbnail (6, 8, 3), or why it cannot be read."""
-
-    digest: str = ""
-    thumbnail: NDArray[np.float32] | None = None
-    broken: str = ""
+_Check = Callable[[Sequence[Grasp], Files], Iterable[Finding]]
 
 
 def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = False) -> list[Finding]:
-    """Check every image of the successful grasps, and the split where one is given. Raises DatasetError where the
-    recording cannot be read at all."""
-    grasps = load_grasps(folder)
-    files = sorted({path for grasp in grasps for path in (grasp.photo, *grasp.touches, *grasp.backgrounds)})
-    seen: dict[Path, _Seen] = {}
-    with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images", quiet=quiet) as bar:
-        for path, image in zip(files, pool.map(_look, files), strict=True):
-            seen[path] = image
-            bar.advance()
-    findings = [*_broken(folder, seen), *_single(grasps), *_duplicates(folder, grasps, seen)]
-    findings += [*_same_images(grasps, seen), *_swapped(grasps, seen)]
-    return findings + (list(check_split(grasps, split)) if split else [])
+    """Check every photo and gel image of a recording, those of rejected grasps too, and the split where one is given.
+
+    Depth pictures are not opened: nothing is trained on them. A grasp that one check names is left out of the later
+    ones. Raises DatasetError where the recording cannot be read at all, or holds no accepted grasp.
+    """
+    attempts = load_all(folder)
+    accepted = require_accepted(folder, attempts)
+    seen = _look_at_all(attempts, quiet)
+    grasps = [attempt.grasp for attempt in attempts]
+    findings = [*_broken(folder, seen), *_single(accepted), *_duplicates(folder, grasps, seen)]
+    whole = [one.grasp for one in attempts if all(not seen[path].broken for path in _pictures(one))]
+    trained_on = {grasp.grasp_id for grasp in accepted}
+    of_all: tuple[_Check, ...] = (_same_images, doubts.swapped, doubts.fingers, doubts.moments)
+    of_accepted: tuple[_Check, ...] = (doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies)
+    for check in of_all + of_accepted:
+        known = {name for finding in findings for name in finding.grasps}
+        left = [grasp for grasp in whole if grasp.grasp_id not in known]
+        findings += check([one for one in left if check in of_all or one.grasp_id in trained_on], seen)
+    findings += check_split(accepted, split) if split else []
+    return sorted(findings, key=lambda finding: finding.severity == "note")
 
 
 def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
@@ -62,7 +56,7 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
             part_of[name].add(part)
     shared = sorted(name for name, on in part_of.items() if len(on) > 1)
     if shared:
-        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {_some(shared)}")
+        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {some(shared)}")
     sides: dict[str, set[str]] = defaultdict(set)
     for grasp in grasps:
         if grasp.sequence_id is not None:
@@ -73,17 +67,17 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
             "error",
             "split-sequences",
             f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides: "
-            f"{_some(leaking)}",
+            f"{some(leaking)}",
         )
     recorded = {grasp.object_id for grasp in grasps}
     unknown = sorted(set(part_of) - recorded)
     if unknown:
         yield Finding(
-            "warning", "split-unknown", f"the split names {len(unknown)} object(s) not recorded: {_some(unknown)}"
+            "warning", "split-unknown", f"the split names {len(unknown)} object(s) not recorded: {some(unknown)}"
         )
     absent = sorted(recorded - set(part_of))
     if absent:
-        yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {_some(absent)}")
+        yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {some(absent)}")
 
 
 def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
@@ -99,15 +93,41 @@ def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
             )
 
 
-def _look(path: Path) -> _Seen:
-    try:
-        data = read_bytes(path)
-        return _Seen(sha256(data).hexdigest(), resize(decode_rgb(data, path), _THUMBNAIL))
-    except ImageError as error:
-        return _Seen(broken=error.reason)
+# Files -----------------------------------------------------------------------------------------------------
 
 
-def _broken(folder: Path, seen: dict[Path, _Seen]) -> Iterable[Finding]:
+def _pictures(attempt: Attempt) -> tuple[Path, ...]:
+    grasp = attempt.grasp
+    return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
+
+
+def _look_at_all(attempts: Sequence[Attempt], quiet: bool) -> Files:
+    files = sorted({path for attempt in attempts for path in _pictures(attempt)})
+    photos = {attempt.grasp.photo for attempt in attempts}
+    copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
+
+    def look(path: Path) -> Seen:
+        try:
+            data = read_bytes(path)
+            image = decode_rgb(data, path)
+        except ImageError as error:
+            return Seen(broken=error.reason)
+        return Seen(
+            sha256(data).hexdigest(),
+            resize(image, _SMALL),
+            resize(image, _PHOTO) if path in photos else None,
+            thumbnail(data, image) if path in copied else None,
+        )
+
+    seen: Files = {}
+    with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images", quiet=quiet) as bar:
+        for path, found in zip(files, pool.map(look, files), strict=True):
+            seen[path] = found
+            bar.advance()
+    return seen
+
+
+def _broken(folder: Path, seen: Files) -> Iterator[Finding]:
     for path, image in seen.items():
         if image.broken:
             yield Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
@@ -121,11 +141,11 @@ def _single(grasps: Sequence[Grasp]) -> Iterable[Finding]:
             "warning",
             "one-grasp",
             f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
-            f"the same moment: {_some(single)}",
+            f"the same moment: {some(single)}",
         )
 
 
-def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:
+def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     """The same bytes under two objects."""
     holders: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
@@ -135,60 +155,18 @@ def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: dict[Path, _Seen]) 
     for objects in holders.values():
         if len(objects) > 1:
             where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
-            yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {_some(where)}")
+            yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {some(where)}")
 
 
-def _same_images(grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:
+def _same_images(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     """The same bytes for the photo and a touch, or for two fingers, of one grasp."""
     kinds = {"same-modality": ("error", "photo and touch are"), "same-fingers": ("warning", "two fingers have")}
     names: dict[str, list[str]] = {kind: [] for kind in kinds}
     for grasp in grasps:
-        touches = [seen[path].digest for path in grasp.touches if seen[path].digest]
+        touches = [seen[path].digest for path in grasp.touches]
         if seen[grasp.photo].digest in touches:
             names["same-modality"].append(grasp.grasp_id)
         if len(set(touches)) < len(touches):
             names["same-fingers"].append(grasp.grasp_id)
     for kind, (severity, what) in kinds.items():
-        if names[kind]:
-            where = f"in {len(names[kind])} of {len(grasps)} grasps: {_some(names[kind])}"
-            yield Finding(severity, kind, f"{what} the same image {where}")
-
-
-def _swapped(grasps: Sequence[Grasp], seen: dict[Path, _Seen]) -> Iterable[Finding]:
-    """Gel images share one look (the gel's tint and lamps); photos of different objects do not.
-
-    So thumbnails of touches lie close to their median and those of photos lie far from it. A grasp whose photo lies
-    closer than its touch is suspect; when the photos of the whole recording are the tighter cloud, everything is.
-    """
-    usable = [grasp for grasp in grasps if all(not seen[path].broken for path in (grasp.photo, grasp.touches[0]))]
-    if len(usable) < 3:
-        return
-    touches = np.array([seen[grasp.touches[0]].thumbnail for grasp in usable])
-    photos = np.array([seen[grasp.photo].thumbnail for grasp in usable])
-    if _spread(photos) < _spread(touches) / 2:
-        yield Finding(
-            "error",
-            "swapped",
-            "touches and photos look swapped throughout (the photos are the more alike); exchange the columns",
-        )
-        return
-    look = np.median(touches, axis=0)
-    closer = _distance(photos, look) < _distance(touches, look) / 2
-    names = [grasp.grasp_id for grasp, suspect in zip(usable, closer, strict=True) if suspect]
-    if names:
-        yield Finding(
-            "error", "swapped", f"touch and photo look swapped in {len(names)} of {len(usable)} grasps: {_some(names)}"
-        )
-
-
-def _spread(images: NDArray[np.float32]) -> float:
-    return float(np.median(_distance(images, np.median(images, axis=0))))
-
-
-def _distance(images: NDArray[np.float32], centre: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3)))  # type: ignore[no-any-return]
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+        yield from named(severity, kind, f"{what} the same image", names[kind], grasps)

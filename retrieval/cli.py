@@ -114,8 +114,8 @@ def run_check(arguments: argparse.Namespace) -> None:
         print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
     for finding in findings:
         say(f"{finding.severity}: {finding.message}")
-    errors = sum(finding.severity == "error" for finding in findings)
-    say(f"{arguments.recording}: {errors} error(s), {len(findings) - errors} warning(s)")
+    errors, warnings = (sum(one.severity == severity for one in findings) for severity in ("error", "warning"))
+    say(f"{arguments.recording}: {errors} error(s), {warnings} warning(s)")
     if errors:
         raise RetrievalError(f"{arguments.recording} is not fit for training; see the errors above")
 

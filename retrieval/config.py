@@ -54,10 +54,12 @@ class TrainingConfig:
     term; 0 is exactly the paper's loss, and leaves the embeddings untrained. listwise_weight: weight of a term that
     asks each touch of a batch to pick its object's photos by match logit out of all photos of the batch; 0 in the
     paper. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way round would; not in
-    the paper. freeze_batch_norm: keep the batch
-    statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
-    encoded once for the whole training. distil_steps: steps of teaching the pruner after training, where the matcher
-    has one (`retrieval.distil`). validation_fraction, test_fraction: shares of the objects.
+    the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the paper; "batch" from the
+    photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is "batch" where towers are
+    trained. freeze_batch_norm: keep the batch statistics of the initial weights. freeze_towers: train only what comes
+    after the towers; every image is then encoded once for the whole training. distil_steps: steps of teaching the
+    pruner after training, where the matcher has one (`retrieval.distil`). validation_fraction, test_fraction: shares of
+    the objects.
     """
 
     init: str = "imagenet"
@@ -70,6 +72,7 @@ class TrainingConfig:
     contrastive_weight: float = 0.0
     listwise_weight: float = 0.0
     shuffle_fingers: bool = False
+    negatives: str = "auto"
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
     distil_steps: int = 600
@@ -94,7 +97,7 @@ class TrainingConfig:
             weight = getattr(self, name)
             _require(0 <= weight < math.inf, f"{name} must be a number from 0; got {weight}")
         _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
-        for name, known in (("schedule", SCHEDULES), ("precision", PRECISIONS)):
+        for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
             _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
         held_out = (self.validation_fraction, self.test_fraction)
@@ -109,6 +112,7 @@ class TrainingConfig:
 
 
 SCHEDULES = ("constant", "cosine")
+NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 

@@ -38,7 +38,12 @@ def load_grasps(folder: Path) -> list[Grasp]:
 
     Raises DatasetError for an unreadable recording, one without such grasps, or one that mixes numbers of fingers.
     """
-    grasps = [_as_grasp(folder, grasp) for grasp in _recorded(folder) if grasp.grasped is not False]
+    return require_accepted(folder, load_all(folder))
+
+
+def require_accepted(folder: Path, attempts: Iterable["Attempt"]) -> list[Grasp]:
+    """The accepted grasps of a recording read by `load_all`. Raises DatasetError as `load_grasps` does."""
+    grasps = [attempt.grasp for attempt in attempts if attempt.accepted]
     if not grasps:
         raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
     finger_count(grasps)
@@ -49,12 +54,14 @@ def load_grasps(folder: Path) -> list[Grasp]:
 class Attempt:
     """One closing of the gripper, whatever came of it.
 
-    outcome: "held", or what went wrong: "missed", "slipped", or "failed" where the recording does not say which.
-    after: the frames after the lift, one file per finger in order, or empty.
+    outcome: "held", or what went wrong: "missed", "slipped", "no_plan", or "failed" where the recording does not say
+    which; "unknown" where it says nothing. accepted: whether a matcher is trained on it. after: the frames after the
+    lift, one file per finger in order, or empty.
     """
 
     grasp: Grasp
     outcome: str
+    accepted: bool
     after: tuple[Path, ...]
 
     @property
@@ -63,27 +70,36 @@ class Attempt:
         return self.outcome == "held"
 
 
+def load_all(folder: Path) -> list[Attempt]:
+    """Read every line of a recording, in the order of collection. Raises DatasetError for an unreadable one."""
+    return [
+        Attempt(
+            _as_grasp(folder, grasp),
+            _outcome(grasp),
+            grasp.grasped is not False,
+            _in_finger_order(folder, grasp.touches_after),
+        )
+        for grasp in _recorded(folder)
+    ]
+
+
 def load_attempts(folder: Path) -> list[Attempt]:
     """Read the successful AND the failed grasps of a recording, in the order of collection.
 
     A grasp counts by its `outcome`, and where that was not recorded by `grasped`; left out are those with neither,
     and plans that never came to a grasp. Raises DatasetError as `load_grasps` does.
     """
-    attempts = [
-        Attempt(_as_grasp(folder, grasp), outcome, _in_finger_order(folder, grasp.touches_after))
-        for grasp in _recorded(folder)
-        if (outcome := _outcome(grasp)) not in (None, "no_plan")
-    ]
+    attempts = [attempt for attempt in load_all(folder) if attempt.outcome not in ("unknown", "no_plan")]
     if not attempts:
         raise DatasetError(f"{folder} must say of its grasps whether they succeeded (grasped, outcome); none says so")
     finger_count([attempt.grasp for attempt in attempts])
     return attempts
 
 
-def _outcome(grasp: RecordedGrasp) -> str | None:
+def _outcome(grasp: RecordedGrasp) -> str:
     if grasp.outcome is not None:
         return grasp.outcome
-    return None if grasp.grasped is None else "held" if grasp.grasped else "failed"
+    return "unknown" if grasp.grasped is None else "held" if grasp.grasped else "failed"
 
 
 def _recorded(folder: Path) -> tuple[RecordedGrasp, ...]:

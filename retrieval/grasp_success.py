@@ -42,6 +42,7 @@ from retrieval.dataset import (
 )
 from retrieval.encode import batches, one_thread, touch_batch
 from retrieval.errors import ConfigError, DatasetError, NumericalError
+from retrieval.evaluation.intervals import FEW_OBJECTS
 from retrieval.evaluation.metrics import grouped_interval
 from retrieval.gate import TASK, Gate, GateSettings, GraspNet
 from retrieval.gate import load_gate as load_gate
@@ -90,6 +91,11 @@ class GateReport:
             f"{self.validation_grasps} grasps of {self.validation_objects} other objects; always giving the commoner "
             f"answer: {self.chance:.3f}"
         )
+        if self.validation_objects < FEW_OBJECTS:
+            yield (
+                f"so few objects ({self.validation_objects}) cannot show how much objects differ: the interval is too "
+                "narrow, and holds the truth less often than in 95 % of cases (2 objects: 79 %, 3: 86 %, 4: 89 %)"
+            )
         yield "accepted: " + ", ".join(f"{part} of {whole} {name}" for name, (part, whole) in self.accepted.items())
         if self.least:
             yield f"held grasps are accepted least often of {self.least[0]}: {self.least[1]:.0%}"

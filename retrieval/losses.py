@@ -23,12 +23,14 @@ def match_loss(logits: Tensor, labels: Tensor) -> Tensor:
 def contrastive_loss(
     touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor, log_scale: Tensor
 ) -> Tensor:
-    """Symmetric cross-entropy between unit embeddings of touches (T, d) and photos (N, d).
+    """Symmetric cross-entropy between unit embeddings of touches (T, d) and photos (N, d); scores are exp(log_scale)
+    times their cosines. `*_objects` are integer labels (T,), (N,).
 
-    Each touch must pick each photo of its own object out of the photos of OTHER objects: photos of the same object
-    are never negatives of each other, and so the other way round (InfoNCE with several positives: Khosla et al.,
-    NeurIPS 2020, eq. 2, with the positives taken out of the denominator). `*_objects` are integer labels (T,), (N,).
-    Zero where no touch has both a positive and a negative.
+    Each touch must pick each photo of its own object out of that photo and the photos of OTHER objects: photos of the
+    same object are never negatives of each other (InfoNCE with several positives: Khosla et al., NeurIPS 2020, eq. 2,
+    with the other positives taken out of the denominator). Mean over a touch's photos, then over the touches that have
+    a photo of their own object and one of another. The same is asked of each photo among the touches, and the loss is
+    the mean of the two; a way in which nobody has both adds zero.
     """
     scores = log_scale.float().exp() * touch.float() @ photo.float().T
     return listwise_loss(scores, touch_objects, photo_objects)

@@ -138,12 +138,14 @@ class Trainer:
     def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
         settings = self.config.training
         chosen = self.split.select(grasps, part)
+        # Features that are kept cost nothing to draw from all objects.
+        shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
         return PairSampler(
             chosen,
             seed=settings.seed,
             positives=settings.positives_per_touch,
             negatives=settings.negatives_per_touch,
-            share_photos=not settings.freeze_towers,  # features that are kept cost nothing to draw from all objects
+            share_photos=shared,
         )
 
     def run(self, quiet: bool = False) -> None:
@@ -237,7 +239,6 @@ class Trainer:
             group["lr"] = settings.learning_rate * factor
 
     def _validate_and_save(self) -> None:
-        distributed.average_buffers(self.matcher)
         metrics = self.validate()
         better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
         self.best = max(self.best, metrics.get("validation_auc", -math.inf))
@@ -337,6 +338,7 @@ def build_matcher(config: Config) -> Matcher:
     for tower in (matcher.touch_tower, matcher.photo_tower):
         initialise_tower(tower, config.matcher.tower, config.training.init)
         tower.requires_grad_(not config.training.freeze_towers)
+        distributed.share_batch_statistics(tower)
     return matcher
 
 

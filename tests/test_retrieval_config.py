@@ -60,8 +60,19 @@ def test_the_defaults_are_the_papers_which_has_no_pruner():
     assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, pruner_width=0))
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_every_preset_has_embeddings_to_search_candidates_by(name):
+def test_paper_exact_sets_back_what_the_table_of_differences_says_can_be():
+    paper, exact = load_config("paper"), load_config("paper-exact")
+    training = dataclasses.replace(
+        paper.training, validation_fraction=0.0, negatives="dataset", precision="float32", distil_steps=600
+    )
+    assert exact == dataclasses.replace(paper.without_pruner(), training=training)
+    table = (Path(__file__).parents[1] / "docs" / "paper.md").read_text("utf-8")
+    for setting in ("validation_fraction = 0.0", 'negatives = "dataset"', 'precision = "float32"', "pruner_width = 0"):
+        assert f"`{setting}`" in table
+
+
+@pytest.mark.parametrize("name", [name for name in preset_names() if name != "paper-exact"])
+def test_every_preset_but_that_of_the_paper_alone_has_embeddings_to_search_candidates_by(name):
     config = load_config(name)
     assert config.matcher.pruner_width > 0
     assert config.has_embeddings

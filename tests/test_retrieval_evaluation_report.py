@@ -184,6 +184,23 @@ def test_too_few_objects_for_a_posterior_are_said(made, tmp_path):
 
 
 @pytest.mark.usefixtures("words_only")
+def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table_that_holds_one(made, tmp_path):
+    def change(results):
+        for method in results["methods"].values():
+            method["measures"]["pair_accuracy"]["few_objects"] = True
+        results["comparisons"][0]["few_objects"] = True
+
+    assert "† Fewer than 5 objects" not in remake(made, tmp_path)[1]
+    page, text, _ = remake(made, tmp_path, change=change)
+    for written in (page, text):
+        assert "] †" in written
+        # The headline, the methods side by side, the differences, the controls, and every number.
+        assert written.count("† Fewer than 5 objects: the interval is too narrow.") == 5
+    row = next(line for line in text.splitlines() if line.startswith("| late fusion |"))
+    assert row.count("†") == 1  # of its columns only the one from too few objects
+
+
+@pytest.mark.usefixtures("words_only")
 def test_leakage_is_set_apart(made, tmp_path):
     def change(results):
         results["audit"] |= {"clean": False, "verdict": "Leakage is possible: 3 file(s)."}

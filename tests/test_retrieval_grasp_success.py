@@ -162,6 +162,7 @@ def test_the_frame_after_the_lift_is_judged_where_there_is_one(attempts, tmp_pat
 def test_the_report_says_how_good_chance_is_and_what_was_accepted(trained):
     text = "\n".join(trained[1].lines())
     assert "accuracy 1.000 (95 %: 0.631 to 1.000) on 8 grasps of 2 other objects" in text
+    assert "so few objects (2) cannot show how much objects differ: the interval is too narrow" in text
     assert "always giving the commoner answer: 0.500" in text
     assert "accepted: 4 of 4 held, 0 of 4 missed" in text
 

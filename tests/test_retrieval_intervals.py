@@ -153,6 +153,21 @@ def test_with_few_objects_the_plain_percentile_interval_is_too_narrow_and_ours_i
     assert ours >= 0.91 > plain
 
 
+@pytest.mark.parametrize(("objects", "stated"), [(2, 0.50), (3, 0.74), (4, 0.87), (5, 0.91), (7, 0.94), (10, 0.94)])
+def test_how_often_the_interval_of_few_objects_holds_the_truth_is_as_stated(objects, stated):
+    """1,500 samples of normal object means, whose shares scatter by 0.013."""
+    means = np.random.default_rng(objects).normal(size=(objects, 1500))
+    low, high = bootstrap_interval(means, draws=1000)
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(stated, abs=0.04)
+
+
+def test_results_of_fewer_than_five_objects_say_so():
+    for objects, few in ((1, True), (2, True), (4, True), (5, False), (12, False)):
+        measure = measure_of(some_objects(objects))
+        assert summarise([measure])["few_objects"] is few
+        assert compare([measure], [measure])["few_objects"] is few
+
+
 # Comparisons -----------------------------------------------------------------------------------------------
 
 

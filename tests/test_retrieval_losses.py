@@ -9,6 +9,7 @@ from retrieval.losses import (
     LOG_SCALE_MAX,
     SIGMOID_BIAS_INIT,
     SIGMOID_LOG_SCALE_INIT,
+    _pick_loss,
     contrastive_loss,
     listwise_loss,
     match_loss,
@@ -61,6 +62,23 @@ def test_a_batch_of_one_object_has_no_contrast_and_no_nan():
     loss.backward()
     assert loss.item() == 0.0
     assert torch.equal(touch.grad, torch.zeros_like(touch))
+
+
+def test_a_row_of_positives_alone_has_nothing_to_pick_from_and_does_not_thin_the_mean():
+    """Rows: two positives; a positive at 1 beside a negative at 3; two negatives. Only the second one counts."""
+    scores = torch.tensor([[5.0, -5.0], [1.0, 3.0], [0.0, 0.0]], requires_grad=True)
+    loss = _pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
+    loss.backward()
+    assert loss.item() == pytest.approx(math.log(1 + math.exp(2)), rel=1e-6)
+    assert torch.equal(scores.grad[[0, 2]], torch.zeros(2, 2))
+    assert scores.grad[1].tolist() == pytest.approx([-1 / (1 + math.exp(-2)), 1 / (1 + math.exp(-2))], rel=1e-6)
+
+
+def test_photos_count_where_no_touch_has_both_a_positive_and_a_negative():
+    """One photo of object 0, touches of 0 and 1: the photo picks between them, and the mean halves its loss."""
+    touch, photo = torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([[1.0, 0.0]])
+    loss = contrastive_loss(touch, photo, torch.tensor([0, 1]), torch.tensor([0]), torch.tensor(0.0))
+    assert loss.item() == pytest.approx(math.log(1 + math.exp(-1)) / 2, rel=1e-6)
 
 
 def test_the_hardest_pair_at_the_largest_scale_keeps_its_loss_and_gradient():

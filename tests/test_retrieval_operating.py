@@ -102,6 +102,30 @@ def test_fewer_touches_are_asked_of_more_photos_but_never_too_few(checkpoint, ga
         assert Bench(checkpoint, *gallery).queries == queries
 
 
+def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_place(checkpoint, gallery, monkeypatch):
+    """By a clock that the search and the judging put forward: 9, 1, 2 ms and 4, 6, 100 ms."""
+    now = [0.0]
+    bench = Bench(checkpoint, *gallery, clock=lambda: now[0])
+    index, judged = bench.built("flat"), []
+    search, searching, judging = index.search, iter((9, 1, 2)), iter((4, 6, 100))
+
+    def slow_search(queries, k):
+        now[0] += next(searching) / 1e3
+        return search(queries, k)
+
+    def slow_judge(head, touch, halves, rows):
+        now[0] += next(judging) / 1e3
+        judged.append(rows.tolist())
+
+    monkeypatch.setattr(operating, "TIMED", 3)
+    monkeypatch.setattr(index, "search", slow_search)
+    monkeypatch.setattr(operating, "score_halves", slow_judge)
+    assert bench.times(index, 8) == pytest.approx((2.0, 6.0))
+    for rows in judged:  # eight different photos, in the order in which they lie on the disk
+        assert rows == sorted(set(rows))
+        assert len(rows) == 8
+
+
 class Scripted:
     """A bench whose points are written down: {(kind, k): (found of 100, search ms, judging ms)}; k = 1000 is all."""
 

@@ -382,11 +382,7 @@ def gradients(recording, tmp_path, ranks, loss):
     """Gradients of one batch, reckoned by so many ranks."""
     script, out = tmp_path / "gradients.py", tmp_path / f"{loss}{ranks}.pt"
     script.write_text(GRADIENTS)
-    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, *torchrun, str(script), str(recording), str(out), loss]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 0, done.stderr
+    run_ranks(script, ranks, recording, out, loss)
     return torch.load(out, weights_only=True)
 
 
@@ -407,6 +403,90 @@ def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, 
     reference = gradients(recording, tmp_path, 1, "contrast")
     assert difference(gradients(recording, tmp_path, 2, "contrast"), reference) < 1e-5
     assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("negatives", "frozen", "shared"),
+    [("auto", False, True), ("auto", True, False), ("dataset", False, False), ("batch", True, True)],
+)
+def test_negatives_come_from_the_batch_or_the_whole_set_as_set(recording, tmp_path, negatives, frozen, shared):
+    config = with_training(TINY, negatives=negatives, freeze_towers=frozen)
+    assert trainer_for(recording, tmp_path / "m.safetensors", config).sampler.share_photos is shared
+
+
+def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording, tmp_path):
+    config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
+    made = train(recording, tmp_path / "m.safetensors", config, quiet=True)
+    assert made.split.validation == ()
+    assert len(made.split.train) + len(made.split.test) == 12
+    assert made.provenance["step"] == 4
+    assert made.calibration is None
+
+
+BATCH_STATISTICS = """
+import sys, torch
+from torch import nn
+from retrieval import distributed
+from retrieval.towers import build_tower
+
+torch.set_num_threads(1)
+distributed.start()
+torch.manual_seed(0)
+if sys.argv[1] == "resnet18":
+    tower, images = build_tower("resnet18", "pooled").double(), torch.randn(5, 3, 64, 64).double()
+    encode = tower._encode  # without the check that images are in single precision
+else:
+    tower = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 2, 3), nn.BatchNorm2d(2))
+    encode, images = tower.double(), 30 + torch.randn(4, 3, 8, 8).double()
+if sys.argv[2] == "all":
+    distributed.share_batch_statistics(tower)
+with distributed.encoding(len(images)):
+    local = encode(images[distributed.share(len(images))])
+rows = distributed.gather_rows(local.flatten(1), len(images))
+loss = (rows * torch.randn(rows.shape).double()).sum() + rows.square().square().mean()
+loss.backward()
+distributed.average_gradients(tower)
+made = {name: value.grad for name, value in tower.named_parameters() if value.grad is not None}
+made |= {"loss": loss.detach()} | {name: value for name, value in tower.named_buffers() if "running" in name}
+torch.save(made, f"{sys.argv[3]}.{distributed.rank()}")
+distributed.stop()
+"""
+
+
+def run_ranks(script, ranks, *arguments):
+    """Run a script on so many ranks."""
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *torchrun, str(script), *map(str, arguments)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def of_one_batch(tmp_path, tower, ranks, statistics="all"):
+    """Of every rank: loss, gradients and running statistics of a tower after one batch, in double precision, so that
+    no ReLU falls the other way by rounding."""
+    script, out = tmp_path / "statistics.py", tmp_path / f"{ranks}{statistics}"
+    script.write_text(BATCH_STATISTICS)
+    run_ranks(script, ranks, tower, statistics, out)
+    return [torch.load(f"{out}.{rank}", weights_only=True) for rank in range(ranks)]
+
+
+def test_batch_statistics_are_those_of_all_ranks_images_each_counted_once(tmp_path):
+    """Four images on three ranks: the last share holds nothing new, the fourth image again and again."""
+    (one,) = of_one_batch(tmp_path, "tiny", 1)
+    three, *others = of_one_batch(tmp_path, "tiny", 3)
+    assert difference(three, one) < 1e-12
+    for other in others:  # the ranks stay one model, to the bit
+        assert all(torch.equal(other[name], three[name]) for name in three)
+
+
+@pytest.mark.slow
+def test_two_ranks_of_a_resnet_are_one_process(tmp_path):
+    (one,) = of_one_batch(tmp_path, "resnet18", 1)
+    assert difference(of_one_batch(tmp_path, "resnet18", 2)[0], one) < 1e-9
+    naive = of_one_batch(tmp_path, "resnet18", 2, statistics="own")[0]
+    assert difference(naive, one) > 0.3
+    assert abs(naive["loss"] - one["loss"]) > 0.01 * abs(one["loss"])
 
 
 TINY_TOML = """

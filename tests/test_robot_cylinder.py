@@ -284,10 +284,19 @@ def width_by_points(fit, yaw, finger):
     return 2 * most
 
 
+@pytest.mark.parametrize("half_mm", [(75.0, 10.0), (10.0, 75.0)])
 @pytest.mark.parametrize("yaw", [0.3, 0.8, 1.2, 2.0, 3.0])
-def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw):
-    fit = CylinderFit(0, 0, 100, 10, 1, "box", (75.0, 10.0), 0.3)
+def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw, half_mm):
+    fit = CylinderFit(0, 0, 100, 10, 1, "box", half_mm, 0.3)
     assert fit.width_mm(yaw, 25.0) == pytest.approx(width_by_points(fit, yaw, 25.0), abs=1.0)
+
+
+def test_fingers_that_pass_between_the_corners_meet_the_end_of_a_box():
+    """A box 20 mm long and 150 mm wide, closed on along its length by fingers of 25 mm: 20 mm. Turned by 0.2 rad the
+    strip leaves through the same end: 2 (10 + 12.5 sin 0.2) / cos 0.2."""
+    fit = CylinderFit(0, 0, 100, 10, 1, "box", (10.0, 75.0))
+    assert fit.width_mm(0.0, 25.0) == pytest.approx(20.0)
+    assert fit.width_mm(0.2, 25.0) == pytest.approx(25.4736, abs=1e-3)
 
 
 def test_a_round_thing_is_as_wide_from_all_sides():

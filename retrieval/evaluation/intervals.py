@@ -4,6 +4,15 @@ What a value means: the mean over objects of the mean over the object's queries;
 there are several. What an interval covers: other objects drawn as these were. What it does not: another recording,
 rig, light or split, and, since seeds are averaged first, more training seeds than those that ran. Queries of one
 object are alike; resampled one by one they give intervals that are far too narrow.
+
+Few objects cannot show how much objects differ. How often the interval held the truth, of 4,000 samples each of object
+means that are normal, and of shares drawn as Beta(2.8, 1.2) and counted in 20 queries:
+
+    objects   2    3    4    5    6    7    8    9   10
+    normal   50   74   87   91   93   94   94   94   94 %
+    shares   56   76   89   91   92   94   95   95   94 %
+
+So results say `few_objects` where there are fewer than 5, and every table marks these intervals.
 """
 
 from collections.abc import Sequence
@@ -17,13 +26,17 @@ from retrieval.errors import BadInput
 from retrieval.evaluation.table import Measure
 
 LEVEL = 0.95
+FEW_OBJECTS = 5
+"""With fewer, an interval holds the truth far less often than LEVEL."""
+
 _EXACT_UP_TO = 18  # objects: 2 ** 17 sign flips, the other half being their mirror image
 
 
 def summarise(measures: Sequence[Measure], *, draws: int = 10_000, seed: int = 0) -> dict[str, Any]:
     """The "summary" of results.json: one measure a training seed, in the order of the seeds.
 
-    {"value": [m], "low": [m], "high": [m], "chance": [m], "queries", "objects", "gallery", "by_seed": [[m], ...]}.
+    {"value": [m], "low": [m], "high": [m], "chance": [m], "queries", "objects", "few_objects": whether so few that
+    the interval says less than it should, "gallery", "by_seed": [[m], ...]}.
     """
     means = _object_means(measures)
     every = means.mean(0)
@@ -37,6 +50,7 @@ def summarise(measures: Sequence[Measure], *, draws: int = 10_000, seed: int = 0
         "chance": first.chance.tolist(),
         "queries": len(first.owner),
         "objects": int(means.shape[1]),
+        "few_objects": means.shape[1] < FEW_OBJECTS,
         "gallery": first.gallery,
         "by_seed": means.mean(1).tolist(),
     }
@@ -75,8 +89,9 @@ def bootstrap_interval(
 
 def compare(
     a: Sequence[Measure], b: Sequence[Measure], *, column: int = 0, draws: int = 10_000, seed: int = 0
-) -> dict[str, float]:
-    """Two methods on the same queries: {"difference": a - b, "low", "high", "p"}, objects being the units.
+) -> dict[str, float | bool]:
+    """Two methods on the same queries: {"difference": a - b, "low", "high", "few_objects", "p"}, objects being the
+    units.
 
     column: of a guess curve, 0 is the first guess. p: two-sided sign-flip permutation test of the objects'
     differences, over all flips up to 18 objects, else over `draws` drawn ones (Phipson and Smyth 2010: none is ever
@@ -90,6 +105,7 @@ def compare(
         "difference": float(differences.mean()),
         "low": float(np.clip(low[0], -1, 1)),
         "high": float(np.clip(high[0], -1, 1)),
+        "few_objects": len(differences) < FEW_OBJECTS,
         "p": sign_flip_p(differences, draws=draws, seed=seed),
     }
 

@@ -17,7 +17,7 @@ from retrieval.dataset import Split
 from retrieval.encode import one_thread, photo_features, touch_features
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.audit import audit
+from retrieval.evaluation.audit import UNIT, audit
 from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.controls import METHOD, control_benches, score_control
 from retrieval.evaluation.intervals import compare
@@ -169,7 +169,8 @@ def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[st
 
 def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
     """The leakage audit; it reads every image, so it is kept."""
-    path, of = out / "audit.json", {"recording": material.digest, "split": material.split.to_dict()}
+    path = out / "audit.json"
+    of = {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT}
     if path.is_file():
         try:
             kept = read_json(path)

@@ -127,7 +127,7 @@ def audit(builder: Builder) -> Iterator[Block | None]:
         ]
         yield builder.picture(
             "nearest.jpg",
-            f"Test frames beside the nearest frames fitted or chosen on; grey levels apart: {', '.join(gaps)}.",
+            f"Test frames beside the nearest frames fitted or chosen on; distances: {', '.join(gaps)}.",
             "The nearest frames on both sides of the split. Copies would look the same here; two light touches "
             "look alike without being copies.",
             galleries.nearest_frames,

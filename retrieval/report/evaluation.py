@@ -11,7 +11,16 @@ from retrieval.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.report import comparing, looking, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown
-from retrieval.report.results import at_start, measure_label, method_label, percent, read_results, with_interval
+from retrieval.report.results import (
+    FEW,
+    FEW_MEANS,
+    at_start,
+    measure_label,
+    method_label,
+    percent,
+    read_results,
+    with_interval,
+)
 
 PAPER = (
     "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "
@@ -73,7 +82,8 @@ def _headline(builder: Builder) -> str:
         f"{measure_label(key)}: {with_interval(summary)} (chance {percent(summary['chance'][0])})"
         for key, summary in found
     ]
-    return f"{at_start(method_label(builder.main))} on unseen objects, in percent. {at_start('; '.join(told))}."
+    text = f"{at_start(method_label(builder.main))} on unseen objects, in percent. {at_start('; '.join(told))}."
+    return f"{text} {FEW_MEANS}" if FEW in text else text
 
 
 def _setting(builder: Builder) -> Iterator[Block | None]:

@@ -77,7 +77,7 @@ def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
     for row, kind in enumerate(kinds):
         for column, pair in enumerate(frames[kind]["nearest"][:shown]):
             left, top = 2.35 * column, 1.5 * row
-            panel.text(left, top - 0.05, f"{kind}: {pair['distance']:.2f} grey levels apart", fontsize=8)
+            panel.text(left, top - 0.05, f"{kind}: distance {pair['distance']:.2f}", fontsize=8)
             for side, part in enumerate(("test", "seen")):
                 grasp = grasps.get(pair[part])
                 _tile(panel, left + side, top, _frame(grasp, kind) if grasp else None)

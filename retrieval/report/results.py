@@ -9,6 +9,7 @@ from typing import Any
 from indexes.regular import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
+from retrieval.evaluation.intervals import FEW_OBJECTS
 
 NOTHING = "–"
 
@@ -136,12 +137,24 @@ def percent(share: float | None, digits: int = 1) -> str:
     return NOTHING if share is None else f"{100 * share:.{digits}f}"
 
 
+FEW = " †"
+FEW_MEANS = (
+    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it held the truth in "
+    "50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
+)
+
+
 def with_interval(summary: Summary | None, place: int = 0) -> str:
-    """Value and interval in percent, as in "71.2 [65.0, 77.1]"."""
+    """Value and interval in percent, as in "71.2 [65.0, 77.1]"; marked where objects are too few for it."""
     if summary is None or summary["value"][place] is None:
         return NOTHING
     low, high = percent(summary["low"][place]), percent(summary["high"][place])
-    return f"{percent(summary['value'][place])} [{low}, {high}]"
+    return f"{percent(summary['value'][place])} [{low}, {high}]{few(summary)}"
+
+
+def few(summary: Mapping[str, Any]) -> str:
+    """The mark of an interval from too few objects, else nothing."""
+    return FEW if summary.get("few_objects") else ""
 
 
 def number(value: float | None) -> str:

@@ -1,14 +1,18 @@
 """Tables of an evaluation: results in, blocks of the document out."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from retrieval.posterior import FORMULA
 from retrieval.report.document import Table
 from retrieval.report.results import (
+    FEW,
+    FEW_MEANS,
     NOTHING,
     Results,
     Summary,
+    few,
     measure_label,
     method_label,
     number,
@@ -35,6 +39,13 @@ def guesses(results: Results, measure: str) -> Table | None:
     return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])
 
 
+def _explained(table: Table) -> Table:
+    """The table, with what its marks mean below it."""
+    if any(FEW in cell for row in table.rows for cell in row):
+        return dataclasses.replace(table, notes=(*table.notes, FEW_MEANS))
+    return table
+
+
 def _table(results: Results, columns: Sequence[Column]) -> Table | None:
     columns = [column for column in columns if any(results.summary(name, column[1]) for name in results.methods)]
     if not columns:
@@ -44,11 +55,13 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
         for name in results.methods
     ]
     chance = ("chance, closed form", *(_chance(results, key, place) for _, key, place in columns))
-    return Table(
-        ("method, %", *(heading for heading, _, _ in columns)),
-        (*rows, chance),
-        tuple(_basis(results, list(dict.fromkeys(key for _, key, _ in columns)))),
-        bold=frozenset(_best(results, columns)),
+    return _explained(
+        Table(
+            ("method, %", *(heading for heading, _, _ in columns)),
+            (*rows, chance),
+            tuple(_basis(results, list(dict.fromkeys(key for _, key, _ in columns)))),
+            bold=frozenset(_best(results, columns)),
+        )
     )
 
 
@@ -102,7 +115,7 @@ def everything(results: Results) -> Table:
         if (found := results.summary(name, key))
     ]
     header = ("method", "measure", "value [interval], %", "chance, %", "by seed, %", "queries", "objects", "gallery")
-    return Table(header, tuple(rows), words=frozenset({1, 7}))
+    return _explained(Table(header, tuple(rows), words=frozenset({1, 7})))
 
 
 def _full_row(summary: Summary) -> tuple[str, ...]:
@@ -123,7 +136,7 @@ def comparisons(results: Results) -> Table:
         (
             f"{method_label(one['a'])} − {method_label(one['b'])}",
             measure_label(one["measure"]),
-            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]",
+            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}",
             probability(one["p"]),
         )
         for one in results.data["comparisons"]
@@ -131,7 +144,7 @@ def comparisons(results: Results) -> Table:
     note = (
         "Same queries for both. Interval: bootstrap over objects; p: sign flips of the objects' differences, two-sided."
     )
-    return Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1}))
+    return _explained(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
 
 
 def probability(value: float) -> str:
@@ -154,7 +167,7 @@ def controls(results: Results) -> Table:
     real = tuple(with_interval(results.summary("late_fusion", key)) for key in keys)
     rows.insert(0, ("the result", "late fusion as it is", *real, ""))
     header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
-    return Table(header, tuple(rows), words=frozenset({1}))
+    return _explained(Table(header, tuple(rows), words=frozenset({1})))
 
 
 def _at_chance(summary: Summary | None) -> str:
@@ -182,7 +195,7 @@ def rejects(results: Results) -> Table:
         "Balanced accuracy is that of accepting where the posterior, fitted on validation objects, thinks one of the "
         f"gallery's at least as likely as none: {FORMULA}.",
     )
-    return Table(header, tuple(rows), notes)
+    return _explained(Table(header, tuple(rows), notes))
 
 
 def rejects_by_grasps(results: Results) -> Table | None:
@@ -203,7 +216,7 @@ def rejects_by_grasps(results: Results) -> Table | None:
     ]
     header = ("%, by grasps in a query", *map(str, sizes))
     note = "A set of grasps is asked as a whole; each number of grasps has a posterior of its own."
-    return Table(header, tuple(rows), (note,))
+    return _explained(Table(header, tuple(rows), (note,)))
 
 
 def _has(results: Results, name: str, what: str) -> bool:
@@ -268,10 +281,12 @@ def audit(found: Any) -> Table:
     for kind, frames in found["frames"].items():
         for key, what in (("to_seen", "to training and validation objects"), ("within_object", "to its own object")):
             values = [f"{value:.2f}" for value in frames[key] or ()] or [NOTHING] * len(points)
-            close = f"{frames['close']} of {frames['test']:,}" if key == "to_seen" else ""
-            rows.append((f"{kind}, {what}", *values, close))
+            counts = (
+                (f"{frames['close']} of {frames['checked']:,}", f"{frames['test']:,}") if key == "to_seen" else ("", "")
+            )
+            rows.append((f"{kind}, {what}", *values, *counts))
     return Table(
-        ("nearest frame of each test frame", *points, f"closer than {found['threshold']}"),
+        ("nearest frame of each test frame", *points, "copies of those checked", "test frames"),
         tuple(rows),
-        (f"Quantiles of the distance, in {found['unit']}.",),
+        (f"Quantiles of the distance: {found['unit']}.",),
     )

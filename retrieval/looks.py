@@ -1,0 +1,171 @@
+"""What pictures of a recording look like together: fingers, moments, light and photos that do not fit the others.
+
+Every judgement is made against the recording itself: a minority is suspect, and where looks do not tell two things
+apart (gels that are alike, touches without contact, objects of one colour) nothing is said, but how much could not be
+checked. Arrays hold small pictures (n, h, w, 3) of one kind, 0..1.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Looks = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+_TOLD_APART = 0.3  # how near to nothing, of its median, the difference of two fingers may come
+_NOISE_TIMES = 5.0
+_LEAST_NOISE = 0.25 / 255
+_NEARER = 0.5  # logarithm: 40 % nearer
+_FOREGROUND = 25.0
+_BINS = 16
+
+
+# Fingers -----------------------------------------------------------------------------------------------------
+
+
+def swapped_fingers(a: Looks, b: Looks) -> Rows | None:
+    """Grasps whose frames of fingers a and b look exchanged; None where the gels are too much alike to tell.
+
+    The difference of the two gels is the same in every grasp but for contact and its sign. Its direction is that of the
+    largest sum of squares, and the sign that of most grasps.
+    """
+    differences = (a - b).reshape(len(a), -1)
+    along = differences @ np.linalg.svd(differences, full_matrices=False)[2][0]
+    size = np.abs(along)
+    if not size.any() or np.quantile(size, 0.05) < _TOLD_APART * np.median(size):
+        return None
+    usual = 1.0 if 2 * (along > 0).sum() >= len(along) else -1.0
+    return np.flatnonzero(usual * along < 0)
+
+
+# Moments -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Moments:
+    """swapped: grasps whose frames before and during look exchanged; throughout: whether all do; faint: how many
+    touches differ from the untouched gel too little to tell."""
+
+    swapped: Rows
+    throughout: bool
+    faint: int
+
+
+def swapped_moments(before: Looks, during: Looks) -> Moments:
+    """Frames of the untouched gel are all alike, touches are not: what lies far from the median of the frames before
+    belongs among the touches."""
+    untouched, touched = (_from(frames, np.median(before, axis=0)) for frames in (before, during))
+    noise = max(float(np.quantile(untouched, 0.25)), _LEAST_NOISE)
+    if np.median(untouched) > 2 * np.median(touched) and np.median(untouched) > _NOISE_TIMES * _LEAST_NOISE:
+        return Moments(np.zeros(0, np.int64), True, 0)
+    far = _NOISE_TIMES * noise
+    swapped = np.flatnonzero((untouched > far) & (touched < untouched / 2))
+    return Moments(swapped, False, int(((untouched <= far) & (touched <= far)).sum()))
+
+
+def _from(images: Looks, centre: Looks) -> NDArray[np.float64]:
+    return np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3), dtype=np.float64))
+
+
+# Light -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Named:
+    """How often the nearest other grasp is one of the same object, how often by chance, and of how many grasps."""
+
+    share: float
+    chance: float
+    grasps: int
+
+    def beyond(self, part: float) -> bool:
+        """Whether it goes more than `part` of the way from chance to always, and more than chance would by itself."""
+        scatter = np.sqrt(self.chance * (1 - self.chance) / max(self.grasps, 1))
+        least = max(part * (1 - self.chance), 4 * scatter)
+        return bool(self.grasps > 0 and self.share > self.chance + least)
+
+
+def named_by(values: NDArray[np.floating], objects: NDArray[np.int64]) -> Named:
+    """Whether values (n, k) of grasps name their objects (n,), by the nearest other grasp."""
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    flat = flat - flat.mean(axis=0)
+    squares = (flat**2).sum(axis=1)
+    right = []
+    for row in range(len(flat)):
+        distance = squares - 2 * (flat @ flat[row])
+        distance[row] = np.inf
+        right.append(objects[distance.argmin()] == objects[row])
+    others = np.bincount(objects)[objects] - 1
+    some = others > 0
+    if not some.any():
+        return Named(0.0, 0.0, 0)
+    chance = others[some].mean() / (len(objects) - 1)
+    return Named(float(np.mean(np.array(right)[some])), float(chance), int(some.sum()))
+
+
+# Photos ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Exchanges:
+    """pairs: grasps (row, row) of two objects whose photos look exchanged; told_apart: of how many pairs of objects
+    (`all`) the photos look different enough to notice."""
+
+    pairs: list[tuple[int, int]]
+    told_apart: int
+    all: int
+
+
+def exchanged_photos(photos: Looks, objects: NDArray[np.int64]) -> Exchanges:
+    """Two grasps of two objects, each photo nearer in colour to the other object's photos than to its own object's,
+    where every other photo of both objects is nearer to its own.
+
+    Objects with fewer than four photos are passed over. Colour is the chromaticity of what stands out from the median
+    photo. Measured on five simulated recordings of 12 and 40 objects, every photo under another light: none is called
+    exchanged that is not, and of single exchanges 5, 20, 35, 65 and 70 % are found. Fixed light tells more.
+    """
+    counts = np.bincount(objects)
+    names = np.flatnonzero(counts >= 4)
+    members = [np.flatnonzero(objects == name) for name in names]
+    colours = _colours(photos)
+    distance = (
+        np.stack([_to_object(colours, own) for own in members], axis=1) if members else np.zeros((len(photos), 0))
+    )
+    worst, second, which = (np.zeros((len(names), len(names))) for _ in range(3))
+    for at, own in enumerate(members):
+        nearer = np.log(distance[own, at][:, None] / distance[own])
+        order = np.argsort(nearer, axis=0, kind="stable")
+        second[at] = np.take_along_axis(nearer, order[-2:-1], 0)[0]
+        worst[at], which[at] = np.take_along_axis(nearer, order[-1:], 0)[0], own[order[-1]]
+    apart = np.triu((second < 0) & (second.T < 0), 1)
+    pairs = np.argwhere(apart & (worst > _NEARER) & (worst.T > _NEARER))
+    return Exchanges(
+        [(int(which[one, other]), int(which[other, one])) for one, other in pairs],
+        int(apart.sum()),
+        len(np.unique(objects)) * (len(np.unique(objects)) - 1) // 2,
+    )
+
+
+def _to_object(colours: NDArray[np.float64], own: Rows) -> NDArray[np.float64]:
+    """Median distance (n,) of every photo to an object's photos, without the one that is farthest, or itself."""
+    squares = 2 - 2 * colours @ colours[own].T
+    distance = np.sqrt(np.maximum(squares, 1e-9))
+    distance[own, np.arange(len(own))] = np.inf
+    return np.asarray(np.median(np.sort(distance, axis=1)[:, :-1], axis=1))
+
+
+def _colours(photos: Looks) -> NDArray[np.float64]:
+    """Unit vectors (n, 256): square roots of the share of the foreground's pixels in each bin of chromaticity."""
+    usual = 255 * np.median(photos, axis=0)
+    found = []
+    for photo in 255 * photos:
+        light = np.median(photo / np.maximum(usual, 1))
+        pixels = photo[np.abs(photo - light * usual).max(axis=2) > _FOREGROUND]
+        pixels = pixels if len(pixels) > 20 else photo.reshape(-1, 3)
+        share = pixels[:, :2] / (pixels.sum(axis=1, keepdims=True) + 1)
+        counts = np.histogram2d(share[:, 0], share[:, 1], bins=_BINS, range=((0.1, 0.7), (0.1, 0.7)))[0]
+        counts = cv2.GaussianBlur(counts, (3, 3), 0).ravel() + 1e-9
+        found.append(np.sqrt(counts / counts.sum()))
+    return np.array(found)
