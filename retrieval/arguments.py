@@ -2,16 +2,24 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from retrieval.output import printable
 from retrieval.version import __version__
 
 DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
 
 
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with the words of a command as everything is said."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(printable(message))
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="retrieve",
         description="From the gel images of a grasp, find the catalogue photo of the object in the hand.",
     )

@@ -5,10 +5,10 @@ Nothing is unpickled. A file is written beside its place, flushed to disk, then 
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,10 @@ from retrieval.calibration import Calibration
 from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.files import CARD, CHECKPOINT, HEADER, require_ours, write_atomically
 from retrieval.fusion import Matcher
 from retrieval.stored import (
     FORMAT,
-    HEADER,
     Stored,
     config_of,
     file_digest,
@@ -98,10 +98,12 @@ def require_writable(path: Path) -> None:
         raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _temporary(path).touch()
-        _temporary(path).unlink()
+        with NamedTemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
+    require_ours(path, CHECKPOINT)
+    require_ours(beside(path, ".md"), CARD)
 
 
 def beside(path: Path, ending: str) -> Path:
@@ -184,23 +186,6 @@ def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before."""
-    temporary = _temporary(path)
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _model_card(name: str, header: Mapping[str, Any]) -> str:

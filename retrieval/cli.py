@@ -5,8 +5,8 @@ Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job r
 
 import argparse
 import dataclasses
+import errno
 import json
-import logging
 import os
 import signal
 import sys
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 from retrieval.arguments import build_parser
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours, text_bytes, write_output
 from retrieval.interruption import noticed_interrupts
-from retrieval.output import print_json, say
+from retrieval.output import give_up_stdout, prepare_streams, print_json, printing, say
 from retrieval.rig_commands import run_collect, run_import, run_rig
 
 if TYPE_CHECKING:
@@ -25,20 +26,26 @@ if TYPE_CHECKING:
     from retrieval.dataset import Split
 
 DEFAULT_PRESET = "small"
+EVALUATION = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
+_WRONG_PATHS = {
+    *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     _replace_closed_streams()
+    prepare_streams()
     arguments = build_parser().parse_args(argv)
-    logging.basicConfig(format="%(message)s", stream=sys.stderr, level=logging.WARNING)
     with noticed_interrupts() as interrupts:
         try:
             COMMANDS[arguments.command](arguments)
-            sys.stdout.flush()
+            with printing():
+                sys.stdout.flush()
             return 0
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            give_up_stdout()
             return 1
         except KeyboardInterrupt:
             return _stopped(arguments, interrupts)
@@ -61,9 +68,14 @@ def _explain(arguments: argparse.Namespace, error: Exception, interrupts: list[i
     if interrupts:
         return _stopped(arguments, interrupts)
     if isinstance(error, OSError):
-        named = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
-        return _fail(arguments, f"{error.filename or 'a file'}: {error.strerror or error}", 2 if named else 1)
+        return _fail(arguments, *_of_file(error))
     return _fail(arguments, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
+
+
+def _of_file(error: OSError) -> tuple[str, int]:
+    """What went wrong with which file, and the exit code: 2 where another path would have done."""
+    reason = error.strerror or str(error)
+    return f"{error.filename or 'a file'}: {reason}", 2 if error.errno in _WRONG_PATHS else 1
 
 
 def _replace_closed_streams() -> None:
@@ -73,7 +85,7 @@ def _replace_closed_streams() -> None:
 
 
 def _fail(arguments: argparse.Namespace, message: str, code: int) -> int:
-    print(f"retrieve {arguments.command}: {message}", file=sys.stderr)
+    say(f"retrieve {arguments.command}: {message}")
     return code
 
 
@@ -213,6 +225,8 @@ def run_query(arguments: argparse.Namespace) -> None:
         say(f"index: {path} ({why})")
     from retrieval.search import Searcher
 
+    if arguments.html:
+        require_ours(arguments.html, PAGE)
     searcher = Searcher.open(path, model=arguments.model, verify=not arguments.no_verify)
     result = searcher.query(
         arguments.gelsight,
@@ -223,8 +237,7 @@ def run_query(arguments: argparse.Namespace) -> None:
     if arguments.html:
         from retrieval.report.query import query_html
 
-        arguments.html.parent.mkdir(parents=True, exist_ok=True)
-        arguments.html.write_text(query_html(result, searcher.catalogue), "utf-8")
+        write_output(arguments.html, text_bytes(query_html(result, searcher.catalogue)), PAGE)
         say(f"page: {arguments.html}")
     say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
     if arguments.json:
@@ -259,6 +272,8 @@ def run_evaluate(arguments: argparse.Namespace) -> None:
 
     if arguments.model and (arguments.config or arguments.init):
         raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
+    for name, kind in EVALUATION.items():
+        require_ours(arguments.out / name, kind)
     try:
         results = evaluate(
             arguments.recording,

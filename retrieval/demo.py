@@ -6,7 +6,6 @@ make the catalogue, the touches of its last ones are the queries; no grasp gives
 
 import os
 import shutil
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 from retrieval import cli
 from retrieval.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.output import say
 
 SEED = 20_000
 """Of the demo's objects; the shipped checkpoint was trained on other seeds."""
@@ -39,9 +39,9 @@ def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
         _retrieve("build-index", catalogue, "--out", index)
         gelsight = [word for grasp in queries[in_hand] for word in ("--gelsight", *grasp.touches)]
         _retrieve("query", *gelsight, "--index", index, "--html", folder / "query.html", "--top", 8)
-        _say(f"in the hand: {in_hand}, an object that the model was never trained on")
-        _say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
-        _say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
+        say(f"in the hand: {in_hand}, an object that the model was never trained on")
+        say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
+        say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
 
 
 def _check_folder(folder: Path) -> None:
@@ -96,11 +96,7 @@ def _first_places(index: Path, queries: dict[str, list[Grasp]]) -> str:
 def _retrieve(*arguments: object) -> None:
     """Say a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
-    _say("$ retrieve " + " ".join(words))
+    say("$ retrieve " + " ".join(words))
     if code := cli.main(words):
         failure = BadInput if code == BadInput.exit_code else RetrievalError
         raise failure(f"`retrieve {words[0]}` failed; what it said stands above")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

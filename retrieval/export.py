@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from retrieval.checkpoint import Checkpoint, write_atomically
+from retrieval.checkpoint import Checkpoint
 from retrieval.encode import TorchEncoder, for_inference
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.files import EXPORT, require_ours, write_atomically
 from retrieval.fusion import Matcher
 from retrieval.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, sealed
 
@@ -56,6 +57,7 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     path = out or checkpoint.path.with_suffix(ENDING)
     if path.suffix != ENDING:
         raise BadInput(f"an export must be named *{ENDING}; got {path}")
+    require_ours(path, EXPORT)
     unsettled = path.with_name(f".{path.name}.unsettled")
     try:
         write_atomically(unsettled, sealed(graph_of(checkpoint)))

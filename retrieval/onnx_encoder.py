@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import CheckpointError
+from retrieval.files import SEAL
 from retrieval.resize import RgbImage
 from retrieval.stored import Stored
 
 log = logging.getLogger(__name__)
 ENDING = ".onnx"
 CHECKPOINT = "touch_retrieval.checkpoint"
-_SEAL = b"touch_retrieval.sha256"
-_SEAL_BYTES = 2 + 2 + len(_SEAL) + 2 + 64
+_SEAL_BYTES = 2 + 2 + len(SEAL) + 2 + 64
 Floats = NDArray[np.float32]
 
 
@@ -106,7 +106,7 @@ def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:
 def sealed(model: bytes) -> bytes:
     """`model` with one more entry of metadata: `metadata_props` is field 14 of ONNX's ModelProto, a map entry has its
     key in field 1 and its value in field 2, and what stands last in a protocol buffer is merged with the rest."""
-    entry = _field(1, _SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
+    entry = _field(1, SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
     return model + _field(14, entry)
 
 

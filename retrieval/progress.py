@@ -5,6 +5,8 @@ import time
 from types import TracebackType
 from typing import Any
 
+from retrieval.output import printable, say
+
 
 class Bar:
     """A bar for `total` units of work; use as a context manager.
@@ -28,10 +30,10 @@ class Bar:
             from rich.progress import Progress as RichProgress
 
             self._rich = RichProgress(
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
-                TextColumn(f"{self.unit}  {{task.fields[note]}}"),
+                TextColumn(f"{self.unit}  {{task.fields[note]}}", markup=False),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
             )
@@ -43,13 +45,13 @@ class Bar:
         """Say that `count` more units are done; `note` shows the latest figures."""
         self.done += count
         if self._rich:
-            self._rich.update(self._task, advance=count, note=note)
+            self._rich.update(self._task, advance=count, note=printable(note))
         elif not self._quiet and (time.monotonic() - self._last_line > self._LINE_EVERY_S or self.done == self.total):
             self._last_line = time.monotonic()
             rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
             left = (self.total - self.done) / rate if rate else float("nan")
             text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left:.0f} s left"
-            print(f"{text}  {note}".rstrip(), file=sys.stderr, flush=True)
+            say(f"{text}  {note}".rstrip())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from retrieval.errors import RetrievalError
-from retrieval.output import print_json, say
+from retrieval.files import HAND_EYE, PREVIEW, require_ours
+from retrieval.output import print_json, say, show
 from retrieval.progress import Bar
 
 if TYPE_CHECKING:
@@ -25,6 +26,9 @@ def run_collect(arguments: argparse.Namespace) -> None:
     from robot.collect import CollectSettings, collect
     from robot.rig import load_rig
 
+    preview = _preview_of(arguments.out)
+    if arguments.preview:
+        require_ours(preview, PREVIEW)
     gate, gate_name = _load_gate(arguments.gate)
     settings = CollectSettings(grasps=arguments.grasps)
     try:
@@ -43,7 +47,8 @@ def run_collect(arguments: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         say(f"what was collected is whole in {arguments.out}; the same command goes on with it")
         raise
-    say(acceptance_table(tallies, wanted=settings.grasps))
+    for line in acceptance_table(tallies, wanted=settings.grasps).splitlines():
+        say(line)
     accepted = sum(each.accepted for each in tallies)
     if accepted == 0:
         raise RetrievalError(f"no grasp was accepted; {arguments.out}/attempts.jsonl says why")
@@ -51,9 +56,13 @@ def run_collect(arguments: argparse.Namespace) -> None:
     if arguments.preview:
         from robot.sim.preview import write_preview
 
-        folder = arguments.out if arguments.out.name not in ("", "..") else arguments.out.resolve()
-        beside = folder.with_name(f"{folder.name}-preview.png")  # every image inside belongs to a grasp
-        say(f"preview: {write_preview(arguments.out, beside)}")
+        say(f"preview: {write_preview(arguments.out, preview)}")
+
+
+def _preview_of(out: Path) -> Path:
+    """Beside the recording: every image inside belongs to a grasp."""
+    folder = out if out.name not in ("", "..") else out.resolve()
+    return folder.with_name(f"{folder.name}-preview.png")
 
 
 def _rehearse(arguments: argparse.Namespace) -> None:
@@ -62,7 +71,7 @@ def _rehearse(arguments: argparse.Namespace) -> None:
     from robot.dry_run import without_motion
     from robot.rig import load_rig
 
-    rig = without_motion(load_rig(arguments.rig, seed=arguments.seed), print)
+    rig = without_motion(load_rig(arguments.rig, seed=arguments.seed), show)
     with rig:
         attempter = Attempter(rig, arguments.seed, rig.attempt)
         for object_id in rig.object_ids(arguments.objects):
@@ -87,14 +96,15 @@ def _check_rig(arguments: argparse.Namespace) -> None:
             print_json({"found": [dataclasses.asdict(device) for device in found]})
             return
         for device in found:
-            print(f"# {device.kind}: {device.label}\n{device.toml}\n")
+            for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
+                show(line)
         say(f"{len(found)} device(s) found; the lines above go into a rig's file" if found else "no device was found")
         return
     rows = []
     for row in check_rig(load_rig(arguments.rig, seed=0), motion=not arguments.no_motion):
         rows.append(row)
         if not arguments.json:
-            print(row.line(), flush=True)
+            show(row.line())
     if arguments.json:
         print_json({"devices": [dataclasses.asdict(row) for row in rows]})
     if failed := sum(row.failure is not None for row in rows):
@@ -105,6 +115,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     """Where the camera stands, from points known in its frame and in the rig's."""
     from robot.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
+    require_ours(arguments.out, HAND_EYE)
     found = fit_hand_eye(*read_pairs(arguments.points))
     for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
         say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")

@@ -11,10 +11,10 @@ from safetensors import SafetensorError, safe_open
 
 from retrieval.config import Config
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.files import HEADER
 from retrieval.judge import Judge
 
 FORMAT = 1
-HEADER = "touch_retrieval"
 _PARTS = ("config", "split", "calibration", "provenance")
 _JUDGE = ("head.second.weight", "head.second.bias", "head.out.weight", "head.out.bias")
 

@@ -13,7 +13,7 @@ PACKAGES = ("indexes", "robot", "retrieval")
 MAY_TOUCH_ROBOT = {"retrieval/dataset.py", "retrieval/cli.py", "retrieval/rig_commands.py"}
 # In `retrieval` the stages run one way; a module may import those of its own line and of lines above.
 STAGES = (
-    ("errors", "version", "progress", "interruption", "output", "stopwatch"),
+    ("errors", "version", "files", "output", "progress", "interruption", "stopwatch"),
     ("binomial",),
     ("resize", "judge", "heic", "naming"),
     ("images",),

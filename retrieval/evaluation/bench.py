@@ -1,6 +1,5 @@
 """Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from retrieval.features import Features
 from retrieval.methods import build_method
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import LateFusion
+from retrieval.output import say
 from retrieval.version import __version__
 
 SEEDLESS = frozenset({"cca", "plsca", "constant"})
@@ -56,7 +56,7 @@ class Bench:
             except BadInput:  # damaged, or of other features, queries or settings: made again
                 path.unlink()
         if not self.quiet:
-            print(f"evaluate: {name}, seed {seed}", file=sys.stderr)
+            say(f"evaluate: {name}, seed {seed}")
         method, fit_s = self._fitted(name, seed)
         write_predictions(path, predict(method, self.features, self.queries, fit_s), self._made_by(name, seed))
 

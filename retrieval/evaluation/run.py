@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from retrieval.batches import BatchImages
-from retrieval.checkpoint import write_atomically
 from retrieval.config import Config
 from retrieval.dataset import Split
 from retrieval.encode import one_thread, photo_features, touch_features
@@ -25,6 +24,7 @@ from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.features import encode_recording
+from retrieval.files import write_atomically
 from retrieval.methods import METHODS, require_known
 from retrieval.progress import Bar
 from retrieval.version import __version__

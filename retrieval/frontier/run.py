@@ -3,16 +3,16 @@
 import dataclasses
 import hashlib
 import json
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from retrieval.checkpoint import write_atomically
+from retrieval.files import write_atomically
 from retrieval.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation
 from retrieval.frontier.clock import machine
 from retrieval.frontier.points import Row
 from retrieval.frontier.sample import Sample
+from retrieval.output import say
 from retrieval.stored import file_digest
 from retrieval.version import __version__
 
@@ -58,7 +58,7 @@ def _row(sample: Sample, out: Path, name: str) -> Row:
 
 def _say(sample: Sample, text: str) -> None:
     if not sample.quiet:
-        print(text, file=sys.stderr, flush=True)
+        say(text)
 
 
 def _kept(path: Path) -> dict[str, Any]:

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.checkpoint import Checkpoint, load_checkpoint, write_atomically
+from retrieval.checkpoint import Checkpoint, load_checkpoint
 from retrieval.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.features import Features, encode_recording
+from retrieval.files import write_atomically
 from retrieval.fusion import Code, score_halves
 from retrieval.progress import Bar
 

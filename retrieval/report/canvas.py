@@ -1,5 +1,6 @@
 """How the report's figures look: colours that colour-blind readers tell apart, light background, files."""
 
+import io
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from retrieval.errors import RetrievalError
+from retrieval.files import write_atomically
 
 Figure = Any
 Axes = Any
@@ -99,8 +101,9 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
 
 def _write(path: Path, samples: NDArray[np.uint8]) -> None:
     """A plot has few colours: 256 of its own make the file three times smaller."""
-    image = Image.fromarray(np.ascontiguousarray(samples[..., :3]))
+    image, data = Image.fromarray(np.ascontiguousarray(samples[..., :3])), io.BytesIO()
     if path.suffix == ".jpg":
-        image.save(path, quality=86)
+        image.save(data, "JPEG", quality=86)
     else:
-        image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+        image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
+    write_atomically(path, data.getvalue())

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from retrieval.dataset import load_grasps
+from retrieval.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.report import comparing, looking, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown
@@ -37,8 +38,8 @@ def write_report(out: Path, recording: Path | None) -> list[Path]:
     builder = Builder(results, grasps, out)
     document = _document(builder)
     text, page = out / "report.md", out / "report.html"
-    text.write_text(to_markdown(document), "utf-8")
-    page.write_text(to_html(document, out), "utf-8")
+    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
+    write_output(page, text_bytes(to_html(document, out)), PAGE)
     return [text, page, *builder.figures]
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from retrieval.files import PAGE, text_bytes, write_output
 from retrieval.frontier.points import Panel, Point, Row, duration, number
 from retrieval.report.canvas import FAINT, Axes, Figure, canvas, draw
 from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
@@ -37,7 +38,8 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     }
     page = out / "frontier.html"
     sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
-    page.write_text(to_html(Document("Error against run time", tuple(_lead(document, rows)), sections), out), "utf-8")
+    html = to_html(Document("Error against run time", tuple(_lead(document, rows)), sections), out)
+    write_output(page, text_bytes(html), PAGE)
     return [page, *figures.values()]
 
 

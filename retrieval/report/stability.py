@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from retrieval.files import PAGE, text_bytes, write_output
 from retrieval.report.document import Document, Section, Table, Text, to_html
 
 _HEADER = ("kernel", "input", "what must hold", "naive formula", "ours", "")
@@ -26,7 +27,8 @@ def write_stability(out: Path, document: Mapping[str, Any]) -> Path:
     packages = dict.fromkeys(case["package"] for case in cases)
     sections = tuple(_section(name, [case for case in cases if case["package"] == name]) for name in packages)
     page = out / "stability.html"
-    page.write_text(to_html(Document("Hard cases of every numerical kernel", lead, sections), out), "utf-8")
+    html = to_html(Document("Hard cases of every numerical kernel", lead, sections), out)
+    write_output(page, text_bytes(html), PAGE)
     return page
 
 

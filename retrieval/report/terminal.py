@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from retrieval.answer import QueryResult
+from retrieval.output import printable, printing, show
 
 if TYPE_CHECKING:
     from retrieval.report.results import Results
@@ -36,16 +37,19 @@ def print_measures(results: "Results") -> None:
     table = tables.measures(results, MEASURES)
     if table is not None:
         print_columns("On objects that no method saw", table.header, table.rows, words=(0,))
-        print(*table.notes, sep="\n")
+        for note in table.notes:
+            show(note)
 
 
 def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
     """Print a table of text. words: columns of names, set to the left; numbers are set to the right."""
+    seen = [[printable(cell) for cell in row] for row in rows]
     if sys.stdout.isatty():
-        _draw(title, header, rows, words)
+        with printing():
+            _draw(title, header, seen, words)
         return
-    for line in aligned([header, *rows], words):
-        print(line)
+    for line in aligned([header, *seen], words):
+        show(line)
 
 
 def aligned(rows: Sequence[Sequence[str]], words: Collection[int]) -> Iterator[str]:

@@ -1,5 +1,7 @@
 """A contact sheet that a person can look at: photo, depth, gels before and during, and the wall that each gel met."""
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,8 @@ Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
 _HEADER_PX = 24
 _CAPTION_PX = 20
+_FIRST = 8 + 25
+"""Bytes of a PNG file before its second chunk: the signature and the header."""
 _DEEPEST_MM = 3.0
 """Walls are drawn from touched (bright) to this far behind (dark)."""
 
@@ -34,8 +38,15 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_file(Path(out), data)
+        write_file(Path(out), _signed(data))
     return Path(out)
+
+
+def _signed(png: bytes) -> bytes:
+    """The PNG file with a chunk after its first that says what made it, by which a later preview may replace it."""
+    chunk = b"tEXtSoftware\0touch-retrieval"
+    length, check = (struct.pack(">I", number) for number in (len(chunk) - 4, zlib.crc32(chunk)))
+    return png[:_FIRST] + length + chunk + check + png[_FIRST:]
 
 
 def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
