@@ -20,6 +20,8 @@ line leaves with; anything that is not one of these errors is a bug.
 
 from collections.abc import Sequence
 
+AGAIN = "run `retrieve build-index` again"
+
 
 class IndexesError(Exception):
     """Wrong use or bad input."""

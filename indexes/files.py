@@ -13,6 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import RowError
+from indexes.regular import open_regular
+
+DEEPEST = 64
+"""Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
 
 
 @contextmanager
@@ -58,8 +62,8 @@ def remove_folder(folder: Path) -> None:
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as handle:
+    """SHA-256 of a regular file, in hexadecimal."""
+    with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
@@ -114,9 +118,23 @@ def encoded(document: Any, *, indent: int | None = None) -> bytes:
 
 def check_json(document: Any, what: str, row: str | None = None) -> None:
     """`document` can be stored as JSON and read back the same, or `RowError` naming `what`."""
+    if is_deep(document):
+        raise RowError(f"{what} must not be nested deeper than {DEEPEST} levels", row)
     try:
         same = json.loads(encoded(document)) == document
     except (ValueError, TypeError, RecursionError) as error:
         raise RowError(f"{what} must be JSON of finite numbers; {error}", row) from error
     if not same:
         raise RowError(f"{what} must read back from JSON as it is: text keys, lists rather than tuples", row)
+
+
+def is_deep(document: Any) -> bool:
+    """Whether JSON has more than `DEEPEST` lists or objects inside one another."""
+    level = [document]
+    for _ in range(DEEPEST):
+        level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
+    return any(isinstance(each, dict | list | tuple) for each in level)
+
+
+def _inside(each: Any) -> Iterable[Any]:
+    return each.values() if isinstance(each, dict) else each

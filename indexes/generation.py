@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from indexes import load_kind
 from indexes.base import VectorIndex
+from indexes.checks import BLOCK_ROWS, NORM_TOLERANCE, row_norms
 from indexes.errors import (
+    AGAIN,
     CorruptIndex,
     IndexesError,
     MismatchedIndex,
@@ -19,10 +21,11 @@ from indexes.errors import (
     SelfRetrievalFailed,
     UnsupportedFormat,
 )
-from indexes.manifest import AGAIN, Manifest, check_files, read_manifest
+from indexes.manifest import Manifest, check_files, read_manifest
+from indexes.regular import read_regular
 from indexes.rows import RECORD, Records, Rows, Segment, keys_of
 from indexes.scores import Floats, Mask, Slots, grid_scores, on_grid
-from indexes.stack import Vectors, parts_of, stacked
+from indexes.stack import Vectors, blocks_of, parts_of, stacked
 
 STRUCTURE, ORDER = "vectors.faiss", "order.npy"
 SHOWN_IDS = 5
@@ -225,6 +228,7 @@ def mapped(path: Path) -> NDArray[Any]:
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:
     """Open a generation's folder, checked as `IndexStore.open` says."""
     manifest = read_manifest(folder)
+    _require_listed(folder, manifest)
     check_files(folder, manifest, verify=verify)
     try:
         identities = {name: file_identity(folder / name) for name in manifest.files}
@@ -232,8 +236,10 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         order = mapped(folder / ORDER) if ORDER in manifest.files else None
         names = [segment_name("embeddings", number) for number in manifest.segments["vectors"]]
         embeddings = stacked([mapped(folder / name) for name in names])
-        documents = {name: json.loads((folder / f"{name}.json").read_bytes()) for name in manifest.documents}
+        documents = {name: json.loads(read_regular(folder / f"{name}.json")) for name in manifest.documents}
         _check_counts(manifest, records, order, embeddings)
+        if verify:
+            _check_vectors(folder, embeddings)
         index = _read_index(folder, manifest, embeddings, threads)
         return Generation(folder, manifest, records, order, embeddings, documents, index, identities)
     except ParameterError as error:
@@ -242,6 +248,16 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise
     except Exception as error:  # damaged files raise anything: OSError, ValueError, KeyError, SyntaxError
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
+
+
+def _require_listed(folder: Path, manifest: Manifest) -> None:
+    """Every file that is opened is among those that are checked."""
+    needed = {f"{name}.json" for name in manifest.documents}
+    needed |= {segment_name("embeddings", number) for number in manifest.segments["vectors"]}
+    for number in manifest.segments["records"]:
+        needed |= {segment_name(what, number) for what in ("rows", "table", *manifest.arrays)}
+    if lacking := sorted(needed - set(manifest.files)):
+        raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
 
 
 def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
@@ -254,11 +270,22 @@ def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
     got |= {name: len(array) for name, array in arrays.items()}
     if got != must:
         raise CorruptIndex(f"{folder}: segment {number} must hold {must}, holds {got}; {AGAIN}")
+    starts, stops = table["start"], table["stop"]
+    if starts.min() < 0 or stops.max() > len(text) or not (starts < stops).all():
+        raise CorruptIndex(f"{folder}: the lines of segment {number} must lie in its text, and do not; {AGAIN}")
     return Segment(text, table, arrays)
+
+
+def _check_vectors(folder: Path, embeddings: Vectors) -> None:
+    for block in blocks_of(embeddings, BLOCK_ROWS):
+        if not (np.abs(row_norms(block) - 1.0) <= NORM_TOLERANCE).all():
+            raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
 
 
 def _check_counts(manifest: Manifest, records: Records, order: Slots | None, embeddings: Vectors) -> None:
     counts = manifest.counts
+    if order is not None and (order.dtype != np.int64 or order.min() < 0 or order.max() >= len(records)):
+        raise CorruptIndex(f"{manifest.generation}: the order must name records 0 to {len(records) - 1}; {AGAIN}")
     slots = records.column("slot", order)
     if slots.min() < 0 or slots.max() >= counts.slots:
         raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")

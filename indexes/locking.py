@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import stat
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -37,9 +38,12 @@ class WriterLock:
     def _take(self) -> int:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
         except OSError as error:
             raise WriteFailed(f"{self.path}: the lock file cannot be opened; {error.strerror}") from error
+        if not _is_lock(descriptor):
+            os.close(descriptor)
+            raise WriteFailed(f"{self.path} is not the lock file of an index, and stays as it is; give another folder")
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -52,6 +56,14 @@ class WriterLock:
         os.ftruncate(descriptor, 0)
         os.write(descriptor, f"{os.getpid()}\n".encode())
         return descriptor
+
+
+def _is_lock(descriptor: int) -> bool:
+    """Whether a file holds nothing but a process id: any other one is of the user."""
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
+        return False
+    return status.st_size == 0 or (status.st_size <= 32 and _holder(descriptor) is not None)
 
 
 def _holder(descriptor: int) -> int | None:

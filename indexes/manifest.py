@@ -2,17 +2,21 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from indexes.errors import CorruptIndex, UnsupportedFormat
-from indexes.files import digest, durable, encoded
+from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
+from indexes.files import digest, durable, encoded, is_deep
+from indexes.regular import open_regular, read_regular
 
 FORMAT = 2
 NAME = "manifest.json"
-AGAIN = "run `retrieve build-index` again"
+_NUMBER = range(10**9)
+_WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,12 @@ def read_manifest(folder: Path) -> Manifest:
     """The manifest of a generation's folder; `CorruptIndex` or `UnsupportedFormat` where it is bad."""
     path = folder / NAME
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_regular(path))
     except OSError as error:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except (ValueError, RecursionError) as error:
         raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
-    if not isinstance(content, dict):
+    if not isinstance(content, dict) or is_deep(content):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
     _check_format(path, content.get("format"))
     if content.pop("sha256", None) != _own_digest(content):
@@ -100,7 +104,8 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
     for name, must in manifest.files.items():
         path = folder / name
         try:
-            size = path.stat().st_size
+            with open_regular(path) as file:
+                size = os.fstat(file.fileno()).st_size
             fits = size == must["bytes"] and (not verify or digest(path) == must["sha256"])
         except OSError as error:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
@@ -131,7 +136,72 @@ def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
     if set(content) != known:
         odd = ", ".join(sorted(set(content) ^ known))
         raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}")
-    try:
-        return Manifest(**content | {"counts": Counts(**content["counts"])})
-    except TypeError as error:
-        raise CorruptIndex(f"{path}: the counts are not usable ({error}); {AGAIN}") from error
+    wrong = [name for name, is_right in _RIGHT.items() if not is_right(content[name])]
+    if wrong:
+        raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
+    return Manifest(**content | {"counts": Counts(**content["counts"])})
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and value in _NUMBER
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
+
+
+def _is_words(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(each, str) and bool(_WORD.fullmatch(each)) for each in value)
+
+
+def _is_counts(value: object) -> bool:
+    names = {field.name for field in fields(Counts)}
+    return isinstance(value, dict) and set(value) == names and all(_is_count(each) for each in value.values())
+
+
+def _is_segments(value: object) -> bool:
+    if not isinstance(value, dict) or set(value) != {"records", "vectors"}:
+        return False
+    return all(isinstance(part, list) and part and all(map(_is_count, part)) for part in value.values())
+
+
+def _is_files(value: object) -> bool:
+    """Names inside the folder, each with its size and digest."""
+    if not isinstance(value, dict):
+        return False
+    return all(
+        Path(name).name == name
+        and name.isprintable()
+        and isinstance(must, dict)
+        and set(must) == {"bytes", "sha256"}
+        and type(must["bytes"]) is int
+        and isinstance(must["sha256"], str)
+        for name, must in value.items()
+    )
+
+
+def _is(*types: type) -> Callable[[object], bool]:
+    return lambda value: type(value) in types
+
+
+_RIGHT: Mapping[str, Callable[[object], bool]] = {
+    "generation": _is(str),
+    "parent": _is(str, type(None)),
+    "created": _is(str),
+    "software": _is(str),
+    "fingerprint": _is_texts,
+    "about": _is(dict),
+    "dim": _is_count,
+    "metric": _is(str),
+    "kind": _is(str),
+    "parameters": _is(dict),
+    "asked": _is(dict),
+    "seed": _is(int),
+    "recall": _is(dict),
+    "counts": _is_counts,
+    "segments": _is_segments,
+    "arrays": _is_words,
+    "documents": _is_words,
+    "files": _is_files,
+}
+"""What each field must be: whoever alters a file can reckon its digest again."""

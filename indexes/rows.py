@@ -14,7 +14,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.errors import CorruptIndex
+from indexes.errors import AGAIN, CorruptIndex
+from indexes.files import is_deep
 from indexes.scores import Slots
 from indexes.stack import stacked
 
@@ -140,9 +141,8 @@ class Rows(Sequence[dict[str, Any]]):
     def _parsed(self, place: int) -> dict[str, Any]:
         try:
             row = json.loads(self.records.line(place).decode())
-            row["id"]
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
-            raise CorruptIndex(
-                f"the row at place {place} of the index cannot be read ({error}); run `retrieve build-index` again"
-            ) from error
-        return row  # type: ignore[no-any-return]
+        except (ValueError, RecursionError) as error:
+            raise CorruptIndex(f"the row at place {place} of the index cannot be read ({error}); {AGAIN}") from error
+        if not isinstance(row, dict) or not isinstance(row.get("id"), str) or is_deep(row):
+            raise CorruptIndex(f"the row at place {place} of the index must be a plain object with an id; {AGAIN}")
+        return row

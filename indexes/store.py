@@ -32,15 +32,17 @@ from numpy.typing import NDArray
 
 from indexes import files, load_kind
 from indexes.base import Parameters
-from indexes.errors import CorruptIndex, NoIndex, RowError, WriteFailed
+from indexes.errors import AGAIN, CorruptIndex, NoIndex, RowError, WriteFailed
 from indexes.generation import Generation, read_generation
 from indexes.locking import WriterLock
-from indexes.manifest import AGAIN
+from indexes.regular import read_regular
 from indexes.scores import Floats
 from indexes.spool import Block, Kept, check_documents
 from indexes.writing import Job, Settle, write_generation
 
 GENERATION = re.compile(r"gen-(\d{6,})")
+LEFT = re.compile(r"(gen-\d{6,}|CURRENT)\.tmp-\d+")
+"""What killed writers leave: unfinished and half-deleted generations, and files beside CURRENT."""
 
 
 class IndexStore:
@@ -75,7 +77,7 @@ class IndexStore:
         """The name of the current generation, as CURRENT says."""
         path = self.path / "CURRENT"
         try:
-            text = path.read_bytes().decode("ascii", "replace").strip()
+            text = read_regular(path).decode("ascii", "replace").strip()
         except FileNotFoundError as error:
             raise NoIndex(f"{self.path}: there is no index here; run `retrieve build-index` first") from error
         except OSError as error:
@@ -154,9 +156,21 @@ class IndexStore:
             queries=queries,
         )
         check_about(fingerprint, about or {})
+        self._require_ours()
         with self._lock, self._writing():
             self._sweep()
             return self._publish(self._next_number(), blocks, job, self_check, keep)
+
+    def _require_ours(self) -> None:
+        """A file called CURRENT in a folder without a generation is not of an index, and would be replaced."""
+        path = self.path / "CURRENT"
+        try:
+            if not self._numbers() and read_regular(path).strip():
+                raise NoIndex(f"{path} is not of an index, and is left as it is; give another folder for the index")
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
 
     def _publish(self, number: int, blocks: Iterable[Block | Kept], job: Job, self_check: int, keep: int) -> Generation:
         name = generation_name(number)
@@ -201,9 +215,9 @@ class IndexStore:
         return max(self._numbers(), default=0) + 1
 
     def _sweep(self) -> None:
-        """Delete what killed writers left: unfinished folders and files beside CURRENT."""
-        for path in self.path.glob("*.tmp-*"):
-            if path.is_dir():
+        """Delete what killed writers left, and nothing else."""
+        for path in [path for path in self.path.iterdir() if LEFT.fullmatch(path.name)]:
+            if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
             else:
                 path.unlink()
