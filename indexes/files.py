@@ -13,10 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import RowError
-from indexes.regular import open_regular
-
-DEEPEST = 64
-"""Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
+from indexes.regular import DEEPEST, is_deep, open_regular
 
 
 @contextmanager
@@ -126,15 +123,3 @@ def check_json(document: Any, what: str, row: str | None = None) -> None:
         raise RowError(f"{what} must be JSON of finite numbers; {error}", row) from error
     if not same:
         raise RowError(f"{what} must read back from JSON as it is: text keys, lists rather than tuples", row)
-
-
-def is_deep(document: Any) -> bool:
-    """Whether JSON has more than `DEEPEST` lists or objects inside one another."""
-    level = [document]
-    for _ in range(DEEPEST):
-        level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
-    return any(isinstance(each, dict | list | tuple) for each in level)
-
-
-def _inside(each: Any) -> Iterable[Any]:
-    return each.values() if isinstance(each, dict) else each

@@ -1,6 +1,5 @@
 """One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +21,7 @@ from indexes.errors import (
     UnsupportedFormat,
 )
 from indexes.manifest import Manifest, check_files, read_manifest
-from indexes.regular import read_regular
+from indexes.regular import read_json
 from indexes.rows import RECORD, Records, Rows, Segment, keys_of
 from indexes.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.stack import Vectors, blocks_of, parts_of, stacked
@@ -236,7 +235,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         order = mapped(folder / ORDER) if ORDER in manifest.files else None
         names = [segment_name("embeddings", number) for number in manifest.segments["vectors"]]
         embeddings = stacked([mapped(folder / name) for name in names])
-        documents = {name: json.loads(read_regular(folder / f"{name}.json")) for name in manifest.documents}
+        documents = {name: read_json(folder / f"{name}.json") for name in manifest.documents}
         _check_counts(manifest, records, order, embeddings)
         if verify:
             _check_vectors(folder, embeddings)

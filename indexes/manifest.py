@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
-from indexes.files import digest, durable, encoded, is_deep
-from indexes.regular import open_regular, read_regular
+from indexes.files import digest, durable, encoded
+from indexes.regular import open_regular, read_json
 
 FORMAT = 2
 NAME = "manifest.json"
@@ -78,12 +78,12 @@ def read_manifest(folder: Path) -> Manifest:
     """The manifest of a generation's folder; `CorruptIndex` or `UnsupportedFormat` where it is bad."""
     path = folder / NAME
     try:
-        content = json.loads(read_regular(path))
+        content = read_json(path)
     except OSError as error:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
-    if not isinstance(content, dict) or is_deep(content):
+    if not isinstance(content, dict):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
     _check_format(path, content.get("format"))
     if content.pop("sha256", None) != _own_digest(content):

@@ -2,11 +2,16 @@
 read for ever."""
 
 import errno
+import json
 import os
 import stat
+from collections.abc import Iterable
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
+DEEPEST = 64
+"""Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
 MOST_BYTES = 512 * 2**20
 """Of what is read whole."""
 
@@ -18,7 +23,7 @@ _WORDS = {
 }
 
 
-def open_regular(path: str | Path) -> BinaryIO:
+def open_regular(path: str | Path) -> BufferedReader:
     """A regular file, opened to be read. Raises OSError, whose `strerror` says what stands there instead."""
     _require_regular(os.stat(path).st_mode, path)
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what was swapped since does not block
@@ -40,6 +45,34 @@ def read_regular(path: str | Path, most: int = MOST_BYTES) -> bytes:
     if size > most:
         raise OSError(errno.EINVAL, f"has {size} bytes; at most {most} are read", str(path))
     return data
+
+
+def read_json(path: str | Path) -> Any:
+    """The JSON document in a regular file. Raises OSError, and ValueError as `parse_json` does."""
+    return parse_json(read_regular(path))
+
+
+def parse_json(text: str | bytes) -> Any:
+    """A JSON document. Raises ValueError for what is none, or nested deeper than `DEEPEST`."""
+    try:
+        document = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(f"it is nested deeper than {DEEPEST} levels") from error
+    if is_deep(document):
+        raise ValueError(f"it is nested deeper than {DEEPEST} levels")
+    return document
+
+
+def is_deep(document: Any) -> bool:
+    """Whether JSON has more than `DEEPEST` lists or objects inside one another."""
+    level = [document]
+    for _ in range(DEEPEST):
+        level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
+    return any(isinstance(each, dict | list | tuple) for each in level)
+
+
+def _inside(each: Any) -> Iterable[Any]:
+    return each.values() if isinstance(each, dict) else each
 
 
 def _require_regular(mode: int, path: str | Path) -> None:

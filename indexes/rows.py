@@ -4,7 +4,6 @@ A segment of records is three kinds of files: the rows as lines of JSON, the tab
 A record never changes; a generation is a list of segments and the order in which it shows their records.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import AGAIN, CorruptIndex
-from indexes.files import is_deep
+from indexes.regular import parse_json
 from indexes.scores import Slots
 from indexes.stack import stacked
 
@@ -140,9 +139,9 @@ class Rows(Sequence[dict[str, Any]]):
 
     def _parsed(self, place: int) -> dict[str, Any]:
         try:
-            row = json.loads(self.records.line(place).decode())
-        except (ValueError, RecursionError) as error:
+            row = parse_json(self.records.line(place))
+        except ValueError as error:
             raise CorruptIndex(f"the row at place {place} of the index cannot be read ({error}); {AGAIN}") from error
-        if not isinstance(row, dict) or not isinstance(row.get("id"), str) or is_deep(row):
+        if not isinstance(row, dict) or not isinstance(row.get("id"), str):
             raise CorruptIndex(f"the row at place {place} of the index must be a plain object with an id; {AGAIN}")
         return row

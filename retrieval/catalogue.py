@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
 
+from indexes.regular import read_regular
 from retrieval.errors import DatasetError, ImageError
 from retrieval.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.naming import STEM, Naming
@@ -250,7 +251,7 @@ def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
 
 def _lines(path: Path) -> list[bytes]:
     try:
-        return path.read_bytes().split(b"\n")
+        return read_regular(path).split(b"\n")
     except FileNotFoundError:
         return []
     except OSError as error:

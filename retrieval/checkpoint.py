@@ -37,6 +37,16 @@ from retrieval.stored import (
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_halves"
+_DTYPES = {
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+    torch.int32,
+    torch.int64,
+    torch.bool,
+    torch.uint8,
+}
 
 
 @dataclass(frozen=True)
@@ -125,20 +135,43 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
         calibration = None if header["calibration"] is None else Calibration.from_dict(header["calibration"])
         queries = state.pop(_QUERIES, None)
         matcher = _matcher(about.config, state)
+        kept = None if queries is None else _queries(about.config, queries)
     except BadInput as error:
         raise unusable(path, error) from error
-    kept = None if queries is None else queries.numpy()
     return Checkpoint(path, about.digest, about.config, about.provenance, matcher, split, calibration, kept)
 
 
 def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    _require_fit(_without_memory(config), state)
     matcher = Matcher(config.matcher)
-    load_weights(matcher, state)
+    matcher.load_state_dict(state)
     return matcher.eval()
+
+
+def _without_memory(config: Config) -> Matcher:
+    """The matcher with shapes alone: a header may ask for more memory than there is, or than can be counted."""
+    try:
+        with torch.device("meta"):
+            return Matcher(config.matcher)
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
+
+
+def _queries(config: Config, queries: Tensor) -> NDArray[np.float16]:
+    if queries.dtype != torch.float16 or queries.ndim != 2 or queries.shape[1] != config.matcher.hidden:
+        raise CheckpointError(
+            f"{_QUERIES} must be float16 (touches, {config.matcher.hidden}); got {queries.dtype} {tuple(queries.shape)}"
+        )
+    return np.asarray(queries.numpy())
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
+    _require_fit(module, state)
+    module.load_state_dict(state)
+
+
+def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
     for name in sorted(got.keys() | wanted.keys()):
         if got.get(name) != wanted.get(name):
@@ -146,7 +179,6 @@ def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
                 f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
                 f"must be {wanted.get(name, 'absent')}"
             )
-    module.load_state_dict(state)
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -163,8 +195,11 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
     try:
         with safe_open(path, framework="pt") as file:
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, MemoryError) as error:
         raise unreadable(path, error) from error
+    for name, tensor in state.items():
+        if tensor.dtype not in _DTYPES:
+            raise CheckpointError(f"{path} holds {name} as {tensor.dtype}, which no checkpoint of ours does")
     checksum = header.pop("sha256", None)
     if check and checksum != _checksum(state, header):
         raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")

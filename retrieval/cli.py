@@ -6,7 +6,6 @@ Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job r
 import argparse
 import dataclasses
 import errno
-import json
 import os
 import signal
 import sys
@@ -14,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from indexes.regular import read_json
 from retrieval.arguments import build_parser
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours, text_bytes, write_output
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from retrieval.dataset import Split
 
 DEFAULT_PRESET = "small"
+LONGEST = 2000
+"""Characters of a message; what stands in a hostile file may be of any length."""
 EVALUATION = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
 _WRONG_PATHS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
@@ -85,7 +87,7 @@ def _replace_closed_streams() -> None:
 
 
 def _fail(arguments: argparse.Namespace, message: str, code: int) -> int:
-    say(f"retrieve {arguments.command}: {message}")
+    say(f"retrieve {arguments.command}: {message if len(message) <= LONGEST else message[:LONGEST] + ' ...'}")
     return code
 
 
@@ -180,7 +182,7 @@ def _read_split(path: Path | None) -> "Split | None":
     from retrieval.dataset import Split
 
     try:
-        return Split.from_dict(json.loads(path.read_text("utf-8")))
+        return Split.from_dict(read_json(path))
     except ValueError as error:
         raise BadInput(f"{path} is not a JSON file: {error}") from error
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from indexes.regular import read_regular
 from retrieval.errors import ConfigError
 from retrieval.images import Preprocessing
 
@@ -146,15 +148,15 @@ def load_config(name_or_path: str) -> Config:
     file = Path(name_or_path)
     if name_or_path in preset_names():
         file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
-    elif not file.is_file():
+    elif not os.path.exists(file):  # False, and no error, for a name that no disk takes
         raise ConfigError(
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )
     try:
-        return Config.from_dict(tomllib.loads(file.read_text("utf-8")))
+        return Config.from_dict(tomllib.loads(read_regular(file).decode()))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # what TOML or UTF-8 forbids
+    except (ValueError, RecursionError) as error:  # what TOML or UTF-8 forbids
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
 
 

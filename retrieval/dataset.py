@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.regular import read_regular
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
 from robot.recording import RecordedGrasp, read_info, read_recording
@@ -134,7 +135,7 @@ def data_digest(grasps: Iterable[Grasp]) -> str:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
         for path in (grasp.photo, *grasp.touches, *grasp.backgrounds):
             try:
-                digest.update(hashlib.sha256(path.read_bytes()).digest())
+                digest.update(hashlib.sha256(read_regular(path)).digest())
             except OSError as error:
                 raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error
     return digest.hexdigest()

@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from indexes.regular import read_json
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ def _noted() -> dict[str, str]:
 def _notes() -> dict[str, dict[str, str]]:
     """By working folder, the one noted last at the end."""
     try:
-        notes = json.loads(_state_file().read_text("utf-8"))
+        notes = read_json(_state_file())
     except (OSError, RuntimeError, ValueError):
         return {}
     mine = notes.items() if isinstance(notes, dict) else ()

@@ -10,7 +10,6 @@ truncated JPEG lacks with grey and says nothing.) Colour profiles and gamma chun
 import hashlib
 import io
 import json
-import stat
 import struct
 import threading
 import warnings
@@ -23,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
+from indexes.regular import read_regular
 from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
 from retrieval.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
 from retrieval.resize import RgbImage, check_rgb, resize
@@ -77,16 +77,11 @@ def read_rgb(path: str | Path) -> RgbImage:
 def read_bytes(path: str | Path) -> bytes:
     """Return the bytes of a regular file of at most MAX_BYTES. Raises ImageError."""
     try:
-        status = Path(path).stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise ImageError(path, "is a folder; give the picture's file")
-        if not stat.S_ISREG(status.st_mode):
-            raise ImageError(path, "is not a regular file")
-        if status.st_size > MAX_BYTES:
-            raise ImageError(path, f"has {status.st_size} bytes; at most {MAX_BYTES} are read")
-        return Path(path).read_bytes()
+        return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         raise ImageError(path, "no such file") from None
+    except IsADirectoryError:
+        raise ImageError(path, "is a folder; give the picture's file") from None
     except (OSError, ValueError, MemoryError) as error:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 

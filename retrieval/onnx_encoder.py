@@ -18,6 +18,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.regular import read_regular
 from retrieval.errors import CheckpointError
 from retrieval.files import SEAL
 from retrieval.resize import RgbImage
@@ -112,7 +113,10 @@ def sealed(model: bytes) -> bytes:
 
 def unsealed(path: Path) -> bytes:
     """The bytes of a sealed file. Raises CheckpointError where one of them changed."""
-    data = path.read_bytes()
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
     if len(data) <= _SEAL_BYTES or sealed(data[:-_SEAL_BYTES]) != data:
         raise CheckpointError(f"{path} is damaged or no export of `retrieve export`")
     return data

@@ -1,7 +1,6 @@
 """What a checkpoint's file says of itself, read without PyTorch: enough for a query whose towers run elsewhere."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from indexes.regular import open_regular, parse_json
 from retrieval.config import Config
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.files import HEADER
@@ -42,18 +42,31 @@ def read_stored(path: Path) -> Stored:
 
 
 def read_judge(path: Path) -> Judge:
-    """The layers of a checkpoint's head that judge pairs of halves."""
-    with safe_open(path, framework="np") as file:
-        second, second_bias, out, out_bias = (file.get_tensor(name).astype(np.float32) for name in _JUDGE)
+    """The layers of a checkpoint's head that judge pairs of halves. Raises CheckpointError."""
+    try:
+        with safe_open(path, framework="np") as file:
+            parts = [file.get_tensor(name) for name in _JUDGE]
+    except (SafetensorError, OSError, TypeError) as error:  # TypeError: numbers that numpy does not know
+        raise unreadable(path, error) from error
+    hidden = parts[1].size
+    wanted = [(hidden, hidden), (hidden,), (1, hidden), (1,)]
+    for name, part, shape in zip(_JUDGE, parts, wanted, strict=True):
+        if part.shape != shape or part.dtype.kind != "f":
+            raise unusable(path, f"{name} is {part.dtype} {part.shape}, must be of floats {shape}")
+    second, second_bias, out, out_bias = (part.astype(np.float32) for part in parts)
     return Judge(second, second_bias, out[0], out_bias)
 
 
 def read_header(path: Path) -> dict[str, Any]:
     """Our JSON header of a `.safetensors` file, "sha256" among it. Raises CheckpointError where there is none."""
-    if path.is_dir():
-        raise CheckpointError(f"{path} is a folder; give the .safetensors file of a checkpoint")
-    if not path.is_file():
-        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one")
+    try:
+        open_regular(path).close()
+    except FileNotFoundError as error:
+        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one") from error
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be read ({error.strerror}); give the .safetensors file of a checkpoint"
+        ) from error
     try:
         with safe_open(path, framework="np") as file:
             text = (file.metadata() or {}).get(HEADER)
@@ -79,6 +92,8 @@ def matcher_header(path: Path, header: dict[str, Any]) -> dict[str, Any]:
             f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
             "`retrieve train` makes matchers"
         )
+    if not isinstance(header.get("provenance", {}), dict):
+        raise unusable(path, "its provenance must be an object")
     lacking = [name for name in _PARTS if name not in header]
     if lacking:
         raise CheckpointError(
@@ -96,14 +111,14 @@ def config_of(path: Path, header: dict[str, Any]) -> Config:
         raise unusable(path, error) from error
 
 
-def unusable(path: Path, error: Exception) -> CheckpointError:
+def unusable(path: Path, error: object) -> CheckpointError:
     """What to raise where a file holds what no matcher of this version is made of."""
     return CheckpointError(f"{path} is not a checkpoint that this version can use: {error}")
 
 
 def _parsed(path: Path, text: str) -> dict[str, Any]:
     try:
-        header = json.loads(text)
+        header = parse_json(text)
         version = header["format"]
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"the header of {path} is damaged ({error}); train again or restore the file") from error
@@ -116,6 +131,6 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    with path.open("rb") as file:
+    """SHA-256 of a regular file, in hexadecimal. Raises OSError."""
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -19,7 +19,7 @@ from typing import Any, Self
 from robot.errors import RecordingError
 from robot.recorded_grasp import OUTCOMES
 from robot.recording import Recording, parse_object
-from robot.storage import append_line, storage_errors
+from robot.storage import append_line, read_regular, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
 
@@ -73,7 +73,7 @@ def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
 def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
     """Attempts that count, each with where its line ends in the file."""
     try:
-        lines = path.read_bytes().splitlines(keepends=True)
+        lines = read_regular(path).splitlines(keepends=True)
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -117,7 +117,7 @@ class AttemptLog:
         self.attempts = [attempt for attempt, _ in read]
         self._end = read[-1][1] if read else 0
         with storage_errors(folder):
-            descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+            descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
             self._file = FileIO(descriptor, "r+b")
             self._file.truncate(self._end)
 

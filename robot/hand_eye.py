@@ -8,6 +8,7 @@ left out, rigid 8.7 and 10.2.)
 """
 
 import csv
+import io
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RobotConfigError
-from robot.storage import storage_errors, sync_folder, write_file
+from robot.storage import read_regular, storage_errors, sync_folder, write_file
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
@@ -173,7 +174,7 @@ def errors_of(fit: Fit, camera_mm: Points, rig_mm: Points) -> Errors:
 def read_pairs(path: Path) -> tuple[Points, Points]:
     """Camera and rig points from a CSV file with the columns COLUMNS, in any order. Raises RobotConfigError."""
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(read_regular(path).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
                 raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
@@ -216,7 +217,7 @@ def _check_age(path: Path, found: HandEye, max_age_days: float | None, now: date
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text("utf-8"))
+        document = json.loads(read_regular(path))
     except OSError as error:
         raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

@@ -29,7 +29,16 @@ from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
 from robot.recorded_grasp import RecordedGrasp as RecordedGrasp
 from robot.recorded_grasp import check_name, unknown_keys
-from robot.storage import PART, ImageSource, append_line, file_content, storage_errors, sync_folder, write_file
+from robot.storage import (
+    PART,
+    ImageSource,
+    append_line,
+    file_content,
+    read_regular,
+    storage_errors,
+    sync_folder,
+    write_file,
+)
 
 SCHEMA_VERSION = 1
 KNOWN_VERSIONS = (1,)
@@ -93,7 +102,7 @@ def read_recording(folder: str | Path) -> Recording:
 def read_info(root: Path) -> dict[str, Any]:
     """Read and check recording.json alone. Raises RecordingError."""
     path = root / INFO_FILE
-    if not path.is_file():
+    if not os.path.exists(path):  # False, and no error, for a name that no disk takes
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
     try:
         info = parse_object(_read(path))
@@ -114,7 +123,7 @@ def _check_info(info: Mapping[str, Any]) -> None:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_regular(path)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
 
@@ -165,7 +174,7 @@ class RecordingWriter:
         _check_is_ours(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+            descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
             self._file = os.fdopen(descriptor, "r+b", buffering=0)
             try:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

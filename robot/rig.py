@@ -14,6 +14,7 @@ from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.readings import Pose
 from robot.settings import build
+from robot.storage import read_regular
 
 RIGS = {"sim": "robot.sim.rig:SimRig", "real": "robot.real_rig:RealRig"}
 """Rigs by name, imported when asked for. A new rig is a file with a subclass of Rig, and a row here."""
@@ -175,7 +176,7 @@ def check_seed(seed: int) -> None:
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Name of the rig and its settings."""
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = tomllib.loads(read_regular(path).decode())
     except OSError as error:
         raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

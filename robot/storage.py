@@ -1,7 +1,9 @@
 """Files that survive a crash: written beside, synced, renamed; and pictures as PNG or JPEG content."""
 
 import contextlib
+import errno
 import os
+import stat
 from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
@@ -80,9 +82,26 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     raise RecordingError(f"{column} must be a PNG or JPEG file; its first bytes are {data[:4]!r}")
 
 
+def read_regular(path: str | Path) -> bytes:
+    """The bytes of a regular file. Raises OSError, whose `strerror` says what stands there instead: a pipe would block,
+    a device may be read for ever."""
+    _require_regular(os.stat(path).st_mode, path)
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what was swapped since does not block
+    with os.fdopen(descriptor, "rb") as file:
+        _require_regular(os.fstat(descriptor).st_mode, path)
+        return file.read()
+
+
+def _require_regular(mode: int, path: str | Path) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, not a regular file", str(path))
+
+
 def _read(column: str, path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_regular(path)
     except OSError as error:
         raise RecordingError(f"{column}: {path} cannot be read: {error.strerror}") from error
 

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from indexes.errors import CorruptIndex, IndexesError, LockedIndex, NoIndex, RowError, WriteFailed
-from indexes.files import DEEPEST, digest
+from indexes.files import digest
 from indexes.manifest import _own_digest
-from indexes.regular import read_regular
+from indexes.regular import DEEPEST, read_regular
 from indexes.store import IndexStore
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 

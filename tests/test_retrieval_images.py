@@ -283,10 +283,10 @@ def test_a_missing_file_a_folder_and_a_pipe_are_named_with_the_reason(tmp_path):
 def test_a_file_that_may_not_be_read_is_named_with_the_reason(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(sample_files()["png"])
 
-    def refuse(self):
+    def refuse(*arguments):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(ImageError, match=r"a\.png: cannot be read: Permission denied"):
         read_rgb(tmp_path / "a.png")
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from indexes.regular import read_json
 from retrieval.batches import BatchImages
 from retrieval.config import Config
 from retrieval.dataset import Split
@@ -171,7 +172,7 @@ def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
     path, of = out / "audit.json", {"recording": material.digest, "split": material.split.to_dict()}
     if path.is_file():
         try:
-            kept = json.loads(path.read_text("utf-8"))
+            kept = read_json(path)
             if kept["of"] == json.loads(json.dumps(of)):
                 return dict(kept["audit"])
         except (ValueError, KeyError, TypeError):  # damaged: made again

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from indexes.regular import read_json
 from retrieval.files import write_atomically
 from retrieval.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation
 from retrieval.frontier.clock import machine
@@ -63,7 +64,7 @@ def _say(sample: Sample, text: str) -> None:
 
 def _kept(path: Path) -> dict[str, Any]:
     try:
-        kept = json.loads(path.read_text("utf-8"))
+        kept = read_json(path)
     except (OSError, ValueError):
         return {}
     return kept if isinstance(kept, dict) else {}

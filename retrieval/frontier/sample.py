@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from indexes.regular import read_json
 from retrieval.checkpoint import Checkpoint, load_checkpoint
 from retrieval.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
@@ -203,7 +204,7 @@ class Sample:
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, json.dumps(self._find_winners()).encode())
-        return np.array(json.loads(path.read_text("utf-8")), dtype=np.int64)
+        return np.array(read_json(path), dtype=np.int64)
 
     def _find_winners(self) -> list[int]:
         halves, found = self.queries["half"], list[int]()

@@ -1,12 +1,12 @@
 """results.json and timings.json as the report reads them, and how numbers, measures and methods are called in it."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from indexes.regular import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 
@@ -105,7 +105,7 @@ def read_results(out: Path) -> Results:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text("utf-8"))
+        data = read_json(path)
     except (OSError, ValueError) as error:
         raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve evaluate`") from error
     if not isinstance(data, dict):

@@ -46,7 +46,9 @@ def read_state(path: Path) -> dict[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # third-party loaders raise a dozen kinds; each means the same to the user
         raise CheckpointError(f"{path} is not a readable state dict ({type(error).__name__}: {error})") from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
         raise CheckpointError(f"{path} must hold a plain state dict (name -> tensor); got {type(state).__name__}")
     return dict(state)
 

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
+from robot.storage import read_regular
 
 Picture = npt.NDArray[np.uint8]
 _KEYS = {"image_px", "corners_px", "crop", "output_px", "note"}
@@ -136,7 +137,7 @@ def make_rectifier(
 def load_rectifier(path: str | Path) -> Rectifier:
     """Read a calibration file. Raises RobotConfigError with the file's name."""
     try:
-        return _from_json(json.loads(Path(path).read_text("utf-8")))
+        return _from_json(json.loads(read_regular(path)))
     except OSError as error:
         raise RobotConfigError(f"calibration file {path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
