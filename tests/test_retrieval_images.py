@@ -8,7 +8,6 @@ import warnings
 import zlib
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
