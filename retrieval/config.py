@@ -175,7 +175,7 @@ def _build(table_name: str, cls: type[Any], table: Any) -> Any:
 
 
 def _typed(name: str, wanted: Any, value: Any) -> Any:
-    if wanted is float and type(value) is int:
+    if wanted is float and type(value) is int and abs(value) < 2**63:
         return float(value)
     if type(value) is not wanted:
         raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from indexes.regular import read_json
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.files import write_atomically
 
 if TYPE_CHECKING:
     from indexes.manifest import Manifest
@@ -90,9 +91,7 @@ def remember(kind: str, path: Path) -> None:
         mine = {**notes.pop(here, {}), kind: str(path.resolve())}
         notes = {**dict(list(notes.items())[-MOST_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
-        beside = _state_file().with_suffix(f".{os.getpid()}.tmp")
-        beside.write_text(json.dumps(notes), "utf-8")
-        beside.replace(_state_file())
+        write_atomically(_state_file(), json.dumps(notes).encode())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.generation import Generation
+from retrieval.listing import listed_photo
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -48,7 +49,7 @@ class Objects:
         """Of each row, its object's place in the order of names; all 0 where no tie asks for it, as it parses rows."""
         if len(np.unique(logits)) == len(logits):
             return np.zeros(len(rows), dtype=np.int64)
-        names = np.array([self._rows[row]["object_id"] for row in rows])
+        names = np.array([listed_photo(self._rows[row]).object_id for row in rows])
         return np.unique(names, return_inverse=True)[1]
 
 

@@ -45,7 +45,16 @@ class OnnxEncoder:
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> tuple[Floats, Floats]:
         """Halves (B, hidden) and embeddings (B, embedding_dim) of touches, each its fingers' images in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
-        half, embedding = self._own_session().run(None, {"images": images})
+        try:
+            half, embedding = self._own_session().run(("half", "embedding"), {"images": images})
+        except Exception as error:  # its errors have no common base
+            raise CheckpointError(f"the export of this checkpoint cannot be run ({error}); export it again") from error
+        for name, values in (("half", half), ("embedding", embedding)):
+            if values.ndim != 2 or len(values) != len(touches) or values.dtype != np.float32:
+                raise CheckpointError(
+                    f"the export must give a {name} of float32 for each touch, gives {values.dtype} {values.shape}; "
+                    "export the checkpoint again"
+                )
         return half, embedding
 
     def _own_session(self) -> Any:

@@ -17,6 +17,7 @@ from retrieval.calibration import Calibration
 from retrieval.encoded import Encoded, Encoder, TouchReader
 from retrieval.errors import BadInput
 from retrieval.judge import Judge
+from retrieval.listing import listed_photo, require_usable
 from retrieval.objects import Objects
 from retrieval.onnx_encoder import exported_beside
 from retrieval.stopwatch import Stopwatch
@@ -58,6 +59,7 @@ class Searcher:
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
         _require(generation, stored)
+        require_usable(generation, stored.config.matcher.hidden)
         return cls(
             Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
         )
@@ -206,10 +208,10 @@ class Searcher:
         )
 
     def _match(self, rank: int, row_number: int, logit: float, grasps: int) -> Match:
-        row = self.generation.rows[row_number]
+        photo = listed_photo(self.generation.rows[row_number])
         probability = float(self.calibration.probability(logit, grasps)) if self.calibration else None
-        path = self.catalogue.absolute() / row["path"]
-        return Match(rank, row["object_id"], logit, probability, row["path"], row["metadata"], path)
+        path = self.catalogue.absolute() / photo.path
+        return Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path)
 
     def _verdict(self, best: Match, grasps: int) -> str:
         if self.calibration is None:

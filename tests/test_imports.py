@@ -31,7 +31,7 @@ STAGES = (
     ("ahead",),
     ("embed", "operating"),
     ("build", "build_report"),
-    ("answer", "objects"),
+    ("answer", "listing", "objects"),
     ("search",),
     ("evaluation", "grasp_success"),
     ("hard_cases",),
