@@ -28,9 +28,12 @@ from retrieval.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
 from retrieval.resize import RgbImage, check_rgb, resize
 
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
-MAX_PIXELS = 50_000_000
+MAX_PIXELS = 20_000_000
+"""Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at a half, a quarter or an eighth of its size."""
+MOST_REDUCED = 160_000_000
+"""Pixels of such a file."""
 MAX_BYTES = 512 * 2**20
-PREPROCESSING_VERSION = 1
+PREPROCESSING_VERSION = 2
 """Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
 
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
@@ -126,11 +129,22 @@ def _decode(data: bytes, name: str | Path) -> RgbImage:
         except Image.DecompressionBombError:
             raise ImageError(name, _too_large("far more")) from None
         with image:
+            _reduce(image)
             check_pixels(image.size, name)
             image.load()
             orientation = _orientation(image)
             rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
     return np.ascontiguousarray(_upright(rgb, orientation))
+
+
+def _reduce(image: Image.Image) -> None:
+    """Have a large JPEG file decoded smaller, which takes the memory of what comes out. A progressive one is not: its
+    decoder holds the whole."""
+    width, height = image.size
+    if image.format != "JPEG" or width * height > MOST_REDUCED or image.info.get("progressive"):
+        return
+    if scale := next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None):
+        image.draft(None, (width // scale, height // scale))
 
 
 def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:

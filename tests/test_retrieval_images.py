@@ -1,5 +1,6 @@
 """Reading pictures, and refusing what is none. Resizing is in test_retrieval_images_resize.py."""
 
+import contextlib
 import io
 import os
 import struct
@@ -309,7 +310,7 @@ REFUSED = {
     "12-bit": (tiff(np.zeros((2, 2, 1), np.uint16), bits=12), "not supported|truncated"),
     "inverted 16-bit": (tiff(np.zeros((2, 2, 1), np.uint16), photometric=0), "not supported"),
     "lab": (saved(Image.new("LAB", (2, 2)), "TIFF"), "pixel type LAB is not supported"),
-    "bomb": (png(2, 8, np.zeros((1, 1, 3)), size=(6000, 10000)), "10000 x 6000 = 60000000 pixels; at most 50000000"),
+    "bomb": (png(2, 8, np.zeros((1, 1, 3)), size=(6000, 10000)), "10000 x 6000 = 60000000 pixels; at most 20000000"),
     "bomb that warns": (png(2, 8, np.zeros((1, 1, 3)), size=(10000, 10000)), "10000 x 10000 = 100000000 pixels"),
     "bomb that raises": (png(2, 8, np.zeros((1, 1, 3)), size=(30000, 30000)), "far more pixels; at most"),
 }
@@ -328,8 +329,50 @@ def test_a_bomb_is_refused_by_its_header_before_it_is_decoded(monkeypatch):
         raise AssertionError("decoded")
 
     monkeypatch.setattr(ImageFile.ImageFile, "load", decoded)
-    with pytest.raises(ImageError, match="at most 50000000"):
+    with pytest.raises(ImageError, match="at most 20000000"):
         decode_rgb(REFUSED["bomb"][0], "x")
+
+
+@pytest.mark.parametrize("side", [60_000, 2**31 - 1])
+def test_a_bomb_of_a_few_bytes_is_refused_in_a_sentence(side):
+    rows = zlib.compress(bytes(10**6))
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    data += chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    with pytest.raises(ImageError, match=r"pixels; at most 20000000|header is damaged"):
+        decode_rgb(data, "x")
+
+
+def jpeg_of(height, width, **options):
+    ramp = np.linspace(0, 255, width).astype(np.uint8)
+    return saved(Image.fromarray(np.broadcast_to(ramp[:, None], (height, width, 3))), "JPEG", **options)
+
+
+@pytest.mark.parametrize(("most", "size"), [(120_000, (300, 400)), (119_999, (150, 200)), (5_000, (38, 50))])
+def test_a_large_jpeg_is_decoded_smaller(monkeypatch, most, size):
+    monkeypatch.setattr(images, "MAX_PIXELS", most)
+    image = decode_rgb(jpeg_of(300, 400), "x")
+    assert image.shape == (*size, 3)
+    assert np.abs(image - np.linspace(0, 1, size[1])[:, None]).max() < 0.02
+
+
+def test_a_large_jpeg_that_cannot_be_decoded_smaller_is_refused_before_it_is_decoded(monkeypatch):
+    monkeypatch.setattr(images, "MAX_PIXELS", 1_000)
+    for data in (jpeg_of(300, 400), jpeg_of(30, 40, progressive=True)):
+        with pytest.raises(ImageError, match="at most 1000"):
+            decode_rgb(data, "x")
+
+
+@settings(max_examples=60)
+@given(
+    kind=st.sampled_from([b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"iTXt", b"eXIf", b"gAMA", b"acTL"]),
+    data=st.data(),
+)
+def test_any_chunk_of_a_png_may_be_hostile(kind, data):
+    content = data.draw(st.binary(max_size=40) | st.just(zlib.compress(bytes(10**7))))
+    length = data.draw(st.sampled_from([len(content), 0, 2**31 - 1, 2**32 - 1]))
+    hostile = struct.pack(">I", length) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+    with contextlib.suppress(ImageError):
+        assert decode_rgb(png(2, 8, np.zeros((1, 1, 3)), hostile), "x").shape[2] == 3
 
 
 def webp_headers(width, height):
