@@ -29,7 +29,7 @@ from retrieval.resize import RgbImage, check_rgb, resize
 
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
-"""Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at a half, a quarter or an eighth of its size."""
+"""Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
 MOST_REDUCED = 160_000_000
 """Pixels of such a file."""
 MAX_BYTES = 512 * 2**20

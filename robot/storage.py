@@ -23,14 +23,15 @@ _SUFFIXES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
 
 @contextlib.contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turn what the disk refuses into a StorageError that names the folder."""
+    """Turn what the disk refuses into a StorageError that names the file, or the folder."""
     try:
         yield
     except BlockingIOError as error:
         raise StorageError(f"{folder} is being written by another process; wait for it or stop it") from error
     except OSError as error:
         reason = error.strerror or str(error)
-        raise StorageError(f"{folder} could not be written: {reason}; what was appended before is whole") from error
+        where = error.filename or folder
+        raise StorageError(f"{where} could not be written: {reason}; what was appended before is whole") from error
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -42,6 +43,8 @@ def write_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
+    except OSError as error:  # a write alone does not tell its file
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

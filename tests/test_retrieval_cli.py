@@ -79,6 +79,18 @@ def test_html_is_written_beside_the_table(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model)])
     assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html"]) == 0
     assert "data:image/jpeg;base64," in Path("out.html").read_text()
+    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html"]) == 0
+
+
+@pytest.mark.parametrize("name", ["a.png", "index/CURRENT", "index/gen-000001/manifest.json", "own.html"])
+def test_html_is_written_over_no_file_of_another_kind(workplace, model, capsys, name):
+    main(["build-index", "catalog/", "--model", str(model)])
+    Path("own.html").write_text("<!doctype html><title>mine</title>")
+    before = Path(name).read_bytes()
+    capsys.readouterr()
+    assert main(["query", "--gelsight", "a.png", "b.png", "--index", "index", "--html", name]) == 2
+    assert f"{name} is not a page that this program wrote" in capsys.readouterr().err
+    assert Path(name).read_bytes() == before
 
 
 WRONG_USE = {

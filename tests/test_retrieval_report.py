@@ -1,6 +1,7 @@
 """The page and the table of a query: self-contained, harmless whatever the names hold, whole when a photo is gone."""
 
 import base64
+import dataclasses
 import json
 import shutil
 import sys
@@ -151,6 +152,15 @@ def stdout(request, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: request.param == "terminal")
     return lambda: capsys.readouterr().out
+
+
+def test_names_in_the_table_are_escaped(answer, stdout):
+    result, _ = answer
+    match = dataclasses.replace(result.results[0], object_id="m\x1b[1m\n2", photo="\u202eg/1.jpg")
+    print_table(dataclasses.replace(result, results=[match]))
+    out = stdout()
+    assert "m\\x1b[1m\\n2" in out
+    assert "\\u202eg/1.jpg" in out
 
 
 def test_the_table_has_a_line_for_each_object(answer, stdout):

@@ -79,6 +79,16 @@ def test_a_calibration_is_fitted_told_and_written(here, capsys):
     assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
 
 
+def test_a_calibration_is_written_over_an_earlier_one_and_over_nothing_else(here, capsys):
+    (here / "points.csv").write_text(POINTS)
+    for _ in range(2):
+        assert main(["rig", "calibrate", "points.csv"]) == 0
+    (here / "photo.png").write_bytes(b"\x89PNG")
+    assert main(["rig", "calibrate", "points.csv", "--out", "photo.png"]) == 2
+    assert "photo.png is not a hand-eye calibration that this program wrote" in capsys.readouterr().err
+    assert (here / "photo.png").read_bytes() == b"\x89PNG"
+
+
 def test_a_calibration_by_which_no_arm_can_be_steered_is_not_written(here, capsys):
     lines = POINTS.splitlines()
     rows = [[float(value) for value in line.split(",")] for line in lines[1:]]

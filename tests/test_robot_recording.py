@@ -1,6 +1,8 @@
 """The recording on disk: what a reader accepts, and what a writer writes."""
 
 import json
+import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -399,3 +401,39 @@ def test_keys_that_other_tools_keep_in_a_line_are_passed_over_with_a_note(tmp_pa
     recording = read_recording(tmp_path)
     assert len(recording.grasps) == 1
     assert "passed over keys that are not of the format: text" in recording.notes[0]
+
+
+@pytest.mark.parametrize("name", ["recording.json", "metadata.jsonl"])
+def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name):
+    write(tmp_path, ROW)
+    path = tmp_path / name
+    path.unlink()
+    for make in (os.mkfifo, lambda there: os.symlink("/dev/zero", there), os.mkdir):
+        make(path)
+        with pytest.raises(RecordingError, match=r"pipe, a socket or a device|folder, not a file"):
+            read_recording(tmp_path)
+        with pytest.raises((RecordingError, StorageError)):
+            RecordingWriter(tmp_path, INFO)
+        path.rmdir() if path.is_dir() else path.unlink()
+
+
+def test_a_picture_that_is_no_file_is_refused_without_being_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    with (
+        RecordingWriter(tmp_path / "r", INFO) as writer,
+        pytest.raises(RecordingError, match=r"photo: .*pipe, a socket or a device"),
+    ):
+        writer.append("1", "mug", {**pictures(), "photo": tmp_path / "pipe.png"})
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with RecordingWriter(tmp_path, INFO) as writer:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+        try:
+            with pytest.raises(StorageError, match=r"1_photo\.png could not be written: File too large"):
+                writer.append("1", "mug", {**pictures(), "photo": pixels(height=40)})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        writer.append("1", "mug", pictures())
+    assert not list((tmp_path / "images").glob("*.part"))
