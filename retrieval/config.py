@@ -148,7 +148,7 @@ def load_config(name_or_path: str) -> Config:
     file = Path(name_or_path)
     if name_or_path in preset_names():
         file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
-    elif not os.path.exists(file):  # False, and no error, for a name that no disk takes
+    elif os.path.isdir(file) or not os.path.exists(file):  # False, and no error, for a name that no disk takes
         raise ConfigError(
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )

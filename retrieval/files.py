@@ -127,7 +127,7 @@ def write_atomically(path: Path, data: bytes) -> None:
             with open(descriptor, "wb", closefd=False) as file:
                 file.write(data)
             os.fsync(descriptor)
-            os.replace(temporary, place)
+            temporary.replace(place)
 
 
 @contextlib.contextmanager

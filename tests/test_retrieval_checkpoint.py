@@ -192,7 +192,7 @@ def test_a_checkpoint_is_not_written_where_its_model_card_goes(tmp_path):
 def test_no_file_and_a_folder_are_told_apart(tmp_path):
     with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.safetensors; `retrieve train` makes one"):
         load_checkpoint(tmp_path / "none.safetensors")
-    with pytest.raises(CheckpointError, match=r"is a folder; give the \.safetensors file"):
+    with pytest.raises(CheckpointError, match=r"is a folder, not a file\); give the \.safetensors file"):
         load_checkpoint(tmp_path)
 
 
