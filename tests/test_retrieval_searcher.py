@@ -199,14 +199,14 @@ def test_a_fork_answers_as_its_parent_does(searcher, touch):
 
 @forking
 def test_a_fork_of_a_process_that_computed_on_several_threads_computes_on_one(searcher):
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)  # as many tests beside each other have one each
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
     try:
-        total = float(torch.ones(1 << 20).add(1).sum())
+        sums = torch.ones(1 << 20).add(1).sum()
         found = in_fork(lambda: (torch.get_num_threads(), float(torch.ones(1 << 20).add(1).sum())))
     finally:
-        torch.set_num_threads(threads)
-    assert found == repr((1, total))
+        torch.set_num_threads(before)
+    assert found == repr((1, float(sums)))
 
 
 @forking
