@@ -147,7 +147,7 @@ class Pictures:
         # Either may be the copy, and what was saved as JPEG once hardly changes the next time.
         changed = np.maximum(self.changed[queries], self.changed[row])
         limit = np.where(changed < most, changed, 0).max(axis=1)
-        return Nearest(row, distance, counts.all(axis=1), distance <= limit)
+        return Nearest(row, distance, np.asarray(counts.all(axis=1)), distance <= limit)
 
     def _nearest(
         self, queries: NDArray[np.int64], among: NDArray[np.int64]
