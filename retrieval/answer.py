@@ -11,6 +11,11 @@ class Match:
 
     probability: None where the model was never calibrated. photo: its path in the catalogue; photo_path: on the disk,
     absolute. metadata: the user's own.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     best = searcher.query(["a.png", "b.png"]).top
+    >>> best.rank, best.photo_path.is_absolute(), best.photo_path.name == best.photo.split("/")[-1]
+    (1, True, True)
     """
 
     rank: int
@@ -32,6 +37,13 @@ class QueryResult:
 
     touches: the gel images of each grasp by name, files by their paths. index: what was searched with what.
     timing_ms: by stage, of this query; of several at once (`Searcher.query_many`) an equal share for each.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     answer = searcher.query(["a.png", "b.png"])
+    >>> answer.top == answer.results[0]
+    True
+    >>> answer.to_dict()["query"]
+    {'touches': [['a.png', 'b.png']]}
     """
 
     touches: list[list[str]]
