@@ -2,22 +2,41 @@
 
 Importing this package needs only numpy; FAISS is imported when one of its kinds is used.
 
-    load_kind("flat")    the class of a kind of index (see `KINDS`)
     indexes.store        `IndexStore`, the folder of generations
     indexes.choice       which kind meets a latency budget, by measurement
     indexes.measure      recall against the exact search
     indexes.errors       every error
+
+>>> import indexes, numpy
+>>> axes = numpy.eye(3, dtype=numpy.float32)
+>>> scores, slots = indexes.load_kind("exact").build(axes).search(axes[:1], 2)
+>>> int(slots[0, 0]), float(scores[0, 0])
+(0, 1.0)
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from indexes.errors import ParameterError
 
 if TYPE_CHECKING:
     from indexes.base import VectorIndex
+    from indexes.choice import choose_kind
+    from indexes.errors import IndexesError
+    from indexes.generation import Generation
+    from indexes.measure import recall_against_exact
+    from indexes.store import IndexStore
 
-__all__ = ["KINDS", "load_kind"]
+__all__ = [
+    "KINDS",
+    "Generation",
+    "IndexStore",
+    "IndexesError",
+    "VectorIndex",
+    "choose_kind",
+    "load_kind",
+    "recall_against_exact",
+]
 
 KINDS = {
     "exact": "indexes.exact:ExactIndex",
@@ -31,9 +50,38 @@ KINDS = {
 
 
 def load_kind(name: str) -> "type[VectorIndex]":
-    """The class of the kind `name`; an unknown name raises `ParameterError` listing the known ones."""
+    """The class of the kind `name`; an unknown name raises `ParameterError` listing the known ones.
+
+    >>> indexes.load_kind("flat").exact, indexes.load_kind("hnsw").exact
+    (True, False)
+    >>> indexes.load_kind("octree")
+    Traceback (most recent call last):
+    indexes.errors.ParameterError: the kind of index must be one of exact, flat, hnsw, ...; got 'octree'
+    """
     if name not in KINDS:
         raise ParameterError(f"the kind of index must be one of {', '.join(KINDS)}; got {name!r}")
     module, _, attribute = KINDS[name].partition(":")
     kind: type[VectorIndex] = getattr(import_module(module), attribute)
     return kind
+
+
+_PLACES = {
+    "Generation": "generation",
+    "IndexStore": "store",
+    "IndexesError": "errors",
+    "VectorIndex": "base",
+    "choose_kind": "choice",
+    "recall_against_exact": "measure",
+}
+"""Public name -> its module in this package, imported when it is used."""
+
+if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+
+    def __getattr__(name: str) -> Any:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -42,6 +42,13 @@ class VectorIndex(ABC):
     * Vectors are checked when added and when searched for: finite, of unit norm within 1e-3, of d components.
 
     A subclass writes `_search`, and the structure's `_build`, `_grown`, `_read`, `_write` where it has one.
+
+    >>> import numpy as np
+    >>> index = indexes.load_kind("flat").build(np.eye(4, dtype=np.float32))
+    >>> index.count, index.dim, index.exact
+    (4, 4, True)
+    >>> index.search(np.eye(4, dtype=np.float32)[2:3], 1)[1].tolist()
+    [[2]]
     """
 
     kind: ClassVar[str]

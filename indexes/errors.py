@@ -24,7 +24,14 @@ AGAIN = "run `retrieve build-index` again"
 
 
 class IndexesError(Exception):
-    """Wrong use or bad input."""
+    """Wrong use or bad input.
+
+    >>> try:
+    ...     indexes.IndexStore("nowhere").open()
+    ... except indexes.IndexesError as error:
+    ...     print(error.exit_code, error)
+    2 nowhere: there is no index here; run `retrieve build-index` first
+    """
 
     exit_code = 2
 

@@ -42,6 +42,13 @@ class Generation:
     manifest    what `manifest.json` says
     index       the vector index over the slots
     identities  file name -> the file that was opened, as `file_identity` says
+
+    >>> import numpy as np
+    >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
+    >>> generation = indexes.IndexStore("searched").write(rows, np.eye(2, dtype=np.float32), fingerprint={})
+    >>> numbers, scores = generation.search(np.float32([[0.6, 0.8]]), 1)[0]
+    >>> generation.rows[int(numbers[0])]["object_id"], round(float(scores[0]), 3)
+    ('tin', 0.8)
     """
 
     def __init__(

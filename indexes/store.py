@@ -46,7 +46,16 @@ LEFT = re.compile(r"(gen-\d{6,}|CURRENT)\.tmp-\d+")
 
 
 class IndexStore:
-    """The index in the folder `path`, which need not exist before the first `write`."""
+    """The index in the folder `path`, which need not exist before the first `write`.
+
+    >>> import numpy as np
+    >>> store = indexes.IndexStore("photos")
+    >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
+    >>> store.write(rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": "abc"}).name
+    'gen-000001'
+    >>> store.open(expect={"checkpoint": "abc"}).count
+    2
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

@@ -1,5 +1,73 @@
 """Identify objects by touch: from the gel images of a grasp, find the catalogue photo of the object in the hand.
 
 The stages run one way: images, dataset -> towers -> fusion -> train -> search -> report -> cli.
-Nothing is imported here, so `import retrieval` costs nothing.
+Public names are imported when they are used, so `import retrieval` costs nothing.
+
+>>> import retrieval
+>>> with retrieval.open("index") as searcher:
+...     answer = searcher.query(["a.png", "b.png"])
+>>> answer.top.object_id in ("mug", "tin")
+True
 """
+
+from importlib import import_module
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from retrieval.answer import Match, QueryResult
+    from retrieval.build import build_index
+    from retrieval.build_report import BuildReport
+    from retrieval.checkpoint import Checkpoint, load_checkpoint
+    from retrieval.defaults import shipped_model
+    from retrieval.embeddings import embed_photos
+    from retrieval.encoded import Encoded
+    from retrieval.errors import BadInput, RetrievalError
+    from retrieval.search import Searcher
+
+    open = Searcher.open
+
+__all__ = [
+    "BadInput",
+    "BuildReport",
+    "Checkpoint",
+    "Encoded",
+    "Match",
+    "QueryResult",
+    "RetrievalError",
+    "Searcher",
+    "build_index",
+    "embed_photos",
+    "load_checkpoint",
+    "open",
+    "shipped_model",
+]
+
+_PLACES = {
+    "BadInput": "errors:BadInput",
+    "BuildReport": "build_report:BuildReport",
+    "Checkpoint": "checkpoint:Checkpoint",
+    "Encoded": "encoded:Encoded",
+    "Match": "answer:Match",
+    "QueryResult": "answer:QueryResult",
+    "RetrievalError": "errors:RetrievalError",
+    "Searcher": "search:Searcher",
+    "build_index": "build:build_index",
+    "embed_photos": "embeddings:embed_photos",
+    "load_checkpoint": "checkpoint:load_checkpoint",
+    "open": "search:Searcher.open",
+    "shipped_model": "defaults:shipped_model",
+}
+"""Public name -> where it stands in this package."""
+
+if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+
+    def __getattr__(name: str) -> Any:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, attribute = _PLACES[name].partition(":")
+        return attrgetter(attribute)(import_module(f"{__name__}.{module}"))
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -18,6 +18,11 @@ class Match:
     logit: what ranks. probability: P(object | touches, catalogue); over all objects and "none of these" it adds up to
     1; None where the model was never calibrated. photo: its path in the catalogue; photo_path: on the disk, absolute.
     metadata: the user's own.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     best = searcher.query(["a.png", "b.png"]).top
+    >>> best.rank, best.photo_path.is_absolute(), best.photo_path.name == best.photo.split("/")[-1]
+    (1, True, True)
     """
 
     rank: int
@@ -46,6 +51,13 @@ class QueryResult:
     contact" or "not a gel image"; only grasps with contact were judged. none_probability: that the object is none of
     the catalogue's. posterior: the formula and its numbers (`retrieval.posterior`). index: what was searched with what.
     timing_ms: by stage, of this query; of several at once (`Searcher.query_many`) an equal share for each.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     answer = searcher.query(["a.png", "b.png"])
+    >>> answer.top == answer.results[0]
+    True
+    >>> answer.to_dict()["query"]
+    {'touches': [['a.png', 'b.png']], 'grasps': ['contact']}
     """
 
     touches: list[list[str]]

@@ -61,6 +61,12 @@ def build_index(
     cannot be read are skipped and reported. Raises BadInput for a rule that is none, DatasetError where no photo can be
     read, and the errors of `indexes.store.IndexStore.write`, which leave the index as it was. What was embedded until
     an error, or until the process was killed, is not embedded again by the next build (`indexes.unfinished`).
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("index"), quiet=True)
+    >>> report.photos, report.embedded  # the index was there, and no photo changed
+    (4, 0)
     """
     asked = Asked(kind, min_recall, max_ms)
     store = IndexStore(out)

@@ -25,6 +25,12 @@ class BuildReport:
     pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
     (`retrieval.operating`), None where the checkpoint has nothing to measure one with. half_error: largest rounding of
     a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("new-index"), quiet=True)
+    >>> report.written, report.objects, report.photos, report.skipped
+    (True, 2, 4, [])
     """
 
     index: str

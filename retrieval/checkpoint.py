@@ -58,6 +58,11 @@ class Checkpoint(Stored):
 
     posterior: what its logits mean; None where it was never calibrated. queries: (Q, hidden) halves of touches of
     validation objects, by which an index can measure its own search.
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
+    ('none', 64)
     """
 
     matcher: Matcher
@@ -147,6 +152,13 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
 
     known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
     digest nor checksum is reckoned again.
+
+    >>> from pathlib import Path
+    >>> retrieval.load_checkpoint(Path("model.safetensors")).config.matcher.fingers
+    2
+    >>> retrieval.load_checkpoint(Path("catalog"))
+    Traceback (most recent call last):
+    retrieval.errors.CheckpointError: catalog is a folder; give the .safetensors file of a checkpoint
     """
     state, header = read_tensors(path, check=known is None)
     header = matcher_header(path, header)

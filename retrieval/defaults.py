@@ -28,7 +28,11 @@ MOST_FOLDERS = 100
 
 
 def shipped_model() -> Path:
-    """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out."""
+    """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out.
+
+    >>> retrieval.shipped_model().name
+    'simulated-mobilenet.safetensors'
+    """
     return Path(str(resources.files("retrieval") / "shipped" / SHIPPED))
 
 

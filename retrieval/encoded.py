@@ -44,7 +44,13 @@ class Encoder(Protocol):
 
 class Encoded(NamedTuple):
     """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
-    found, and `halves` (N, hidden), by which it judges pairs. float32."""
+    found, and `halves` (N, hidden), by which it judges pairs. float32.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     embeddings, halves = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
+    >>> len(embeddings), len(halves), embeddings.dtype.name
+    (2, 2, 'float32')
+    """
 
     embeddings: Floats
     halves: Floats

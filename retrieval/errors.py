@@ -17,7 +17,14 @@ from pathlib import Path
 
 
 class RetrievalError(Exception):
-    """The job ran and failed."""
+    """The job ran and failed.
+
+    >>> try:
+    ...     retrieval.open("index").query(["a.png"])
+    ... except retrieval.RetrievalError as error:
+    ...     print(error.exit_code, error)
+    2 this model takes 2 gel image(s) for one touch; got 1: a.png (one grasp is ...)
+    """
 
     exit_code = 1
 
@@ -31,7 +38,12 @@ class Interrupted(RetrievalError):
 
 
 class BadInput(RetrievalError):
-    """Wrong use or bad input."""
+    """Wrong use or bad input.
+
+    >>> retrieval.open("index").query(["a.png", "missing.png"])
+    Traceback (most recent call last):
+    retrieval.errors.ImageError: missing.png: no such file
+    """
 
     exit_code = 2
 

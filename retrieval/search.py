@@ -38,6 +38,15 @@ class Searcher:
 
     Any number of threads may query it at once, and a process forked from this one too: no thread or lock outlives a
     query. `close` it, or open it by `with`; a query that is under way then is answered.
+
+    >>> searcher = retrieval.open("index")
+    >>> one = searcher.query(["a.png", "b.png"], top=2)
+    >>> [match.rank for match in one.results]
+    [1, 2]
+    >>> mug, tin = [["a.png", "b.png"], ["a2.png", "b2.png"]], ["a2.png", "b2.png"]
+    >>> len(searcher.query_many([mug, tin]))
+    2
+    >>> searcher.close()
     """
 
     def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
@@ -59,6 +68,14 @@ class Searcher:
         Touches are encoded by the export beside the checkpoint (`retrieval.export`) where there is one, and PyTorch is
         not imported then. Raises the errors of `indexes.store.IndexStore.open`, CheckpointError, and MismatchedIndex
         for another model.
+
+        >>> import numpy as np
+        >>> from PIL import Image
+        >>> pictures = [np.asarray(Image.open(name)) for name in ("a.png", "b.png")]  # as cameras give them
+        >>> with retrieval.open("index") as searcher:
+        ...     from_arrays, from_files = searcher.query(pictures), searcher.query(["a.png", "b.png"])
+        >>> from_arrays.results == from_files.results
+        True
         """
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))

@@ -1,1 +1,61 @@
-"""Rigs and what they write: the recording format and importers of public data. Knows nothing of torch or faiss."""
+"""Rigs and what they write: the recording format and importers of public data. Knows nothing of torch or faiss.
+
+Public names are imported when they are used, so `import robot` costs nothing.
+
+>>> import robot
+>>> rig = robot.load_rig("sim", seed=0)
+>>> rig.info["source"]
+'simulated rig'
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from robot.devices import TactileSensor
+    from robot.errors import RobotError
+    from robot.importers import load_importer
+    from robot.readings import Frame, Pose
+    from robot.recorded_grasp import RecordedGrasp
+    from robot.recording import Recording, RecordingWriter, read_recording
+    from robot.rig import Rig, load_rig
+
+__all__ = [
+    "Frame",
+    "Pose",
+    "RecordedGrasp",
+    "Recording",
+    "RecordingWriter",
+    "Rig",
+    "RobotError",
+    "TactileSensor",
+    "load_importer",
+    "load_rig",
+    "read_recording",
+]
+
+_PLACES = {
+    "Frame": "readings",
+    "Pose": "readings",
+    "RecordedGrasp": "recorded_grasp",
+    "Recording": "recording",
+    "RecordingWriter": "recording",
+    "Rig": "rig",
+    "RobotError": "errors",
+    "TactileSensor": "devices",
+    "load_importer": "importers",
+    "load_rig": "rig",
+    "read_recording": "recording",
+}
+"""Public name -> its module in this package."""
+
+if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+
+    def __getattr__(name: str) -> Any:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -256,7 +256,18 @@ class Gripper(Actuator):
 
 
 class TactileSensor(Device):
-    """The gel of one finger, "a" or "b"."""
+    """The gel of one finger, "a" or "b".
+
+    >>> import numpy as np
+    >>> class Grey(robot.TactileSensor):  # a driver writes the methods whose names begin with an underscore
+    ...     def _connect(self): ...
+    ...     def _close(self): ...
+    ...     def _read(self):
+    ...         return robot.Frame(np.full((120, 160, 3), 128, np.uint8), self.clock())
+    >>> with Grey("grey", "a") as sensor:
+    ...     sensor.read().pixels.shape
+    (120, 160, 3)
+    """
 
     def __init__(self, name: str, finger: str, *, clock: Clock = time.monotonic) -> None:
         super().__init__(name, clock=clock)

@@ -17,7 +17,14 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
 
 
 class RobotError(Exception):
-    """The job ran and failed."""
+    """The job ran and failed.
+
+    >>> try:
+    ...     robot.load_rig("missing.toml", seed=0)
+    ... except robot.RobotError as error:
+    ...     print(error.exit_code, error)
+    2 missing.toml ...
+    """
 
     exit_code = 1
 

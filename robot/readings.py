@@ -19,6 +19,9 @@ class Pose:
     """The point between the fingertips, and the direction (cos yaw, sin yaw) in which the jaws close.
 
     Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers.
+
+    >>> robot.Pose(120.0, 0.0, 40.0, yaw_rad=0.0).as_tuple()
+    (120.0, 0.0, 40.0, 0.0)
     """
 
     x_mm: float
@@ -52,7 +55,12 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and when it was taken."""
+    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and when it was taken.
+
+    >>> import numpy as np
+    >>> robot.Frame(np.zeros((240, 320, 3), np.uint8), time_s=1.5).pixels.shape
+    (240, 320, 3)
+    """
 
     pixels: npt.NDArray[np.uint8]
     time_s: float

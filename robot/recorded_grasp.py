@@ -27,6 +27,12 @@ class RecordedGrasp:
 
     grasped: what the gate decided; training keeps these. outcome: one of OUTCOMES, what the gripper felt.
     touch_skew_s: how far apart in time the fingers' images were taken.
+
+    >>> grasp = robot.read_recording("recording").grasps[0]
+    >>> sorted(grasp.touches)
+    ['a', 'b']
+    >>> sorted(grasp.images())[:2]
+    ['photo', 'touch_a']
     """
 
     grasp_id: str

@@ -59,7 +59,14 @@ _GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording as read: `info` is recording.json, `notes` are remarks for the user."""
+    """A recording as read: `info` is recording.json, `notes` are remarks for the user.
+
+    >>> recording = robot.read_recording("recording")
+    >>> len({grasp.object_id for grasp in recording.grasps})
+    2
+    >>> (recording.folder / recording.grasps[0].photo).is_file()
+    True
+    """
 
     folder: Path
     info: dict[str, Any]
@@ -74,6 +81,12 @@ def read_recording(folder: str | Path) -> Recording:
     """Read and check a recording; images are not opened.
 
     Raises RecordingError with the file and line; half a last line, left by a crash, is dropped with a note.
+
+    >>> [grasp.object_id for grasp in robot.read_recording("recording").grasps]
+    ['mug', 'mug', 'tin', 'tin']
+    >>> robot.read_recording("catalog")
+    Traceback (most recent call last):
+    robot.errors.RecordingError: catalog must be a recording, but has no recording.json; ...
     """
     root = Path(folder)
     info = read_info(root)
@@ -166,6 +179,13 @@ class RecordingWriter:
     recording that exists is continued if its source, sensor, units and background agree (its recording.json
     stays); half a last line is cut off. Raises RecordingError for wrong input, StorageError when the disk
     refuses or another writer has the folder; what was appended before stays whole, and appending may go on.
+
+    >>> from pathlib import Path
+    >>> photo, a, b = (Path(name) for name in ("catalog/mug/1.jpg", "a.png", "b.png"))
+    >>> with robot.RecordingWriter("mine", {"source": "bench 3", "sensor": "GelSight Mini"}) as writer:
+    ...     grasp = writer.append("000001", "mug", {"photo": photo, "touch_a": a, "touch_b": b}, force_n=12.0)
+    >>> len(robot.read_recording("mine").grasps), grasp.force_n
+    (1, 12.0)
     """
 
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:

@@ -33,6 +33,12 @@ class Rig:
     frames are stamped; a simulated rig gives its own. `ask` shows a person a sentence and returns when it is done.
     `attempt`: how attempts are made with this rig unless said otherwise. `given`: where every object stands and how
     large it is, for a rig whose camera cannot tell.
+
+    >>> with robot.load_rig("sim", seed=0) as rig:
+    ...     sorted(rig.sensors), rig.arm.is_connected
+    (['a', 'b'], True)
+    >>> rig.arm.is_connected
+    False
     """
 
     can_run_jobs: ClassVar[bool] = False
@@ -154,6 +160,12 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
 
     The recording's `info` says name and settings, so that the rig can be built again. Raises UnknownName, which
     lists the known ones, and RobotConfigError.
+
+    >>> robot.load_rig("sim", seed=0, fingers=["a"]).sensors.keys()
+    dict_keys(['a'])
+    >>> robot.load_rig("juggler", seed=0)
+    Traceback (most recent call last):
+    robot.errors.UnknownName: no rig is called 'juggler'; known: real, sim, or give a .toml file
     """
     name = spec
     if spec.endswith(".toml"):

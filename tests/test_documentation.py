@@ -1,5 +1,6 @@
 """What the README tells people to run does run; the notebooks have tests/test_notebooks.py."""
 
+import json
 import re
 import shlex
 import shutil
@@ -7,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 
 from retrieval import cli
@@ -97,6 +99,35 @@ def test_the_help_in_the_readme_is_what_the_program_prints(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         cli.main(["--help"])
     assert capsys.readouterr().out.strip() in README
+
+
+class FakeGel:
+    """A camera that shows one picture, blue first."""
+
+    def __init__(self, device):
+        self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
+
+    def read(self):
+        return True, self.picture
+
+
+def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, monkeypatch, capsys):
+    """Two grasps, the next object, one grasp of it."""
+    (program,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    assert cli.main(["build-index", "catalog", "--out", "demo/index"]) == 0
+    keys = iter(["", "", "n", "", "q"])
+    monkeypatch.setattr(cv2, "VideoCapture", FakeGel)
+    monkeypatch.setattr("builtins.input", lambda prompt: next(keys))
+    capsys.readouterr()
+    exec(compile(program, "README.md", "exec"), {})
+    said = [line.split() for line in capsys.readouterr().out.splitlines()]
+    grasp = ["--gelsight", "a.png", "b.png"]
+    for grasps, line in zip((1, 2, 1), said, strict=True):
+        assert cli.main(["query", *grasp * grasps, "--index", "demo/index", "--json"]) == 0
+        best = json.loads(capsys.readouterr().out)["results"][0]
+        assert line[-3] == best["object_id"]
+        assert float(line[-2]) == best["probability"]
+        assert line[-1].endswith(best["photo"])
 
 
 def test_every_file_that_the_readme_links_to_exists():

@@ -32,7 +32,7 @@ STAGES = (
     ("train", "defaults", "export"),
     ("finish",),
     ("methods",),
-    ("ahead",),
+    ("ahead", "embeddings"),
     ("embed", "operating"),
     ("build", "build_report"),
     ("answer", "listing", "objects"),

@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+import retrieval
 from retrieval.build import build_index
 from retrieval.checkpoint import load_checkpoint
 from retrieval.errors import BadInput, ImageError
@@ -151,6 +152,65 @@ def test_what_is_under_way_when_a_searcher_is_closed_is_answered(index, touch, m
 
     monkeypatch.setattr(searcher.encoder, "encode", closed_meanwhile)
     assert ranking(searcher.query(touch)) == expected
+
+
+# For an index of one's own -------------------------------------------------------------------------------------------
+
+
+def test_the_inner_product_of_the_two_embeddings_is_the_score_of_the_candidates(searcher, grasps, catalogue, model):
+    rows = list(searcher.generation.rows)
+    photos = retrieval.embed_photos([catalogue / row["path"] for row in rows], model=model)
+    touches = searcher.encode(grasps[0])
+    np.testing.assert_allclose(np.linalg.norm(touches.embeddings, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(photos.embeddings, axis=1), 1, atol=1e-6)
+    scores = touches.embeddings @ photos.embeddings.T
+    for own, (numbers, theirs) in zip(scores, searcher.generation.search(touches.embeddings, len(rows)), strict=True):
+        np.testing.assert_allclose(own[numbers], theirs, atol=1e-5)  # a photo's batch rounds in another order
+
+
+def test_the_judge_gives_the_logits_of_the_two_halves(searcher, grasps, catalogue, model):
+    answer = searcher.query(grasps[0])
+    photos = retrieval.embed_photos([match.photo_path for match in answer.results], model=load_checkpoint(model))
+    logits = searcher.judge.logits(searcher.encode(grasps[0]).halves, photos.halves)
+    np.testing.assert_allclose(logits, [match.logit for match in answer.results], atol=0.01)  # stored as float16
+
+
+def test_photos_are_embedded_however_they_are_given(catalogue, model):
+    path = sorted(catalogue.rglob("*.jpg"))[0]
+    given = [path, path.read_bytes(), Image.open(path), array(path)]
+    code = retrieval.embed_photos(given, model=model)
+    for embedding in code.embeddings[1:]:
+        np.testing.assert_allclose(embedding, code.embeddings[0], atol=1e-6)
+
+
+def test_no_photo_and_a_bad_one_are_refused(catalogue, model):
+    with pytest.raises(BadInput, match="give at least one photo"):
+        retrieval.embed_photos([], model=model)
+    with pytest.raises(ImageError, match=r"photo 2: an array must hold uint8"):
+        retrieval.embed_photos([sorted(catalogue.rglob("*.jpg"))[0], np.zeros((4, 4, 3))], model=model)
+
+
+# For hours -----------------------------------------------------------------------------------------------------------
+
+
+def resident_mb():
+    """Memory of this process that lies in RAM."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@pytest.mark.parametrize("queries", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
+def test_a_resident_process_answers_arrays_as_files_and_does_not_grow(queries, searcher, grasps):
+    given = [[[array(path) for path in grasp] for grasp in touches] for touches in grasps]
+    expected = [ranking(searcher.query(touches)) for touches in grasps]
+    for number in range(20):  # what is kept for ever is kept by now
+        searcher.query(given[number % 2])
+    before = resident_mb()
+    for number in range(queries):
+        assert ranking(searcher.query(given[number % 2])) == expected[number % 2]
+    one_query = sum(image.nbytes for grasp in given[0] for image in grasp) / 2**20
+    assert resident_mb() - before < max(8, 0.1 * queries * one_query)  # of what was given, next to nothing stays
 
 
 # Threads and forks ---------------------------------------------------------------------------------------------------

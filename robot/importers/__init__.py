@@ -23,7 +23,11 @@ IMPORTERS = {"billets": "robot.importers.billets:import_billets"}
 
 
 def load_importer(name: str) -> Importer:
-    """Return the importer called `name`. Raises UnknownName, which lists the known ones."""
+    """Return the importer called `name`. Raises UnknownName, which lists the known ones.
+
+    >>> robot.load_importer("billets").__name__
+    'import_billets'
+    """
     if name not in IMPORTERS:
         raise UnknownName(f"no importer is called {name!r}; known: {', '.join(sorted(IMPORTERS))}")
     module, function = IMPORTERS[name].split(":")

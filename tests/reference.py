@@ -1,0 +1,113 @@
+"""docs/reference.md, from the docstrings of the public names: `python -m tests.reference` writes it anew."""
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import itertools
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import indexes
+import retrieval
+import robot
+
+PACKAGES = (retrieval, robot, indexes)
+PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
+MADE_BY_HAND = (robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
+"""Classes that a user makes an object of; all others come out of a function."""
+HEAD = """# Reference
+
+The public names of the three packages, from their docstrings; `python -m tests.reference` writes this page. Every
+example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `model.safetensors` and the gel
+images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported when it is used: `import retrieval` alone
+costs nothing.
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    page = HEAD + "".join(_package(package) for package in PACKAGES)
+    return re.sub(r"\n{3,}", "\n\n", page)
+
+
+def _package(package: Any) -> str:
+    parts = [f"\n## {package.__name__}\n", _text(inspect.getdoc(package))]
+    parts += [_public(package, name) for name in package.__all__]
+    return "\n".join(parts)
+
+
+def _public(package: Any, name: str) -> str:
+    thing, title = getattr(package, name), f"{package.__name__}.{name}"
+    if not callable(thing):
+        return f"\n### {title}\n\n{_text(_below(package, name))}"
+    parts = [f"\n### {title}{_arguments(thing)}\n", _text(inspect.getdoc(thing))]
+    if inspect.isclass(thing):
+        parts.append(_fields(thing))
+        parts += [_member(name, own, member) for own, member in vars(thing).items() if not own.startswith("_")]
+    return "\n".join(filter(None, parts))
+
+
+def _member(of: str, name: str, member: Any) -> str:
+    """A method or property of a class; nothing for what has no text, or is a public name itself."""
+    function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+    if not inspect.isfunction(function) or not function.__doc__ or getattr(retrieval.open, "__func__", 0) is function:
+        return ""
+    arguments = "" if isinstance(member, property) else _arguments(function)
+    return f"\n#### {of}.{name}{arguments}\n\n{_text(inspect.getdoc(function))}"
+
+
+def _arguments(thing: Any) -> str:
+    """Names and defaults, types left out; nothing for a class that is not made by hand."""
+    if inspect.isclass(thing) and thing not in MADE_BY_HAND:
+        return ""
+    signature = inspect.signature(thing)
+    named = [item for item in signature.parameters.values() if item.name not in ("self", "cls")]
+    bare = [item.replace(annotation=item.empty) for item in named]
+    text = str(signature.replace(parameters=bare, return_annotation=signature.empty))
+    return re.sub(r"<built-in function (\w+)>", r"\1", text)
+
+
+def _fields(thing: type) -> str:
+    names = getattr(thing, "_fields", None) or [
+        field.name for field in (dataclasses.fields(thing) if dataclasses.is_dataclass(thing) else ())
+    ]
+    return f"\nFields: {', '.join(f'`{name}`' for name in names)}.\n" if names else ""
+
+
+def _below(package: Any, name: str) -> str:
+    """The text that stands below a constant."""
+    body = ast.parse(Path(package.__file__).read_text("utf-8")).body
+    for statement, after in itertools.pairwise(body):
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == name:
+            assert isinstance(after, ast.Expr)
+            assert isinstance(after.value, ast.Constant)
+            return inspect.cleandoc(str(after.value.value))
+    raise AssertionError(f"{name} has no text below it")
+
+
+def _text(docstring: str | None) -> str:
+    """A docstring as Markdown: examples, and what is laid out in columns, in blocks."""
+    assert docstring, "every public name has a docstring"
+    return "\n\n".join(_paragraph(part) for part in re.split(r"\n\n+", docstring.strip())) + "\n"
+
+
+def _paragraph(text: str) -> str:
+    if text.startswith(">>>"):
+        return f"```python\n{text}\n```"
+    columns = re.search(r"^\S.*\S {2,}\S", text, flags=re.MULTILINE) and not text.startswith("* ")
+    return f"```\n{text}\n```" if columns else text
+
+
+def main(arguments: list[str]) -> None:
+    """Write the page."""
+    argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__).parse_args(arguments)
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(reference(), "utf-8")
+    print(PAGE)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
