@@ -36,7 +36,7 @@ FOREIGN = 700
 MISTAKEN = 0.005
 """Share of validation gels that may be called foreign, and of untouched ones that may be called touches."""
 MARGIN = 1.0
-"""Log-odds more than that, before a picture is called foreign: gels that were not recorded differ a little."""
+"""Log-odds beyond that, for both: gels that were not recorded differ a little."""
 FAINT = 0.02
 """Share of validation touches that may be called untouched: those that hardly press the gel say hardly anything."""
 PENALTY = 0.02
@@ -224,7 +224,9 @@ def fit_gel_check(head: GelHead, test: Pictures, levels: tuple[Sequence[float], 
     gels = np.concatenate([touch, untouched])[..., 0].max(1)
     check = GelCheck(
         foreign_above=float(np.quantile(gels, 1 - MISTAKEN)) + MARGIN,
-        contact_above=contact_threshold(untouched[..., 1].max(1), touch[..., 1].max(1)) if len(untouched) else None,
+        contact_above=contact_threshold(untouched[..., 1].max(1) + MARGIN, touch[..., 1].max(1))
+        if len(untouched)
+        else None,
         level_above=contact_threshold(*levels) if all(map(len, levels)) else None,
         shares={},
     )

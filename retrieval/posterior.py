@@ -34,6 +34,7 @@ Numbers = NDArray[np.int64]
 NONE_PRIOR = 0.5
 """That the catalogue lacks the object, where a user says nothing: as likely as not."""
 SLOPE_BOUNDS = (0.01, 100.0)
+_MOST = 1e300
 FORMULA = (
     "P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset), P(none of these) ~ none_prior, "
     "w = slope / (1 + dependence * (grasps - 1)), logit = log mean exp(w * z) / w over the photos of o, "
@@ -65,7 +66,7 @@ class Posterior:
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
-            if type(value) not in (int, float) or not math.isfinite(value):
+            if type(value) not in (int, float) or not abs(value) <= _MOST:
                 raise BadInput(f"a posterior must hold finite numbers; {name} is {value!r}")
         if not SLOPE_BOUNDS[0] <= self.slope <= SLOPE_BOUNDS[1] or not 0 <= self.dependence <= 1:
             raise BadInput(

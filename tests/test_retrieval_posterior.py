@@ -196,6 +196,7 @@ def test_it_is_written_and_read_back():
         {"slope": "1"},
         {"dependence": 2.0},
         {"offset": None},
+        {"offset": 10**400},
         {"tests": True},
         {"formula": "another"},
         {"more": 1},
