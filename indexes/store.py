@@ -176,7 +176,7 @@ class IndexStore:
         try:
             if not self._numbers() and read_regular(path).strip():
                 raise NoIndex(f"{path} is not of an index, and is left as it is; give another folder for the index")
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):  # where a file lies in its place, the lock says so
             return
         except OSError as error:
             raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error

@@ -156,9 +156,9 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
     >>> from pathlib import Path
     >>> retrieval.load_checkpoint(Path("model.safetensors")).config.matcher.fingers
     2
-    >>> retrieval.load_checkpoint(Path("catalog"))
+    >>> retrieval.load_checkpoint(Path("none.safetensors"))
     Traceback (most recent call last):
-    retrieval.errors.CheckpointError: catalog is a folder; give the .safetensors file of a checkpoint
+    retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
     state, header = read_tensors(path, check=known is None)
     header = matcher_header(path, header)

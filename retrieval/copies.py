@@ -6,10 +6,10 @@ are taken off, and what remains is its shape. The distance of two pictures is 1 
 the least over the four flips of one of them: 0 for a copy, about 1 for unlike pictures.
 
 How far a copy may lie is measured on the picture itself: it is saved as JPEG of quality 20, made a tenth brighter, and
-moved by 2 pixels. A change counts where the changed picture, `SLACK` times as far, stays within a quarter of the way to
-the third nearest other object, which is no copy; the farthest that counts is the picture's limit. A touch that hardly
-differs from the untouched gel, or of fine relief alone, loses its shape to such a change: only pictures for which all
-three count are called CHECKED.
+moved by 2 pixels along either diagonal; the farthest of these, `SLACK` times as far, is its limit. A touch that hardly
+differs from the untouched gel, or shows fine relief alone, loses its shape to such a change. So a picture counts as
+CHECKED only where its limit is less than a quarter of the way to the third nearest other object, which is no copy; of
+the others only copies are found that are as near as the gentlest of these changes, such as flipped ones.
 
 Measured on simulated recordings of 12 objects: limits of .002 to .12, other objects from .17 on; JPEG 20 left 64-bit
 perceptual hashes 0 to 18 bits from their picture, where other objects' touches began at 2: no threshold tells these
@@ -43,7 +43,7 @@ Greys = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """One picture: the digest of its bytes, its grey levels (256,), and those of its damaged copies (3, 256)."""
+    """One picture: the digest of its bytes, its grey levels (256,), and those of its damaged copies (4, 256)."""
 
     digest: str
     grey: Greys
@@ -81,12 +81,17 @@ def brighter(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def shifted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Moved by 2 pixels both ways; the border repeats."""
+    """Moved by 2 pixels down and to the right; the border repeats."""
     height, width = picture.shape[:2]
     return np.asarray(np.pad(picture, ((2, 0), (2, 0), (0, 0)), "edge")[:height, :width])
 
 
-DAMAGES = (as_jpeg, brighter, shifted)
+def shifted_across(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Moved by 2 pixels down and to the left."""
+    return shifted(picture[:, ::-1])[:, ::-1]
+
+
+DAMAGES = (as_jpeg, brighter, shifted, shifted_across)
 
 
 def shapes(greys: Greys, common: Greys | None = None) -> Greys:
@@ -142,12 +147,13 @@ class Pictures:
             return Nearest(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)
         parts = [self._nearest(queries[at : at + _BLOCK], among) for at in range(0, len(queries), _BLOCK)]
         row, distance, third = (np.concatenate(part) for part in zip(*parts, strict=True))
-        most = _PART * third[:, None]
-        counts = self.changed[queries] < most
+        most = _PART * third
+        checked = self.changed[queries].max(axis=1) < most
         # Either may be the copy, and what was saved as JPEG once hardly changes the next time.
         changed = np.maximum(self.changed[queries], self.changed[row])
-        limit = np.where(changed < most, changed, 0).max(axis=1)
-        return Nearest(row, distance, np.asarray(counts.all(axis=1)), distance <= limit)
+        farthest, gentlest = changed.max(axis=1), changed.min(axis=1)
+        limit = np.where(farthest < most, farthest, np.minimum(gentlest, most))
+        return Nearest(row, distance, checked, np.asarray(distance <= limit))
 
     def _nearest(
         self, queries: NDArray[np.int64], among: NDArray[np.int64]

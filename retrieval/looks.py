@@ -56,10 +56,11 @@ class Moments:
 def swapped_moments(before: Looks, during: Looks) -> Moments:
     """Frames of the untouched gel are all alike, touches are not: what lies far from the median of the frames before
     belongs among the touches."""
+    spread = [float(np.median(_from(frames, np.median(frames, axis=0)))) for frames in (before, during)]
+    if spread[0] > max(2 * spread[1], _NOISE_TIMES * _LEAST_NOISE):
+        return Moments(np.zeros(0, np.int64), True, 0)
     untouched, touched = (_from(frames, np.median(before, axis=0)) for frames in (before, during))
     noise = max(float(np.quantile(untouched, 0.25)), _LEAST_NOISE)
-    if np.median(untouched) > 2 * np.median(touched) and np.median(untouched) > _NOISE_TIMES * _LEAST_NOISE:
-        return Moments(np.zeros(0, np.int64), True, 0)
     far = _NOISE_TIMES * noise
     swapped = np.flatnonzero((untouched > far) & (touched < untouched / 2))
     return Moments(swapped, False, int(((untouched <= far) & (touched <= far)).sum()))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.copies import PX, Pictures, flipped, shapes, thumbnail
+from retrieval.copies import PX, Pictures, as_jpeg, brighter, flipped, shapes, shifted, thumbnail
 
 
 def scene(seed, size=(120, 160)):
@@ -50,10 +50,11 @@ def test_the_nearest_picture_of_another_object_is_that_of_plain_loops():
         assert found.distance[at] == pytest.approx(min(distances.values()), abs=1e-5)
 
 
-def test_a_copy_of_lower_quality_is_nearer_than_its_limit_and_no_other_picture_is():
+@pytest.mark.parametrize("change", [as_jpeg, brighter, shifted, lambda gel: np.ascontiguousarray(gel[::-1])])
+def test_a_changed_copy_is_nearer_than_its_limit_and_no_other_picture_is(change):
     images = [scene(seed) for seed in range(9)]
-    copy = cv2.imdecode(cv2.imencode(".jpg", np.rint(255 * images[2]), [cv2.IMWRITE_JPEG_QUALITY, 20])[1], 1)
-    found = pictures([*images, copy.astype(np.float32) / 255]).nearest(np.arange(10), np.arange(10))
+    copy = change(np.rint(255 * images[2]).astype(np.uint8)).astype(np.float32) / 255
+    found = pictures([*images, copy]).nearest(np.arange(10), np.arange(10))
     assert np.flatnonzero(found.copy).tolist() == [2, 9]
     assert found.row[[2, 9]].tolist() == [9, 2]
     assert found.checked.all()

@@ -186,7 +186,8 @@ def test_a_check_names_the_grasps_whose_photos_are_exchanged(broken):
     found = one(finding for finding in broken.findings() if finding.kind == "exchanged-photos")
     first, second = broken.rows[2]["grasp_id"], broken.rows[9]["grasp_id"]
     assert found[0] == "warning"
-    assert found[2].endswith(f"look exchanged between two objects: {first} with {second}")
+    assert "the photos of 1 pair(s) of grasps look exchanged between two objects: " in found[2]
+    assert (first in found[2], second in found[2]) == (True, True)
 
 
 # Copies ----------------------------------------------------------------------------------------------------
@@ -213,6 +214,14 @@ COPIES = {
 }
 
 
+GENTLE = ("gain 1.1", "mirrored", "upside down")
+
+
+def found_in(how):
+    """The drawn touches show fine relief alone, which the harder changes wipe out; of these the notes tell."""
+    return {"photo", "touch a", "touch b"} if how in GENTLE else {"photo"}
+
+
 @pytest.mark.parametrize("how", COPIES)
 def test_near_copies_of_another_object_are_named(broken, how):
     for column in ("photo", "touch_a", "touch_b"):
@@ -220,7 +229,10 @@ def test_near_copies_of_another_object_are_named(broken, how):
         cv2.imwrite(str(broken.file(20, column)), copy)
     found = [finding for finding in broken.findings() if finding.kind == "near-copy"]
     assert {finding.severity for finding in found} == {"error"}
-    pair = " and ".join(names(broken, (3, 20)))
-    kinds = {kind for kind in ("photo", "touch a", "touch b") if any(f"({kind})" in one.message for one in found)}
-    assert kinds == {"photo", "touch a", "touch b"}
-    assert all(finding.message.endswith(f"near copies of each other: {pair}") for finding in found)
+    assert {
+        kind for kind in ("photo", "touch a", "touch b") if any(f"({kind})" in one.message for one in found)
+    } >= found_in(how)
+    for finding in found:
+        assert set(finding.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
+    notes = [finding for finding in check_recording(broken.folder, quiet=True) if finding.kind == "unchecked-copies"]
+    assert any("(touch a)" in note.message for note in notes)

@@ -315,6 +315,7 @@ def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(o
     export(load_checkpoint(own))
     group = {item.partition(">=")[0] for item in PROJECT["dependency-groups"]["query"]}
     asked = ["query", "--gelsight", *map(str, touch), "--index", str(index), "--html", str(tmp_path / "q.html")]
+    asked += ["--none-prior", "0"]
     code = ONLY.format(allowed=group, arguments=asked)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr

@@ -261,4 +261,5 @@ def test_a_piped_table_is_plain_and_uncut(capsys):
         f"rank  {name}  probability  logit  photo\n"
         f"   1  {long}        0.800  +1.50  {long}/1.jpg\n"
         f"   2  {'mug':<39}        0.100  -0.25  a very/{'deep/' * 20}\n"
+        f"   -  {'none of these':<39}        0.200\n"
     )

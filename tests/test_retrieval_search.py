@@ -552,7 +552,10 @@ def made_up_objects(searcher, rng):
     names = [f"object-{number:02}" for number in rng.permutation(40)]
     owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
     made_up = copy.copy(searcher.objects)
-    made_up._rows = [{"object_id": names[owner]} for owner in owners]
+    made_up._rows = [
+        {"id": f"{row}", "object_id": names[owner], "path": f"{row}.jpg", "metadata": {}}
+        for row, owner in enumerate(owners)
+    ]
     made_up._of_row, made_up._photos = owners, np.bincount(owners)
     return made_up, names
 

@@ -171,8 +171,14 @@ def test_the_inner_product_of_the_two_embeddings_is_the_score_of_the_candidates(
 def test_the_judge_gives_the_logits_of_the_two_halves(searcher, grasps, catalogue, model):
     answer = searcher.query(grasps[0])
     photos = retrieval.embed_photos([match.photo_path for match in answer.results], model=load_checkpoint(model))
-    logits = searcher.judge.logits(searcher.encode(grasps[0]).halves, photos.halves)
-    np.testing.assert_allclose(logits, [match.logit for match in answer.results], atol=0.01)  # stored as float16
+    shown = np.asarray(searcher.judge.logits(searcher.encode(grasps[0]).halves, photos.halves))
+    meant = searcher.posterior.object_logits(shown, np.arange(len(shown)), np.ones(len(shown), dtype=int))
+    # The photos shown are the best of each object; the mean likelihood of all is no larger than the best one's.
+    assert (meant + 0.01 >= [match.logit for match in answer.results]).all()
+    rows = [photo["path"] for photo in searcher.generation.rows]
+    places = np.array([rows.index(match.photo) for match in answer.results])
+    stored = searcher.judge.logits(searcher.encode(grasps[0]).halves, searcher.generation.arrays["halves"], places)
+    np.testing.assert_allclose(shown, stored, atol=0.01)  # stored as float16
 
 
 def test_photos_are_embedded_however_they_are_given(catalogue, model):

@@ -420,7 +420,7 @@ def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording
     assert made.split.validation == ()
     assert len(made.split.train) + len(made.split.test) == 12
     assert made.provenance["step"] == 4
-    assert made.calibration is None
+    assert made.posterior is None
 
 
 BATCH_STATISTICS = """
