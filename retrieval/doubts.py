@@ -20,7 +20,7 @@ from retrieval.findings import Files, Finding, named, some
 from retrieval.looks import Looks, exchanged_photos, named_by, swapped_fingers, swapped_moments
 
 _LEAST_GRASPS = 4
-_BY_LIGHT, _BY_TOUCH = 0.25, 0.6
+_BY_LIGHT, _BY_TOUCH = 0.35, 0.6
 """How far from chance to always may light alone name the object: by frames without contact, and by the mean colour of
 touches, which names it a little by what was felt (0.2 to 0.35 of the way on simulated recordings)."""
 

@@ -84,7 +84,7 @@ class Named:
     def beyond(self, part: float) -> bool:
         """Whether it goes more than `part` of the way from chance to always, and more than chance would by itself."""
         scatter = np.sqrt(self.chance * (1 - self.chance) / max(self.grasps, 1))
-        least = max(part * (1 - self.chance), 4 * scatter)
+        least = max(part * (1 - self.chance), 5 * scatter)
         return bool(self.grasps > 0 and self.share > self.chance + least)
 
 
