@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 
+from retrieval.gel_check import CONTACT, GelCheck
 from tests import synthetic
 from tests.notebooks import FOLDER, execute, kinds
 
@@ -83,7 +84,9 @@ def beside(tmp_path, recording, monkeypatch):
 
 @pytest.mark.slow
 @every_notebook
-def test_a_notebook_runs_from_top_to_bottom_and_was_committed_with_what_every_cell_shows(name, beside):
+def test_a_notebook_runs_from_top_to_bottom_and_was_committed_with_what_every_cell_shows(name, beside, monkeypatch):
+    # Drawn pictures stand for the demo's touches; the shipped checkpoint would say that they are no gel images.
+    monkeypatch.setattr(GelCheck, "judge", lambda self, readings, levels=None: [CONTACT] * len(readings))
     tiny = "\n".join(f"{key} = {value!r}" for key, value in TINY[name].items())
     shown = [kinds(outputs) for outputs in execute(notebook(name), parameters=tiny)]
     assert shown == [kinds(outputs) for outputs in committed(name)]
