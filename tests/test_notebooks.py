@@ -3,7 +3,6 @@
 import ast
 import json
 import re
-import shutil
 
 import pytest
 
@@ -73,10 +72,10 @@ def committed(name):
 
 
 @pytest.fixture
-def beside(tmp_path, recording, monkeypatch):
-    """What notebooks find beside their folder: the demo's recording and catalogue, and nothing else."""
+def beside(tmp_path, monkeypatch):
+    """What notebooks find beside their folder: a recording and a catalogue in the demo's sizes, and nothing else."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    shutil.copytree(recording, tmp_path / "demo" / "recording")
+    synthetic.write_recording(tmp_path / "demo" / "recording", synthetic.make_objects(24), 3)
     synthetic.write_catalogue(tmp_path / "demo" / "catalog", synthetic.make_objects(4), photos_per_object=2)
     (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path / "notebooks")
