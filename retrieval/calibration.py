@@ -52,7 +52,7 @@ class Calibration:
         return _expit(self.log_odds(logit, grasps))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
+        """Plain dictionary, as in `results.json`."""
         return dataclasses.asdict(self)
 
     @classmethod
