@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = COMMANDS[arguments.command](arguments)
             with printing():
                 sys.stdout.flush()
-            return code or 0
+            return code if isinstance(code, int) else 0
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
             give_up_stdout()
             return 1
