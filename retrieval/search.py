@@ -232,8 +232,12 @@ class Searcher:
             return None
         meaning, logits = self.posterior or Posterior(), self._logits(halves, rows)
         objects = self.objects.judged(rows, logits, meaning, len(halves))
-        best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
-        if len(rest := self.objects.rest_of(best, rows)):
+        if len(rows) < self.generation.count:
+            best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
+            rest = self.objects.rest_of(best, rows)
+        else:
+            rest = rows[:0]
+        if len(rest):
             rows = np.concatenate([rows, rest])
             logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
             objects = self.objects.judged(rows, logits, meaning, len(halves))
