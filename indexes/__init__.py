@@ -2,9 +2,9 @@
 
 Importing this package needs only numpy; FAISS is imported when one of its kinds is used.
 
-    indexes.store        `IndexStore`, the folder of generations
-    indexes.choice       which kind meets a latency budget, by measurement
-    indexes.measure      recall against the exact search
+    indexes.store.folder        `IndexStore`, the folder of generations
+    indexes.kinds.choice       which kind meets a latency budget, by measurement
+    indexes.kinds.measure      recall against the exact search
     indexes.errors       every error
 
 >>> import indexes, numpy
@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 from indexes.errors import ParameterError
 
 if TYPE_CHECKING:
-    from indexes.base import VectorIndex
-    from indexes.choice import choose_kind
     from indexes.errors import IndexesError
-    from indexes.generation import Generation
-    from indexes.measure import recall_against_exact
-    from indexes.store import IndexStore
+    from indexes.kinds.base import VectorIndex
+    from indexes.kinds.choice import choose_kind
+    from indexes.kinds.measure import recall_against_exact
+    from indexes.store.folder import IndexStore
+    from indexes.store.generation import Generation
 
 __all__ = [
     "KINDS",
@@ -39,12 +39,12 @@ __all__ = [
 ]
 
 KINDS = {
-    "exact": "indexes.exact:ExactIndex",
-    "flat": "indexes.flat:FlatIndex",
-    "hnsw": "indexes.hnsw:HNSWIndex",
-    "ivf_flat": "indexes.ivf:IVFFlatIndex",
-    "ivf_sq8": "indexes.ivf:IVFSQ8Index",
-    "ivf_pq": "indexes.ivf:IVFPQIndex",
+    "exact": "indexes.kinds.exact:ExactIndex",
+    "flat": "indexes.kinds.flat:FlatIndex",
+    "hnsw": "indexes.kinds.hnsw:HNSWIndex",
+    "ivf_flat": "indexes.kinds.ivf:IVFFlatIndex",
+    "ivf_sq8": "indexes.kinds.ivf:IVFSQ8Index",
+    "ivf_pq": "indexes.kinds.ivf:IVFPQIndex",
 }
 """Name of a kind -> where its class stands. A new kind is one file and one line here."""
 
@@ -66,12 +66,12 @@ def load_kind(name: str) -> "type[VectorIndex]":
 
 
 _PLACES = {
-    "Generation": "generation",
-    "IndexStore": "store",
+    "Generation": "store.generation",
+    "IndexStore": "store.folder",
     "IndexesError": "errors",
-    "VectorIndex": "base",
-    "choose_kind": "choice",
-    "recall_against_exact": "measure",
+    "VectorIndex": "kinds.base",
+    "choose_kind": "kinds.choice",
+    "recall_against_exact": "kinds.measure",
 }
 """Public name -> its module in this package, imported when it is used."""
 

@@ -15,15 +15,15 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from retrieval.answer import Match, QueryResult
-    from retrieval.build import build_index
-    from retrieval.build_report import BuildReport
-    from retrieval.checkpoint import Checkpoint, load_checkpoint
-    from retrieval.defaults import shipped_model
-    from retrieval.embeddings import embed_photos
-    from retrieval.encoded import Encoded
     from retrieval.errors import BadInput, RetrievalError
-    from retrieval.search import Searcher
+    from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+    from retrieval.model.encoded import Encoded
+    from retrieval.search.answer import Match, QueryResult
+    from retrieval.search.build import build_index
+    from retrieval.search.build_report import BuildReport
+    from retrieval.search.defaults import shipped_model
+    from retrieval.search.embeddings import embed_photos
+    from retrieval.search.searcher import Searcher
 
     open = Searcher.open
 
@@ -45,18 +45,18 @@ __all__ = [
 
 _PLACES = {
     "BadInput": "errors:BadInput",
-    "BuildReport": "build_report:BuildReport",
-    "Checkpoint": "checkpoint:Checkpoint",
-    "Encoded": "encoded:Encoded",
-    "Match": "answer:Match",
-    "QueryResult": "answer:QueryResult",
+    "BuildReport": "search.build_report:BuildReport",
+    "Checkpoint": "model.checkpoint:Checkpoint",
+    "Encoded": "model.encoded:Encoded",
+    "Match": "search.answer:Match",
+    "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
-    "Searcher": "search:Searcher",
-    "build_index": "build:build_index",
-    "embed_photos": "embeddings:embed_photos",
-    "load_checkpoint": "checkpoint:load_checkpoint",
-    "open": "search:Searcher.open",
-    "shipped_model": "defaults:shipped_model",
+    "Searcher": "search.searcher:Searcher",
+    "build_index": "search.build:build_index",
+    "embed_photos": "search.embeddings:embed_photos",
+    "load_checkpoint": "model.checkpoint:load_checkpoint",
+    "open": "search.searcher:Searcher.open",
+    "shipped_model": "search.defaults:shipped_model",
 }
 """Public name -> where it stands in this package."""
 

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from robot.errors import RobotError
     from robot.importers import load_importer
     from robot.readings import Frame, Pose
-    from robot.recorded_grasp import RecordedGrasp
-    from robot.recording import Recording, RecordingWriter, read_recording
+    from robot.recording.folder import Recording, RecordingWriter, read_recording
+    from robot.recording.grasp import RecordedGrasp
     from robot.rig import Rig, load_rig
 
 __all__ = [
@@ -37,15 +37,15 @@ __all__ = [
 _PLACES = {
     "Frame": "readings",
     "Pose": "readings",
-    "RecordedGrasp": "recorded_grasp",
-    "Recording": "recording",
-    "RecordingWriter": "recording",
+    "RecordedGrasp": "recording.grasp",
+    "Recording": "recording.folder",
+    "RecordingWriter": "recording.folder",
     "Rig": "rig",
     "RobotError": "errors",
     "TactileSensor": "devices",
     "load_importer": "importers",
     "load_rig": "rig",
-    "read_recording": "recording",
+    "read_recording": "recording.folder",
 }
 """Public name -> its module in this package."""
 

@@ -2,8 +2,8 @@
 
 Object by object and attempt by attempt: photo, cylinder, random grasp, gel images before, during and after, lift, what
 the gripper felt, and the gate, which decides what training keeps. What it rejects is recorded too, and attempts that
-came to no grasp are logged (robot.attempt_log). `grasps` accepted ones are wanted of each object, in a bounded number
-of attempts: an object that cannot be grasped is reported, not tried for ever.
+came to no grasp are logged (robot.recording.attempt_log). `grasps` accepted ones are wanted of each object, in a
+bounded number of attempts: an object that cannot be grasped is reported, not tried for ever.
 
 A recording is written by one writer in one order, so that it is the same whatever the number of jobs, and a
 collection that was stopped or killed goes on where it was when it is started again.
@@ -24,12 +24,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.attempt import Attempt, Attempter
-from robot.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
-from robot.attempt_settings import AttemptSettings
 from robot.errors import RecordingError, RobotConfigError
-from robot.gates import ContactAreaGate, Gate, GraspFrames, judge
-from robot.recording import INFO_FILE, RecordingWriter, read_info, software_version
+from robot.grasping.attempt import Attempt, Attempter
+from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, judge
+from robot.grasping.settings import AttemptSettings
+from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
+from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.rig import Rig
 from robot.workers import Jobs, RigMaker
 
@@ -94,10 +94,10 @@ def collect(
     """Collect into the folder `out`, or go on with what is there; returns what came of every object.
 
     make_rig builds the rig; it is called once, and with jobs > 1 in every process too. objects: names, or how many of
-    the rig's. gate: see robot.gates; gate_name says which one it is, for it must be the same when a collection goes on.
-    Raises RobotConfigError, RecordingError (the folder holds something else, or was collected otherwise), DeviceError
-    (a device failed too often), StorageError; what was recorded before is whole, and the rig is closed with its jaws
-    open, unless the error says that they could not be opened. KeyboardInterrupt likewise.
+    the rig's. gate: see robot.grasping.gates; gate_name says which one it is, for it must be the same when a collection
+    goes on. Raises RobotConfigError, RecordingError (the folder holds something else, or was collected otherwise),
+    DeviceError (a device failed too often), StorageError; what was recorded before is whole, and the rig is closed with
+    its jaws open, unless the error says that they could not be opened. KeyboardInterrupt likewise.
     """
     settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
     rig = make_rig()
@@ -315,5 +315,5 @@ def frames_of(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
 
 def _decoded(data: bytes) -> npt.NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert pixels is not None, "it was encoded by robot.attempt"
+    assert pixels is not None, "it was encoded by robot.grasping.attempt"
     return np.ascontiguousarray(pixels[..., ::-1])

@@ -29,9 +29,9 @@
     [gel.a]                                   # what it is made of, as far as is known (robot.gel_settings)
     thickness_mm = 3.0
     modulus_mpa = 0.35
-    [grasp]                                   # how grasps are drawn (robot.grasp.GraspSettings)
+    [grasp]                                   # how grasps are drawn (robot.grasping.plan.GraspSettings)
     force_n = [5, 15]
-    [attempt]                                 # how they are made (robot.attempt_settings.AttemptSettings)
+    [attempt]                                 # how they are made (robot.grasping.settings.AttemptSettings)
     settle_s = 1.0
     [object]                                  # instead of depth: every object stands here and is so large
     x_mm = 0
@@ -50,37 +50,37 @@ from typing import Any
 
 import numpy as np
 
-from robot import hand_eye
-from robot.attempt_settings import AttemptSettings, attempt_of
-from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
-from robot.grasp import GraspSettings
+from robot.grasping.plan import GraspSettings
+from robot.grasping.settings import AttemptSettings, attempt_of
 from robot.readings import Box
 from robot.rig import Rig, ask_on_terminal
 from robot.settings import build, check_type
+from robot.sight import hand_eye
+from robot.sight.cylinder import CylinderFit
 
 DRIVERS: Mapping[str, Mapping[str, str]] = {
     "arm": {
         "manual": "robot.drivers.manual_arm:ManualArm",
-        "sawyer": "robot.drivers.sawyer:Sawyer",
+        "sawyer": "robot.drivers.sawyer.driver:Sawyer",
     },
     "gripper": {
-        "wsg50": "robot.drivers.wsg50:WSG50",
+        "wsg50": "robot.drivers.wsg50.driver:WSG50",
     },
     "sensors": {
-        "gelsight": "robot.drivers.opencv_tactile:GelSight",
-        "gelsight_mini": "robot.drivers.opencv_tactile:GelSightMini",
-        "digit": "robot.drivers.opencv_tactile:Digit",
-        "uvc": "robot.drivers.opencv_tactile:OpencvTactile",
+        "gelsight": "robot.drivers.gels.opencv:GelSight",
+        "gelsight_mini": "robot.drivers.gels.opencv:GelSightMini",
+        "digit": "robot.drivers.gels.opencv:Digit",
+        "uvc": "robot.drivers.gels.opencv:OpencvTactile",
         "video": "robot.drivers.replay:VideoSensor",
         "images": "robot.drivers.replay:ImagesSensor",
     },
     "camera": {
-        "kinect2": "robot.drivers.kinect2:Kinect2",
-        "realsense": "robot.drivers.realsense:RealSense",
-        "uvc": "robot.drivers.uvc_camera:UvcCamera",
+        "kinect2": "robot.drivers.cameras.kinect2:Kinect2",
+        "realsense": "robot.drivers.cameras.realsense:RealSense",
+        "uvc": "robot.drivers.cameras.uvc:UvcCamera",
         "replay": "robot.drivers.replay:ReplayCamera",
     },
 }

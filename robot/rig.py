@@ -8,12 +8,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from robot.attempt_settings import AttemptSettings
-from robot.cylinder import CylinderFit
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
+from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.settings import build
+from robot.sight.cylinder import CylinderFit
 from robot.storage import read_regular
 
 RIGS = {"sim": "robot.sim.rig:SimRig", "real": "robot.real_rig:RealRig"}

@@ -15,9 +15,9 @@ from typing import Self
 
 import cv2
 
-from robot.attempt import Attempt, Attempter
-from robot.attempt_settings import AttemptSettings
 from robot.errors import RobotError
+from robot.grasping.attempt import Attempt, Attempter
+from robot.grasping.settings import AttemptSettings
 from robot.rig import Rig
 
 RigMaker = Callable[[], Rig]

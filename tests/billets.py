@@ -20,17 +20,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.batches import BatchImages
-from retrieval.binomial import binomial_interval
-from retrieval.calibration import pair_accuracy
-from retrieval.config import load_config
-from retrieval.dataset import Grasp, PairSampler, Split, load_grasps
-from retrieval.encode import encode_photos, encode_touches
-from retrieval.evaluation.metrics import guess_curve
-from retrieval.features import blurred
-from retrieval.images import read_rgb
-from retrieval.resize import resize
-from retrieval.train import train
+from retrieval.data.dataset import Grasp, PairSampler, Split, load_grasps
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import resize
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import guess_curve
+from retrieval.metrics.pairs import pair_accuracy
+from retrieval.model.config import load_config
+from retrieval.model.encode import encode_photos, encode_touches
+from retrieval.training.batches import BatchImages
+from retrieval.training.features import blurred
+from retrieval.training.train import train
 from robot.importers import load_importer
 
 WELDED = tuple(f"welded{number}" for number in range(1, 6))

@@ -12,8 +12,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from retrieval.config import Config, MatcherConfig, TrainingConfig
-from retrieval.images import Preprocessing
+from retrieval.data.images import Preprocessing
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from tests import synthetic
 
 # Of two processes side by side (`-n 2`) each has one thread: two that wait for each other on one core crawl.
@@ -86,7 +86,7 @@ def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
 @pytest.fixture(scope="session")
 def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint after six steps: it works like any other and knows nothing."""
-    from retrieval.train import train
+    from retrieval.training.train import train
 
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
     train(recording, out, TINY, quiet=True)

@@ -21,18 +21,19 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from robot.attempt_settings import AttemptSettings
 from robot.collect import CollectSettings, collect
 from robot.devices import Arm, Camera
-from robot.drivers import opencv_stream, rosbridge_emulator
-from robot.drivers.opencv_tactile import OpencvTactile
-from robot.drivers.sawyer import Sawyer
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
+from robot.drivers.gels.opencv import OpencvTactile
+from robot.drivers.sawyer.driver import Sawyer
+from robot.drivers.video import opencv_stream
+from robot.drivers.wsg50.driver import WSG50
+from robot.emulators.sawyer import server as rosbridge_emulator
+from robot.emulators.wsg50.server import Emulator, Faults, serve_pty, serve_tcp
 from robot.errors import DeviceError
-from robot.grasp import GraspSettings
+from robot.grasping.plan import GraspSettings
+from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Box, Intrinsics, Pose
-from robot.recording import read_recording
+from robot.recording.folder import read_recording
 from robot.rig import Rig
 from tests import views
 from tests.fake_video import FakeCamera

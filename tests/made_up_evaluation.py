@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 
-from retrieval.dataset import load_grasps, make_split
+from retrieval.data.dataset import load_grasps, make_split
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import audit
-from retrieval.posterior import Posterior
+from retrieval.model.posterior import Posterior
 
 SKILL = {
     "late_fusion": 1.6,

@@ -16,12 +16,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from retrieval.cli import main as retrieve
-from robot import hand_eye
-from robot.drivers.wsg50_emulator import Emulator, serve_tcp
+from retrieval.commands.cli import main as retrieve
+from robot.emulators.wsg50.server import Emulator, serve_tcp
 from robot.readings import Frame, Intrinsics
-from robot.recording import read_info, read_recording
+from robot.recording.folder import read_info, read_recording
 from robot.rig import RIGS, load_rig
+from robot.sight import hand_eye
 from tests.emulated_rig import HOLDING
 from tests.replay_rig import FILE
 

@@ -11,11 +11,11 @@ from unittest.mock import patch
 
 import numpy as np
 
-from robot import hand_eye
 from robot.collect import CollectSettings, collect
-from robot.drivers.wsg50_emulator import Emulator, serve_tcp
-from robot.recording import read_recording
+from robot.emulators.wsg50.server import Emulator, serve_tcp
+from robot.recording.folder import read_recording
 from robot.rig import load_rig
+from robot.sight import hand_eye
 from tests import views
 from tests.fake_rig import LENS, FakeRig
 

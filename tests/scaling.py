@@ -18,16 +18,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from retrieval.config import Config, load_config
-from retrieval.dataset import data_digest, load_grasps
+from retrieval.data.dataset import data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import main_measures, summaries
 from retrieval.evaluation.table import ScoreTable
-from retrieval.features import Features, encode_recording
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
-from retrieval.train import build_matcher
+from retrieval.model.config import Config, load_config
+from retrieval.training.features import Features, encode_recording
+from retrieval.training.train import build_matcher
 
 LINES = ("-", "--", "-.")
 SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}

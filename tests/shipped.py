@@ -24,19 +24,21 @@ import numpy as np
 
 import robot.collect
 import robot.rig
-from retrieval import cli, defaults, distil
-from retrieval.batches import FrozenFeatures
-from retrieval.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
-from retrieval.config import load_config
-from retrieval.dataset import Grasp, Split, data_digest, load_grasps, recording_source
-from retrieval.encode import default_device, one_thread
-from retrieval.features import Features, by_image, encode_recording
-from retrieval.judgement import with_verdicts
+from retrieval.commands import cli
+from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
-from retrieval.train import build_matcher
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.config import load_config
+from retrieval.model.encode import default_device, one_thread
+from retrieval.search import defaults
+from retrieval.training import distil
+from retrieval.training.batches import FrozenFeatures
+from retrieval.training.features import Features, by_image, encode_recording
+from retrieval.training.judgement import with_verdicts
+from retrieval.training.train import build_matcher
 
-# Worlds of the simulated rig. The demo has one of its own (retrieval.demo.SEED), the benchmark has 0.
+# Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
 SEED_TRAINED, SEED_SCORED = 10_000, 30_000
 RIG = Path(__file__).with_name("shipped_rig.toml")
 VALIDATION = 100

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from robot.recording import RecordingWriter
+from robot.recording.folder import RecordingWriter
 
 FloatImage = NDArray[np.float32]
 Picture = NDArray[np.uint8]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.checkpoint import Checkpoint
-from retrieval.fusion import judge_of
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.fusion import judge_of
 from tests.benchmarks import scale
 from tests.benchmarks.common import matcher_of
 from tests.conftest import TINY

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from retrieval.dataset import Grasp
+from retrieval.data.dataset import Grasp
 from tests.billets import KS, fold_split, report, score_fold, share
 
 

@@ -9,10 +9,10 @@ import threading
 import pytest
 
 from robot.collect import CollectSettings, collect
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_motion import Motions
+from robot.drivers.wsg50.driver import WSG50
+from robot.drivers.wsg50.motion import Motions
 from robot.errors import DeviceError
-from robot.recording import read_recording
+from robot.recording.folder import read_recording
 from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
 from tests.fake_video import own_threads
 from tests.waiting import until

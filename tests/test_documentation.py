@@ -11,9 +11,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from retrieval import cli
-from retrieval.answer import EXIT_CODES
-from robot.drivers.wsg50_emulator import Emulator
+from retrieval.commands import cli
+from retrieval.search.answer import EXIT_CODES
+from robot.emulators.wsg50.server import Emulator
 from robot.rig import load_rig
 from tests import synthetic
 from tests.replay_rig import replay_file

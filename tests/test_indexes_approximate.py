@@ -6,9 +6,9 @@ import pytest
 
 from indexes import load_kind
 from indexes.errors import ParameterError
-from indexes.ivf import IVFFlatIndex, IVFParameters, IVFPQIndex, IVFPQParameters
-from indexes.measure import recall_against_exact, sample_queries
-from indexes.store import IndexStore
+from indexes.kinds.ivf import IVFFlatIndex, IVFParameters, IVFPQIndex, IVFPQParameters
+from indexes.kinds.measure import recall_against_exact, sample_queries
+from indexes.store.folder import IndexStore
 
 
 def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:

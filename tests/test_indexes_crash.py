@@ -11,10 +11,10 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from indexes import files
 from indexes.errors import LockedIndex, NoIndex, WriteFailed
-from indexes.generation import Generation
-from indexes.store import IndexStore
+from indexes.store import files
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 from tests.waiting import first_line, running
 
@@ -24,7 +24,7 @@ KILLED_AT_EVERY_STEP = """
 import json, os, shutil, signal, sys
 from pathlib import Path
 import numpy as np
-from indexes.store import IndexStore
+from indexes.store.folder import IndexStore
 
 STEPS = json.loads(sys.argv[2])
 base, work = Path(sys.argv[1]) / "base", Path(sys.argv[1]) / "work"
@@ -116,7 +116,7 @@ def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_wh
 WRITING_FOREVER = """
 import sys
 import numpy as np
-from indexes.store import IndexStore
+from indexes.store.folder import IndexStore
 turn = 0
 while True:
     turn += 1
@@ -245,7 +245,7 @@ def test_two_writers_in_one_process_cannot_work_at_once(tmp_path):
 
 HOLDING = """
 import sys, time
-from indexes.store import IndexStore
+from indexes.store.folder import IndexStore
 with IndexStore(sys.argv[1]).lock():
     print("held", flush=True)
     time.sleep(60)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
-from indexes.manifest import _own_digest
-from indexes.store import IndexStore
+from indexes.store.folder import IndexStore
+from indexes.store.manifest import _own_digest
 from tests.test_indexes_store import FINGERPRINT, filled, unit
 
 SEGMENT = ["rows-000001.jsonl", "table-000001.npy", "embeddings-000001.npy", "halves-000001.npy"]

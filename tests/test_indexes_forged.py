@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from indexes.errors import CorruptIndex, IndexesError, LockedIndex, NoIndex, RowError, WriteFailed
-from indexes.files import digest
-from indexes.manifest import _own_digest
-from indexes.regular import DEEPEST, read_regular
-from indexes.store import IndexStore
+from indexes.store.files import digest
+from indexes.store.folder import IndexStore
+from indexes.store.manifest import _own_digest
+from indexes.store.regular import DEEPEST, read_regular
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from indexes.checks import check_unit
-from indexes.hard_cases import hard_cases, refused
+from indexes.kinds.checks import check_unit
+from retrieval.lab.hard_cases.vectors import hard_cases, refused
 
 KERNELS = ("unit vectors", "top k", "inner products", "recall", "halves")
 

@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from indexes import choice
-from indexes.base import VectorIndex
-from indexes.choice import Choice, choose_kind, operating_points
 from indexes.errors import ParameterError
-from indexes.exact import ExactIndex
-from indexes.measure import disagreements, query_ms, recall_against_exact, sample_queries
+from indexes.kinds import choice
+from indexes.kinds.base import VectorIndex
+from indexes.kinds.choice import Choice, choose_kind, operating_points
+from indexes.kinds.exact import ExactIndex
+from indexes.kinds.measure import disagreements, query_ms, recall_against_exact, sample_queries
 
 AXES = np.eye(6, dtype=np.float32)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from indexes.scores import best, grid_scores, on_grid, scan, slack
+from indexes.kinds.scores import best, grid_scores, on_grid, scan, slack
 
 
 def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:

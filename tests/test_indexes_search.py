@@ -6,8 +6,8 @@ import pytest
 import indexes
 from indexes import load_kind
 from indexes.errors import CorruptIndex, EngineError, ParameterError, VectorError
-from indexes.exact import ExactIndex
-from indexes.measure import disagreements
+from indexes.kinds.exact import ExactIndex
+from indexes.kinds.measure import disagreements
 
 KINDS = list(indexes.KINDS)
 EXACT = ["exact", "flat"]

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexes import faiss_index, plan
 from indexes.errors import CorruptIndex, MismatchedIndex, ParameterError, RowError, VectorError
-from indexes.files import ArrayFile
-from indexes.plan import first_of_equals
-from indexes.rows import key_of
-from indexes.spool import Block, Kept
-from indexes.stack import Stack, segments_kept, stacked
-from indexes.store import IndexStore
+from indexes.kinds import faiss_index
+from indexes.kinds.stack import Stack, segments_kept, stacked
+from indexes.store import plan
+from indexes.store.files import ArrayFile
+from indexes.store.folder import IndexStore
+from indexes.store.plan import first_of_equals
+from indexes.store.rows import key_of
+from indexes.store.spool import Block, Kept
 from tests.test_indexes_store import DIM, EVERY_KIND, FINGERPRINT, names, rows_of, unit
 
 
@@ -237,7 +238,7 @@ def test_new_vectors_are_scanned_until_they_are_a_tenth_and_then_taken_into_the_
 
 
 def test_growing_leaves_the_index_that_was_copied_as_it_was():
-    from indexes.hnsw import HNSWIndex
+    from indexes.kinds.hnsw import HNSWIndex
 
     first = HNSWIndex.build(unit(100), threads=1)
     second = first.copy()
@@ -251,7 +252,7 @@ def test_growing_leaves_the_index_that_was_copied_as_it_was():
 
 
 def test_a_structure_of_fewer_vectors_than_the_manifest_says_is_refused(tmp_path):
-    from indexes.hnsw import HNSWIndex, HNSWParameters
+    from indexes.kinds.hnsw import HNSWIndex, HNSWParameters
 
     HNSWIndex.build(unit(100), threads=1).save(tmp_path / "x")
     loaded = HNSWIndex.load(tmp_path / "x", unit(110), HNSWParameters(), covered=100)
@@ -269,9 +270,9 @@ def test_codes_need_enough_vectors_to_be_trained():
 
 
 def test_training_looks_at_a_bounded_number_of_vectors(monkeypatch):
-    from indexes.ivf import IVFFlatIndex, IVFParameters
+    from indexes.kinds.ivf import IVFFlatIndex, IVFParameters
 
-    monkeypatch.setattr("indexes.ivf.MOST_POINTS_PER_CENTRE", 39)
+    monkeypatch.setattr("indexes.kinds.ivf.MOST_POINTS_PER_CENTRE", 39)
     index = IVFFlatIndex.build(unit(2000), IVFParameters(lists=4), threads=1)
     drawn = index._training()
     assert drawn.shape == (156, DIM)

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from indexes.errors import MismatchedIndex, ParameterError, RowError, SelfRetrievalFailed, VectorError
-from indexes.generation import Generation
-from indexes.hnsw import HNSWParameters
-from indexes.ivf import IVFPQParameters
-from indexes.store import IndexStore
+from indexes.kinds.hnsw import HNSWParameters
+from indexes.kinds.ivf import IVFPQParameters
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
 
 DIM = 8
 FINGERPRINT = {"checkpoint": "abc", "preprocessing": "def"}
@@ -451,8 +451,8 @@ import sys
 for name in ("faiss", "torch", "cv2", "PIL", "scipy", "sklearn", "retrieval", "robot"):
     sys.modules[name] = None
 import numpy as np
-import indexes, indexes.errors, indexes.choice, indexes.measure
-from indexes.store import IndexStore
+import indexes, indexes.errors, indexes.kinds.choice, indexes.kinds.measure
+from indexes.store.folder import IndexStore
 store = IndexStore(sys.argv[1])
 made = store.write([{"id": "a"}, {"id": "b"}], np.eye(2, dtype=np.float32), fingerprint={}, kind="exact")
 assert store.open().search(np.eye(2, dtype=np.float32), 1)[1][0].tolist() == [1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexes.errors import WriteFailed
-from indexes.unfinished import FOLDER, Unfinished
+from indexes.store.unfinished import FOLDER, Unfinished
 
 LAYOUTS = {"embedding": (np.dtype(np.float32), (3,)), "error": (np.dtype(np.float32), ())}
 OF = {"checkpoint": "abc"}

@@ -11,8 +11,8 @@ import pytest
 
 import retrieval
 import robot
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
 from tests import reference, synthetic
 from tests.reference import PACKAGES, PAGE
 from tests.test_imports import HEAVY, run_blocked

@@ -2,11 +2,11 @@
 
 import pytest
 
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
-from retrieval.defaults import shipped_model
-from retrieval.search import Searcher
-from robot.recording import read_info, read_recording
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.search.searcher import Searcher
+from robot.recording.folder import read_info, read_recording
 from tests.rehearsal import rehearse
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.dataset import Split, load_grasps
+from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import ImageError
 from retrieval.evaluation.audit import audit
 from tests import synthetic

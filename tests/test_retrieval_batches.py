@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.batches import TrainedFeatures
-from retrieval.dataset import PairSampler, load_grasps
-from retrieval.fusion import Matcher
-from retrieval.losses import match_loss
-from retrieval.step import batch_loss
-from retrieval.train import set_training_mode
+from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.model.fusion import Matcher
+from retrieval.model.losses import match_loss
+from retrieval.training.batches import TrainedFeatures
+from retrieval.training.step import batch_loss
+from retrieval.training.train import set_training_mode
 from tests.conftest import TINY
 
 # The paper's loss and numbers, on small pictures.

@@ -12,16 +12,16 @@ import pytest
 import torch
 
 from indexes.errors import LockedIndex, ParameterError, VectorError
-from indexes.store import IndexStore
-from retrieval import build, embed, operating
-from retrieval.ahead import ahead
-from retrieval.build import build_index
-from retrieval.catalogue import list_catalogue
-from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.encode import encode_photos, for_inference
+from indexes.store.folder import IndexStore
+from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import BadInput, DatasetError, NumericalError
-from retrieval.fusion import Matcher
-from retrieval.search import Searcher
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.encode import encode_photos, for_inference
+from retrieval.model.fusion import Matcher
+from retrieval.search import build, embed, operating
+from retrieval.search.ahead import ahead
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 

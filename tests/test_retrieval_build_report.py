@@ -5,11 +5,11 @@ import shutil
 
 import pytest
 
-from indexes.store import IndexStore
-from retrieval import cli
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
+from indexes.store.folder import IndexStore
+from retrieval.commands import cli
 from retrieval.errors import BadInput
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
 
 
 @pytest.fixture

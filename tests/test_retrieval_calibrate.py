@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from retrieval.calibration import fit_calibration
 from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.calibrate import (
     Choice,
@@ -19,7 +18,8 @@ from retrieval.evaluation.calibrate import (
     reliability_bins,
 )
 from retrieval.evaluation.table import ScoreTable
-from retrieval.posterior import SLOPE_BOUNDS, Posterior
+from retrieval.metrics.pairs import fit_calibration
+from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 
 
 def table_of(scores, owner, rows=None, own=None):

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
-from retrieval.calibration import SLOPE_BOUNDS, Calibration, fit_calibration, pair_accuracy, pair_auc
 from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.pairs import SLOPE_BOUNDS, Calibration, fit_calibration, pair_accuracy, pair_auc
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 

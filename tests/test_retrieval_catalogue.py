@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval import catalogue as module
-from retrieval.catalogue import CataloguePhoto, SkippedPhoto, decode_photo, list_catalogue, read_photo
+from retrieval.data import catalogue as module
+from retrieval.data.catalogue import CataloguePhoto, SkippedPhoto, decode_photo, list_catalogue, read_photo
+from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
-from retrieval.naming import Naming
 
 
 def photo(colour=(255, 0, 0)):

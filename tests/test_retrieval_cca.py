@@ -7,14 +7,14 @@ import pytest
 import scipy.linalg
 from sklearn.cross_decomposition import CCA
 
-from retrieval.config import Config
 from retrieval.errors import BadInput, NumericalError
-from retrieval.features import Features
 from retrieval.methods.base import Setting
 from retrieval.methods.cca import Canonical, Cca, canonical, cosine, decompose, unit_rows
 from retrieval.methods.plsca import Plsca
 from retrieval.methods.selection import neighbours
 from retrieval.methods.standardise import Standardiser
+from retrieval.model.config import Config
+from retrieval.training.features import Features
 
 
 def linked(rhos, n=200, touch=12, photo=10, seed=0):

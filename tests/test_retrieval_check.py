@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from retrieval.check import check_recording, check_split
-from retrieval.dataset import Split, load_grasps, make_split
+from retrieval.data.check.recording import check_recording, check_split
+from retrieval.data.dataset import Split, load_grasps, make_split
 from retrieval.errors import DatasetError
 from tests import synthetic
 

@@ -16,7 +16,9 @@ from safetensors.torch import save_file
 import indexes
 import retrieval
 import robot
-from retrieval.checkpoint import (
+from retrieval.data.dataset import Split
+from retrieval.errors import CheckpointError
+from retrieval.model.checkpoint import (
     file_digest,
     load_checkpoint,
     read_tensors,
@@ -24,13 +26,11 @@ from retrieval.checkpoint import (
     store_checkpoint,
     write_tensors,
 )
-from retrieval.dataset import Split
-from retrieval.errors import CheckpointError
-from retrieval.fusion import Matcher
-from retrieval.gel_check import GelCheck
-from retrieval.gel_head import GelHead
-from retrieval.posterior import Posterior
-from retrieval.stored import read_stored
+from retrieval.model.fusion import Matcher
+from retrieval.model.gel_check import GelCheck
+from retrieval.model.gel_head import GelHead
+from retrieval.model.posterior import Posterior
+from retrieval.model.stored import read_stored
 from retrieval.version import __version__
 from tests.conftest import TINY
 

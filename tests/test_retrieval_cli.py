@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from retrieval import defaults
-from retrieval.cli import COMMANDS, main
+from retrieval.commands.cli import COMMANDS, main
+from retrieval.search import defaults
 
 
 @pytest.fixture
@@ -307,7 +307,17 @@ def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
 
 def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
     main(["build-index", "catalog/", "--model", str(model)])
-    query = [sys.executable, "-m", "retrieval.cli", "query", "--gelsight", "a.png", "b.png", "--index", "index"]
+    query = [
+        sys.executable,
+        "-m",
+        "retrieval.commands.cli",
+        "query",
+        "--gelsight",
+        "a.png",
+        "b.png",
+        "--index",
+        "index",
+    ]
     done = subprocess.run(f"{' '.join(query)} | true", shell=True, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "Broken pipe" not in done.stderr
@@ -316,7 +326,9 @@ def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
 def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(workplace, model):
     """Python's print falls back to stdout where stderr is closed."""
     main(["build-index", "catalog/", "--model", str(model)])
-    query = f"{sys.executable} -m retrieval.cli query --gelsight a.png b.png --index index --json --none-prior 0"
+    query = (
+        f"{sys.executable} -m retrieval.commands.cli query --gelsight a.png b.png --index index --json --none-prior 0"
+    )
     done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
     assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)
     assert subprocess.run(f"{query} >&- 2>&-", shell=True, check=False).returncode == 0

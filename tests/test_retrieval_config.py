@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 import retrieval
-from retrieval.config import Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.data.images import Preprocessing
 from retrieval.errors import ConfigError
-from retrieval.images import Preprocessing
-from retrieval.towers import OUTPUTS, TOWERS
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.model.towers import OUTPUTS, TOWERS
 
 TABLES = {"matcher": MatcherConfig, "training": TrainingConfig, "preprocessing": Preprocessing}
 

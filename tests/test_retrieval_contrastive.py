@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.config import Config, MatcherConfig, TrainingConfig
+from retrieval.console.progress import Bar
 from retrieval.errors import NumericalError
-from retrieval.features import Features
-from retrieval.losses import LOG_SCALE_MAX, SIGMOID_BIAS_INIT
 from retrieval.methods import contrastive as module
 from retrieval.methods.base import Setting
 from retrieval.methods.contrastive import Contrastive, ContrastiveSigmoid, Projections, SigmoidProjections
 from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded
-from retrieval.progress import Bar
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig
+from retrieval.model.losses import LOG_SCALE_MAX, SIGMOID_BIAS_INIT
+from retrieval.training.features import Features
 
 CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(iterations=80))
 

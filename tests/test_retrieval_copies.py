@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.copies import PX, Pictures, as_jpeg, brighter, flipped, shapes, shifted, thumbnail
+from retrieval.data.check.copies import PX, Pictures, as_jpeg, brighter, flipped, shapes, shifted, thumbnail
 
 
 def scene(seed, size=(120, 160)):

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import pytest
 
-from retrieval.build import build_index
-from retrieval.catalogue import list_catalogue, read_photo
-from retrieval.checkpoint import load_checkpoint
-from retrieval.search import Searcher
+from retrieval.data.catalogue import list_catalogue, read_photo
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 KILLS = int(os.environ.get("KILLS", "5"))
@@ -40,7 +40,7 @@ class Build:
 
 
 def command(*arguments):
-    return [sys.executable, "-m", "retrieval.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "retrieval.commands.cli", *map(str, arguments)]
 
 
 def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=math.inf):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.dataset import (
+from retrieval.data.dataset import (
     Grasp,
     ImageCache,
     PairSampler,

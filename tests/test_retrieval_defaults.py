@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexes.store import IndexStore
-from retrieval import defaults
+from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.stored import file_digest
+from retrieval.model.stored import file_digest
+from retrieval.search import defaults
 
 
 @pytest.fixture(autouse=True)

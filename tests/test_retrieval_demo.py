@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from retrieval import cli
-from retrieval.demo import PHOTOS, SEED, TOUCHES
-from robot.recording import read_recording
+from retrieval.commands import cli
+from retrieval.commands.demo import PHOTOS, SEED, TOUCHES
+from robot.recording.folder import read_recording
 
 
 @pytest.fixture(scope="module")

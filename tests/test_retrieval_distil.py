@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval import distil
-from retrieval.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
-from retrieval.config import Config, MatcherConfig, TrainingConfig
-from retrieval.dataset import load_grasps, make_split
+from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import Interrupted, NumericalError
-from retrieval.features import encode_recording
-from retrieval.fusion import Matcher
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.prune_rerank import PruneRerank
-from retrieval.train import build_matcher
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig
+from retrieval.model.fusion import Matcher
+from retrieval.training import distil
+from retrieval.training.features import encode_recording
+from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
 HIDDEN = 16

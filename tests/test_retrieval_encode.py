@@ -8,10 +8,10 @@ import torch
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from retrieval.checkpoint import load_checkpoint
-from retrieval.config import MatcherConfig
-from retrieval.defaults import shipped_model
-from retrieval.encode import (
+from retrieval.errors import NumericalError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.config import MatcherConfig
+from retrieval.model.encode import (
     encode_photos,
     encode_touches,
     for_inference,
@@ -20,9 +20,9 @@ from retrieval.encode import (
     touch_batch,
     touch_features,
 )
-from retrieval.errors import NumericalError
-from retrieval.fusion import Matcher
-from retrieval.towers import OUTPUTS, TOWERS
+from retrieval.model.fusion import Matcher
+from retrieval.model.towers import OUTPUTS, TOWERS
+from retrieval.search.defaults import shipped_model
 
 SIDE = 48
 SMALL = MatcherConfig(tower="small", tower_output="pooled", hidden=8)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.checkpoint import load_checkpoint
-from retrieval.cli import main
-from retrieval.dataset import load_grasps, make_split
+from retrieval.commands.cli import main
+from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
 from retrieval.evaluation.bench import Bench, _shuffled
 from retrieval.evaluation.controls import thinned
 from retrieval.evaluation.run import evaluate
-from retrieval.features import Features
 from retrieval.methods.base import Method
-from retrieval.train import Trainer, train
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.training.features import Features
+from retrieval.training.train import Trainer, train
 from tests import synthetic
 from tests.conftest import TINY
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from retrieval.errors import BadInput, DatasetError
-from retrieval.posterior import FORMULA
+from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
 from retrieval.report.results import at_start, number, percent, short, with_interval

@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval import export as exporting
-from retrieval import onnx_encoder
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.cli import main
-from retrieval.config import Config, MatcherConfig
-from retrieval.encode import TorchEncoder, encode_touches, touch_features
+from retrieval.commands.cli import main
+from retrieval.data.images import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
-from retrieval.export import export
-from retrieval.fusion import Matcher
-from retrieval.gel_head import GelHead
-from retrieval.images import Preprocessing
-from retrieval.onnx_encoder import OnnxEncoder, sealed, unsealed
-from retrieval.search import Searcher
-from retrieval.towers import OUTPUTS, TOWERS
+from retrieval.model import export as exporting
+from retrieval.model import onnx_encoder
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.config import Config, MatcherConfig
+from retrieval.model.encode import TorchEncoder, encode_touches, touch_features
+from retrieval.model.export import export
+from retrieval.model.fusion import Matcher
+from retrieval.model.gel_head import GelHead
+from retrieval.model.onnx_encoder import OnnxEncoder, sealed, unsealed
+from retrieval.model.towers import OUTPUTS, TOWERS
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from tests.test_imports import run_blocked
 from tests.test_project import PROJECT
 
@@ -150,7 +150,7 @@ def test_a_query_takes_the_export_that_lies_beside_the_model_and_ranks_the_same(
 def test_a_query_runs_with_torch_blocked_where_there_is_an_export(own, index, touch, onnx_wins, tmp_path):
     files = [str(path) for path in touch]
     arguments = ["query", "--gelsight", *files, "--index", str(index), "--none-prior", "0", "--json"]
-    code = f"import sys\nfrom retrieval.cli import main\nsys.exit(main({arguments!r}))"
+    code = f"import sys\nfrom retrieval.commands.cli import main\nsys.exit(main({arguments!r}))"
     refused = run_blocked(code, ("torch",))
     assert refused.returncode == 1
     assert "blocked: torch" in refused.stderr
@@ -302,7 +302,7 @@ class Guard:
 
 sys.meta_path.insert(0, Guard())
 sys.stdout.isatty = lambda: True  # in a terminal, rich draws the table
-from retrieval.cli import main
+from retrieval.commands.cli import main
 code = main({arguments!r})
 used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))
 print(sorted({allowed!r} - used), file=sys.stderr)
@@ -324,7 +324,9 @@ def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(o
 
 
 def test_querys_help_and_a_wrong_index_import_no_encoder(tmp_path):
-    code = f"from retrieval.cli import main\nmain(['query', '--gelsight', 'a.png', '--index', {str(tmp_path)!r}])"
+    code = (
+        f"from retrieval.commands.cli import main\nmain(['query', '--gelsight', 'a.png', '--index', {str(tmp_path)!r}])"
+    )
     done = run_blocked(code, ("torch", "onnxruntime", "onnx"))
     assert "run `retrieve build-index` first" in done.stderr, done.stderr
 
@@ -333,7 +335,8 @@ def test_the_process_that_queries_by_onnx_never_loads_torch(own, index, touch, o
     export(load_checkpoint(own))
     files = [str(path) for path in touch]
     code = (
-        f"import sys\nfrom retrieval.search import Searcher\nSearcher.open({str(index)!r}).query([{files!r}])\n"
+        f"import sys\nfrom retrieval.search.searcher import Searcher\n"
+        f"Searcher.open({str(index)!r}).query([{files!r}])\n"
         "print(sorted({name.split('.')[0] for name in sys.modules} & {'torch', 'scipy', 'cv2', 'robot'}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.dataset import load_grasps
+from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput, DatasetError, NumericalError
-from retrieval.features import Features, blurred, by_image, encode_recording
-from retrieval.train import build_matcher
+from retrieval.training.features import Features, blurred, by_image, encode_recording
+from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
 
@@ -29,14 +29,14 @@ def counted(monkeypatch):
     """How many images have gone through the towers."""
     counts = {"touch_features": 0, "photo_features": 0}
     for name in counts:
-        real = getattr(__import__("retrieval.features", fromlist=[name]), name)
+        real = getattr(__import__("retrieval.training.features", fromlist=[name]), name)
 
         def counting(matcher, items, name=name, real=real):
             items = list(items)
             counts[name] += len(items)
             return real(matcher, items)
 
-        monkeypatch.setattr(f"retrieval.features.{name}", counting)
+        monkeypatch.setattr(f"retrieval.training.features.{name}", counting)
     return counts
 
 
@@ -66,9 +66,9 @@ def test_a_second_run_reads_and_encodes_nothing(grasps, matcher, tmp_path, count
 
 def test_a_run_that_was_stopped_keeps_its_finished_parts(grasps, matcher, tmp_path, counted, monkeypatch):
     whole = encode_recording(grasps, matcher, TINY, None, quiet=True)
-    monkeypatch.setattr("retrieval.features._PART", 4)
+    monkeypatch.setattr("retrieval.training.features._PART", 4)
     with monkeypatch.context() as during:
-        during.setattr("retrieval.images.Preprocessing.load_photo", lambda *_: 1 / 0)
+        during.setattr("retrieval.data.images.Preprocessing.load_photo", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
     assert len(list(tmp_path.iterdir())) == 3  # of 4, 4 and 1 touches; no photo was finished

@@ -13,9 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval import files
-from retrieval.errors import BadInput
-from retrieval.files import (
+from retrieval.console import files
+from retrieval.console.files import (
     CARD,
     CHECKPOINT,
     EXPORT,
@@ -30,6 +29,7 @@ from retrieval.files import (
     write_atomically,
     write_output,
 )
+from retrieval.errors import BadInput
 
 ROOT = Path(__file__).parents[1]
 KINDS = (CARD, CHECKPOINT, EXPORT, HAND_EYE, PAGE, PREVIEW, RESULTS, TEXT, TIMINGS)

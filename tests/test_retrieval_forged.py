@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from indexes.errors import CorruptIndex
-from retrieval import cli
-from retrieval.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
-from retrieval.config import load_config
+from retrieval.commands import cli
 from retrieval.errors import BadInput, CheckpointError, ConfigError
-from retrieval.gate import load_gate
-from retrieval.listing import listed_photo
-from retrieval.stored import read_judge, read_stored
+from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
+from retrieval.model.config import load_config
+from retrieval.model.stored import read_judge, read_stored
+from retrieval.search.listing import listed_photo
+from retrieval.training.gate import load_gate
 from tests.test_retrieval_checkpoint import rewrite, save
 
 JSON = st.recursive(

@@ -7,21 +7,21 @@ import time
 import numpy as np
 import pytest
 
-from retrieval.binomial import binomial_interval
-from retrieval.checkpoint import load_checkpoint
-from retrieval.encode import encode_touches
 from retrieval.errors import ConfigError, DatasetError
-from retrieval.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation, run
-from retrieval.frontier.candidates import default_k, ranks
-from retrieval.frontier.clock import timed
-from retrieval.frontier.correlation import Problem, _by_covariance, _ours, known_problem
-from retrieval.frontier.formats import FORMATS, encoders
-from retrieval.frontier.grasps import sets_of
-from retrieval.frontier.pixels import load_touch
-from retrieval.frontier.points import Panel, Point, Row, duration, missed, number
-from retrieval.frontier.sample import Sample, Scale, blend
-from retrieval.operating import Asked, Bench, settle
-from robot.sim.frontier import Point as SimulationPoint
+from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation, run
+from retrieval.lab.frontier.candidates import default_k, ranks
+from retrieval.lab.frontier.clock import timed
+from retrieval.lab.frontier.contact import Point as SimulationPoint
+from retrieval.lab.frontier.correlation import Problem, _by_covariance, _ours, known_problem
+from retrieval.lab.frontier.formats import FORMATS, encoders
+from retrieval.lab.frontier.grasps import sets_of
+from retrieval.lab.frontier.pixels import load_touch
+from retrieval.lab.frontier.points import Panel, Point, Row, duration, missed, number
+from retrieval.lab.frontier.sample import Sample, Scale, blend
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.encode import encode_touches
+from retrieval.search.operating import Asked, Bench, settle
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -184,7 +184,7 @@ def pruning_sample(sample):
     """The sample with a pruner that knows nothing."""
     import torch
 
-    from retrieval.pruner import Pruner
+    from retrieval.model.pruner import Pruner
 
     matcher = load_checkpoint(sample.model).matcher
     torch.manual_seed(0)
@@ -208,8 +208,8 @@ def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
 
 
 def test_an_index_keeps_halves_in_the_default_format(catalogue, model, tmp_path):
-    from indexes.store import IndexStore
-    from retrieval.build import build_index
+    from indexes.store.folder import IndexStore
+    from retrieval.search.build import build_index
 
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
     kept = IndexStore(tmp_path / "index").open().arrays["halves"]
@@ -225,7 +225,7 @@ def test_images_have_the_default_size_in_a_query(rows, sample):
 
 
 def test_the_rig_solves_contacts_at_the_default():
-    from robot.sim.frontier import contact_points
+    from retrieval.lab.frontier.contact import contact_points
     from robot.sim.pinch import Hand
 
     points = contact_points(rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)

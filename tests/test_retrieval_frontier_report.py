@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from retrieval import cli, frontier_report
-from retrieval.frontier.points import Panel, Point, Row
-from retrieval.frontier.stability import run_hard_cases
-from retrieval.report.frontier import write_frontier
-from robot import hard_cases as of_robot
+from retrieval.commands import cli
+from retrieval.lab import reports as frontier_report
+from retrieval.lab.frontier.points import Panel, Point, Row
+from retrieval.lab.frontier.report import write_frontier
+from retrieval.lab.hard_cases import rig as of_robot
+from retrieval.lab.hard_cases.run import run_hard_cases
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.nn import functional
 
-from retrieval import judge
-from retrieval.config import MatcherConfig
 from retrieval.errors import BadInput, NumericalError
-from retrieval.fusion import FusionHead, Matcher, score_halves
-from retrieval.towers import TOWERS
+from retrieval.model import judge
+from retrieval.model.config import MatcherConfig
+from retrieval.model.fusion import FusionHead, Matcher, score_halves
+from retrieval.model.towers import TOWERS
 
 
 def concatenated_forward(matcher, touches, photos):

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput
-from retrieval.foreign import DRAWN, draw_foreign
-from retrieval.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.judgement import Pictures, contact_threshold, fit_gel_check, fit_gel_head
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.training.foreign import DRAWN, draw_foreign
+from retrieval.training.judgement import Pictures, contact_threshold, fit_gel_check, fit_gel_head
 
 CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, shares={"touches_called_foreign": 0.0})
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from retrieval.checkpoint import load_checkpoint, read_tensors, write_tensors
-from retrieval.dataset import load_attempts, load_grasps
+from retrieval.data.dataset import load_attempts, load_grasps
+from retrieval.data.images import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
-from retrieval.gate import Gate, GateSettings, GraspNet
-from retrieval.grasp_success import BATCH, augment, draw_batch, gate_loss, load_gate, train_gate
-from retrieval.images import Preprocessing
-from robot.recording import RecordingWriter
+from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
+from retrieval.training.gate import Gate, GateSettings, GraspNet
+from retrieval.training.grasp_success import BATCH, augment, draw_batch, gate_loss, load_gate, train_gate
+from robot.recording.folder import RecordingWriter
 
 OBJECTS = tuple("abcdefgh")
 DURING, AFTER = (GateSettings(touch_px=24, frame=frame) for frame in ("during", "after"))
@@ -251,7 +251,7 @@ def test_augmentation_flips_and_changes_the_lamps_of_each_finger_on_its_own():
 
 
 def test_a_loss_that_is_not_finite_stops_the_training_and_writes_nothing(misses, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.grasp_success.gate_loss", lambda logits, held: logits.sum() * torch.nan)
+    monkeypatch.setattr("retrieval.training.grasp_success.gate_loss", lambda logits, held: logits.sum() * torch.nan)
     with pytest.raises(NumericalError, match="step 0"):
         train_gate(misses, tmp_path / "g.safetensors", iterations=2, quiet=True)
     assert not (tmp_path / "g.safetensors").exists()
@@ -300,7 +300,7 @@ def test_settings_out_of_range_are_refused(misses, tmp_path):
 
 
 def test_a_place_that_cannot_be_written_is_told_before_the_first_step(misses, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.grasp_success._trained", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr("retrieval.training.grasp_success._trained", lambda *_: pytest.fail("trained"))
     with pytest.raises(CheckpointError, match="is a folder"):
         train_gate(misses, tmp_path, quiet=True)
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from retrieval.errors import BadInput
-from retrieval.hard_cases import hard_cases, linear, losses, probability, ranking
-from retrieval.hard_cases.case import refused
+from retrieval.lab.hard_cases import hard_cases, linear, losses, probability, ranking
+from retrieval.lab.hard_cases.case import refused
 
 KERNELS = (
     "match loss",

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
-from retrieval import heic
+from retrieval.data import heic
+from retrieval.data.images import decode_rgb
 from retrieval.errors import ImageError
-from retrieval.images import decode_rgb
 from tests.test_retrieval_images import exif, noise, saved
 
 pytest.importorskip("pillow_heif")
@@ -87,7 +87,7 @@ def test_a_film_is_no_picture():
 
 
 def test_a_header_that_asks_for_too_many_pixels_is_refused_before_they_are_decoded(monkeypatch):
-    from retrieval import images
+    from retrieval.data import images
 
     data = {kind: saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS}
     monkeypatch.setattr(images, "MAX_PIXELS", 64 * 64 - 1)

@@ -17,13 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
-from retrieval import images
+from retrieval.data import images
+from retrieval.data.images import decode_rgb, read_rgb, to_float
 from retrieval.errors import BadInput, ImageError
-from retrieval.images import (
-    decode_rgb,
-    read_rgb,
-    to_float,
-)
 
 # Files made by hand ----------------------------------------------------------------------------------------
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval import images
-from retrieval import resize as resizing
+from retrieval.data import images
+from retrieval.data import resize as resizing
+from retrieval.data.images import BACKGROUNDS, Preprocessing, subtract_background, to_float
+from retrieval.data.resize import resize
 from retrieval.errors import BadInput, ConfigError, NumericalError
-from retrieval.images import BACKGROUNDS, Preprocessing, subtract_background, to_float
-from retrieval.resize import resize
 from tests.test_retrieval_images import sample_files, saved
 
 ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1

@@ -8,8 +8,8 @@ import pytest
 from scipy.stats import norm, permutation_test, t
 
 from retrieval.errors import BadInput
-from retrieval.evaluation.intervals import bootstrap_interval, compare, sign_flip_p, summarise
-from retrieval.evaluation.table import Measure
+from retrieval.metrics.intervals import bootstrap_interval, compare, sign_flip_p, summarise
+from retrieval.metrics.measure import Measure
 
 
 def measure_of(by_object, chance=(0.5,)):

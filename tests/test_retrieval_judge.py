@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from retrieval.errors import NumericalError
-from retrieval.judge import Judge, as_float32
+from retrieval.model.judge import Judge, as_float32
 
 
 def drawn_judge(hidden, seed=0):

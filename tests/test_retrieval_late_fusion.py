@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.checkpoint import load_checkpoint
-from retrieval.dataset import load_grasps, make_split
-from retrieval.encode import one_thread
+from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput, Interrupted
-from retrieval.features import Features, encode_recording
-from retrieval.finish import unfinished
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.prune_rerank import PruneRerank, candidates
-from retrieval.train import Trainer, build_matcher, state_path, train
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.encode import one_thread
+from retrieval.training.features import Features, encode_recording
+from retrieval.training.finish import unfinished
+from retrieval.training.train import Trainer, build_matcher, state_path, train
 from tests.conftest import TINY
 
 FROZEN = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, freeze_towers=True))
@@ -96,7 +96,7 @@ def test_the_harness_trains_what_the_command_line_trains(recording, split, fitte
 
 
 def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue, tmp_path):
-    from retrieval.build import build_index
+    from retrieval.search.build import build_index
 
     report = build_index(
         catalogue, load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors"), tmp_path / "index"
@@ -184,8 +184,8 @@ def test_features_of_other_towers_are_refused(parts):
 
 
 def test_a_fit_on_features_reads_no_image(parts, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.batches.touch_features", lambda *_: pytest.fail("read an image"))
-    monkeypatch.setattr("retrieval.batches.photo_features", lambda *_: pytest.fail("read an image"))
+    monkeypatch.setattr("retrieval.training.batches.touch_features", lambda *_: pytest.fail("read an image"))
+    monkeypatch.setattr("retrieval.training.batches.photo_features", lambda *_: pytest.fail("read an image"))
     fit(LateFusion, parts, tmp_path)
 
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from retrieval.losses import (
+from retrieval.model.losses import (
     LOG_SCALE_MAX,
     SIGMOID_BIAS_INIT,
     SIGMOID_LOG_SCALE_INIT,

@@ -5,13 +5,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from retrieval.config import Config, MatcherConfig, TrainingConfig
 from retrieval.errors import BadInput, ConfigError, NumericalError
-from retrieval.features import Features
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.selection import judge, judged_rows, ranking_auc
 from retrieval.methods.standardise import Standardiser
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig
+from retrieval.training.features import Features
 
 KNOWS_NOTHING = {"chance", "constant"}
 LEARNS = [name for name in METHODS if name not in KNOWS_NOTHING]

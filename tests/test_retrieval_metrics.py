@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.binomial import binomial_interval
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.metrics import grouped_interval, guess_curve, guess_curves
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import grouped_interval, guess_curve, guess_curves
 
 
 def curve_by_enumeration(true_score, others, k):

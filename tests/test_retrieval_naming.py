@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.errors import BadInput
-from retrieval.naming import Naming, doubts, per_object
 
 BY_RULE = {
     "folder": {

@@ -8,11 +8,21 @@ import pytest
 import torch
 
 from indexes.errors import ParameterError
-from retrieval import operating
-from retrieval.checkpoint import Checkpoint
 from retrieval.errors import BadInput
-from retrieval.fusion import Matcher
-from retrieval.operating import Asked, Bench, Point, all_judged, can_measure, kept, needs_measuring, sentence, settle
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.fusion import Matcher
+from retrieval.search import operating
+from retrieval.search.operating import (
+    Asked,
+    Bench,
+    Point,
+    all_judged,
+    can_measure,
+    kept,
+    needs_measuring,
+    sentence,
+    settle,
+)
 from tests.conftest import TINY
 
 PHOTOS, TOUCHES = 70, 40

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval import cli
-from retrieval.output import PrintableFormatter, print_json, printable, say, show
+from retrieval.commands import cli
+from retrieval.console.output import PrintableFormatter, print_json, printable, say, show
 
 ROOT = Path(__file__).parents[1]
 
@@ -64,7 +64,7 @@ def test_errors_of_commands_and_of_their_words_are_escaped(tmp_path, capsys):
 
 
 def test_a_terminal_of_plain_ascii_is_shown_escapes():
-    code = r"from retrieval.output import *; prepare_streams(); show('T\xfcr \u2615'); say('\u8336')"
+    code = r"from retrieval.console.output import *; prepare_streams(); show('T\xfcr \u2615'); say('\u8336')"
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, timeout=60, check=False

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.posterior import SLOPE_BOUNDS, Judged, Posterior, fit_posterior
+from retrieval.model.posterior import SLOPE_BOUNDS, Judged, Posterior, fit_posterior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 

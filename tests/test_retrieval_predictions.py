@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from retrieval.checkpoint import write_tensors
-from retrieval.dataset import Grasp, Split
+from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput, CheckpointError, DatasetError
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import MOST_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
-from retrieval.features import Features
 from retrieval.methods.base import Setting
 from retrieval.methods.chance import Chance
+from retrieval.model.checkpoint import write_tensors
+from retrieval.training.features import Features
 from tests.conftest import TINY
 
 SPLIT = Split(0, train=("a", "b"), validation=("c", "d"), test=("e", "f"))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from retrieval import progress
-from retrieval.progress import Bar
+from retrieval.console import progress
+from retrieval.console.progress import Bar
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from retrieval.calibration import Calibration
 from retrieval.errors import BadInput
 from retrieval.evaluation.protocols import (
     confusions,
@@ -19,6 +18,7 @@ from retrieval.evaluation.protocols import (
     true_ranks,
 )
 from retrieval.evaluation.table import ScoreTable, object_scores
+from retrieval.metrics.pairs import Calibration
 
 EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
 

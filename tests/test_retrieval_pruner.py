@@ -2,9 +2,9 @@
 
 import torch
 
-from retrieval.config import MatcherConfig
-from retrieval.fusion import Matcher
-from retrieval.pruner import Pruner, Spread
+from retrieval.model.config import MatcherConfig
+from retrieval.model.fusion import Matcher
+from retrieval.model.pruner import Pruner, Spread
 
 
 def made(hidden=6, width=8, dim=4, seed=0):

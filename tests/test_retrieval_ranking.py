@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.ranking import (
+from retrieval.metrics.ranking import (
     FirstRelevant,
     average_precision,
     chance_of_average_precision,

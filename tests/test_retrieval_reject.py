@@ -7,10 +7,11 @@ import pytest
 
 from retrieval.errors import BadInput
 from retrieval.evaluation.calibrate import questions
-from retrieval.evaluation.intervals import summarise
 from retrieval.evaluation.reject import _false_accepts, galleries, reject, statistic
-from retrieval.evaluation.table import ScoreTable, object_means
-from retrieval.posterior import Posterior, fit_questions
+from retrieval.evaluation.table import ScoreTable
+from retrieval.metrics.intervals import summarise
+from retrieval.metrics.measure import object_means
+from retrieval.model.posterior import Posterior, fit_questions
 
 
 def table_of(scores, owner):

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.answer import Match, QueryResult
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
-from retrieval.posterior import Posterior
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search import Searcher
+from retrieval.search.answer import Match, QueryResult
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from tests.pages import Page
 
 SCRIPT = "<script>alert(1)</script>"

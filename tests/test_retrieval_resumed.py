@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexes.store import IndexStore
-from indexes.unfinished import FOLDER
-from retrieval import cli, embed
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
-from retrieval.encode import encode_photos
+from indexes.store.folder import IndexStore
+from indexes.store.unfinished import FOLDER
+from retrieval.commands import cli
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.encode import encode_photos
+from retrieval.search import embed
+from retrieval.search.build import build_index
 
 PHOTOS, BATCH = 24, 4
 
@@ -23,8 +24,8 @@ KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
 from retrieval import embed
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.model.checkpoint import load_checkpoint
 
 catalogue, model, index, fatal, batch = sys.argv[1:]
 torch.set_num_threads(1)

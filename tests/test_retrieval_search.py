@@ -12,15 +12,15 @@ import pytest
 import torch
 
 from indexes.errors import MismatchedIndex, NoIndex
-from indexes.generation import Generation
-from retrieval import defaults
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.encode import to_batch, touch_batch
+from indexes.store.generation import Generation
 from retrieval.errors import BadInput, CheckpointError, ImageError
-from retrieval.objects import JudgedObjects
-from retrieval.posterior import Posterior
-from retrieval.search import Searcher
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.encode import to_batch, touch_batch
+from retrieval.model.posterior import Posterior
+from retrieval.search import defaults
+from retrieval.search.build import build_index
+from retrieval.search.objects import JudgedObjects
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 HALF_STEP = 2**-11
@@ -300,7 +300,7 @@ def test_the_candidates_are_the_nearest_photos_of_each_grasp(
 ):
     """Plain loops: the best inner products of each grasp, the full network on their union, and on the other photos of
     the objects that come first by these."""
-    monkeypatch.setattr("retrieval.search.COMPLETED", completed)
+    monkeypatch.setattr("retrieval.search.searcher.COMPLETED", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, near = checkpoint.config.preprocessing.load_touch, set()
     for grasp in grasps:

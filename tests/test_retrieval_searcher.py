@@ -13,12 +13,12 @@ import torch
 from PIL import Image
 
 import retrieval
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint
 from retrieval.errors import BadInput, ImageError
-from retrieval.export import graph_of
-from retrieval.onnx_encoder import sealed
-from retrieval.search import Searcher
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.export import graph_of
+from retrieval.model.onnx_encoder import sealed
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 

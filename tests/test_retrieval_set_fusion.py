@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.fusion import FusionHead
 from retrieval.methods import set_fusion
 from retrieval.methods.set_fusion import SetHead, neighbours
+from retrieval.model.fusion import FusionHead
 
 
 def head(hidden=16, seed=0):

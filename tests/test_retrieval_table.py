@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.table import Measure, ScoreTable, object_scores
+from retrieval.evaluation.table import ScoreTable, object_scores
+from retrieval.metrics.measure import Measure
 from tests.test_retrieval_protocols import mine_of, others_of, table_of, uneven
 
 # The table -------------------------------------------------------------------------------------------------

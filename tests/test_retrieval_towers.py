@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
-from retrieval.towers import TOWERS, build_tower
-from retrieval.towers.base import stage_statistics
-from retrieval.towers.weights import initialise_tower, load_tower_state, read_state
+from retrieval.model.towers import TOWERS, build_tower
+from retrieval.model.towers.base import stage_statistics
+from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 
 # ResNet-18 and -50 are made of the two kinds of block that there are.

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from retrieval import distil
-from retrieval.batches import FrozenFeatures, TrainedFeatures
-from retrieval.checkpoint import load_checkpoint, read_tensors
-from retrieval.dataset import PairSampler, Split, load_grasps, make_split
+from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
-from retrieval.fusion import Matcher
-from retrieval.judgement import with_verdicts
-from retrieval.losses import match_loss
-from retrieval.step import batch_loss, shuffle_fingers
-from retrieval.train import Trainer, build_matcher, set_training_mode, state_path, train
+from retrieval.model.checkpoint import load_checkpoint, read_tensors
+from retrieval.model.fusion import Matcher
+from retrieval.model.losses import match_loss
+from retrieval.training import distil
+from retrieval.training.batches import FrozenFeatures, TrainedFeatures
+from retrieval.training.judgement import with_verdicts
+from retrieval.training.step import batch_loss, shuffle_fingers
+from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
 from tests.conftest import TINY
 from tests.waiting import running, until
 
@@ -55,7 +55,7 @@ def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, mo
 
 def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
     """Without the contrastive term and dropout: exactly the paper's loss."""
-    config = with_training(TINY, contrastive_weight=0.0)
+    config = with_training(TINY, contrastive_weight=0.0, precision="float32")
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, standardise=False, dropout=0.0))
     torch.manual_seed(0)
     matcher = build_matcher(config)
@@ -153,7 +153,7 @@ def test_a_power_cut_while_the_pruner_is_taught_changes_no_bit(written, recordin
         if written:
             cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
         else:
-            cut.setattr("retrieval.distil.order_loss", power_cut)
+            cut.setattr("retrieval.training.distil.order_loss", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
     assert (load_checkpoint(broken.out).matcher.pruner is not None) == written
@@ -172,7 +172,7 @@ def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_on
         os.kill(os.getpid(), signal.SIGINT)
         return taught(*given)
 
-    monkeypatch.setattr("retrieval.distil.order_loss", interrupted)
+    monkeypatch.setattr("retrieval.training.distil.order_loss", interrupted)
     with pytest.raises(
         Interrupted, match=r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
     ):
@@ -192,7 +192,7 @@ def test_ctrl_c_while_the_posterior_is_fitted_leaves_a_checkpoint_that_resuming_
     whole, broken = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     train(recording, whole, TINY, quiet=True)
     with monkeypatch.context() as interrupting:
-        interrupting.setattr("retrieval.train.with_verdicts", interrupted_before(with_verdicts))
+        interrupting.setattr("retrieval.training.train.with_verdicts", interrupted_before(with_verdicts))
         with pytest.raises(Interrupted, match=r"before the checkpoint was complete; .* ranks photos"):
             train(recording, broken, TINY, quiet=True)
     assert load_checkpoint(broken).posterior is None
@@ -216,7 +216,7 @@ def test_a_power_cut_while_the_posterior_is_fitted_changes_no_bit(recording, tmp
     trainer_for(recording, tmp_path / "a.safetensors").run(quiet=True)
     broken = trainer_for(recording, tmp_path / "b.safetensors")
     with monkeypatch.context() as cut:
-        cut.setattr("retrieval.train.with_verdicts", power_cut)
+        cut.setattr("retrieval.training.train.with_verdicts", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
     resumed = trainer_for(recording, broken.out)
@@ -317,7 +317,7 @@ def test_a_background_policy_needs_frames_of_the_untouched_gel(recording, tmp_pa
 
 
 def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.encode.has_fast_bfloat16", lambda device: False)
+    monkeypatch.setattr("retrieval.model.encode.has_fast_bfloat16", lambda device: False)
     with pytest.raises(ConfigError, match="bfloat16 needs hardware"):
         train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
 
@@ -337,11 +337,11 @@ GRADIENTS = """
 import sys, torch
 from pathlib import Path
 from retrieval import distributed
-from retrieval.batches import TrainedFeatures
-from retrieval.dataset import PairSampler, load_grasps
-from retrieval.losses import contrastive_loss
-from retrieval.step import batch_loss
-from retrieval.train import build_matcher, set_training_mode
+from retrieval.training.batches import TrainedFeatures
+from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.model.losses import contrastive_loss
+from retrieval.training.step import batch_loss
+from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY
 
 torch.set_num_threads(1)
@@ -427,7 +427,7 @@ BATCH_STATISTICS = """
 import sys, torch
 from torch import nn
 from retrieval import distributed
-from retrieval.towers import build_tower
+from retrieval.model.towers import build_tower
 
 torch.set_num_threads(1)
 distributed.start()
@@ -517,7 +517,17 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 100000"))
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command = [*torchrun, "-m", "retrieval.cli", "train", str(recording), "--out", str(out), "--config", str(config)]
+    command = [
+        *torchrun,
+        "-m",
+        "retrieval.commands.cli",
+        "train",
+        str(recording),
+        "--out",
+        str(out),
+        "--config",
+        str(config),
+    ]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     with running(command, env=environment) as process:
         until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
@@ -568,7 +578,7 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
     command = [
         sys.executable,
         "-m",
-        "retrieval.cli",
+        "retrieval.commands.cli",
         "train",
         str(recording),
         "--out",

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval.answer import EXIT_CODES, in_words
-from retrieval.cli import main
-from retrieval.dataset import load_grasps
-from retrieval.posterior import Posterior
-from retrieval.search import Searcher
+from retrieval.commands.cli import main
+from retrieval.data.dataset import load_grasps
+from retrieval.model.posterior import Posterior
+from retrieval.search.answer import EXIT_CODES, in_words
+from retrieval.search.searcher import Searcher
 from robot.collect import CollectSettings, collect
 from robot.rig import load_rig
 

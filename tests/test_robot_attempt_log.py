@@ -4,16 +4,9 @@ import json
 
 import pytest
 
-from robot.attempt_log import (
-    AttemptLog,
-    LoggedAttempt,
-    acceptance,
-    acceptance_table,
-    read_attempts,
-    tally,
-)
 from robot.errors import RecordingError, StorageError
-from robot.recording import RecordingWriter, read_recording
+from robot.recording.attempt_log import AttemptLog, LoggedAttempt, acceptance, acceptance_table, read_attempts, tally
+from robot.recording.folder import RecordingWriter, read_recording
 from tests.test_robot_recording import INFO, pictures
 from tests.test_robot_recording_crash import FullDisk
 

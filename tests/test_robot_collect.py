@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.attempt import Attempter, depth_in_mm
-from robot.attempt_log import acceptance, read_attempts
-from robot.attempt_settings import AttemptSettings
 from robot.collect import CollectSettings, Progress, collect, name_of
-from robot.cylinder import CylinderFit
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
-from robot.gates import ContactAreaGate
-from robot.grasp import GraspSettings
+from robot.grasping.attempt import Attempter, depth_in_mm
+from robot.grasping.gates import ContactAreaGate
+from robot.grasping.plan import GraspSettings
+from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD
-from robot.recording import RecordingWriter, read_recording
+from robot.recording.attempt_log import acceptance, read_attempts
+from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import Rig
+from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import FakeArm, FakeRig
 
 NAMES = ("round-0", "thin-1", "round-2")
@@ -543,7 +543,7 @@ def test_a_real_rig_cannot_be_doubled(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_told_and_what_was_recorded_is_whole(tmp_path, monkeypatch):
-    from robot import recording as module
+    from robot.recording import folder as module
 
     real, count = module.write_file, []
 
@@ -585,7 +585,7 @@ def test_the_picture_of_the_camera_is_not_changed_by_what_is_made_of_it():
         rig.prepare("round-0", 0)
         image = rig.camera.read()
     kept = RGBD(image.colour.copy(), image.depth_m.copy(), image.intrinsics, 0.0)
-    from robot.cylinder import fit_cylinder
+    from robot.sight.cylinder import fit_cylinder
 
     fit_cylinder(image, rig.camera.extrinsics)
     assert (image.colour == kept.colour).all()

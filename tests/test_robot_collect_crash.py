@@ -13,7 +13,7 @@ import pytest
 
 from robot.collect import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, RobotError, StorageError
-from robot.recording import read_recording
+from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.test_robot_collect import files

@@ -10,11 +10,11 @@ import time
 import numpy as np
 import pytest
 
-from robot.cloud import Rays
-from robot.cylinder import CylinderFit, fit_cylinder
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import RGBD, Box
-from robot.solids import fit_circle
+from robot.sight.cloud import Rays
+from robot.sight.cylinder import CylinderFit, fit_cylinder
+from robot.sight.solids import fit_circle
 from tests import views
 from tests.views import Ball, Block, Lying, Upright, view
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from robot.drivers import discover, vendor
-from robot.drivers.kinect2 import Kinect2
-from robot.drivers.realsense import RealSense
-from robot.drivers.uvc_camera import UvcCamera
+from robot.drivers.cameras.kinect2 import Kinect2
+from robot.drivers.cameras.realsense import RealSense
+from robot.drivers.cameras.uvc import UvcCamera
 from robot.errors import DeviceError, RobotConfigError
 from tests.fake_video import EXTRINSICS, FakeCamera, FakeFreenect2, FakeRealSense, own_threads
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from robot.devices import TactileSensor, read_together
-from robot.drivers import frames
-from robot.drivers.frames import FrameReader, ReaderSettings
+from robot.drivers.video import frames
+from robot.drivers.video.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
 from tests.fake_video import own_threads

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.drivers import discover, opencv_stream
-from robot.drivers.opencv_stream import CaptureSettings, CaptureStream, stable_path
-from robot.drivers.opencv_tactile import PRESETS, Digit, GelSight, GelSightMini, OpencvTactile
+from robot.drivers import discover
+from robot.drivers.gels.opencv import PRESETS, Digit, GelSight, GelSightMini, OpencvTactile
+from robot.drivers.video import opencv_stream
+from robot.drivers.video.opencv_stream import CaptureSettings, CaptureStream, stable_path
 from robot.errors import DeviceError, RobotConfigError
 from tests.fake_video import FakeCamera, own_threads
 from tests.waiting import until

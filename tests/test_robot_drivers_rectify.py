@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.rectify import Rectifier, in_rgb, load_rectifier, make_rectifier
+from robot.drivers.video.rectify import Rectifier, in_rgb, load_rectifier, make_rectifier
 from robot.errors import DeviceError, RobotConfigError
 
 CORNERS = ((10.0, 5.0), (49.0, 5.0), (49.0, 24.0), (10.0, 24.0))
@@ -107,6 +107,7 @@ SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
         ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "corners_px": SQUARE}, "one of corners_px and crop"),
         ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "rotate": 1}, "unknown key 'rotate'"),
         ({"image_px": [10], "crop": [0, 0, 0, 0]}, "image_px"),
+        ({"image_px": [], "corners_px": []}, "image_px"),
         ({"image_px": [10, 0], "crop": [0, 0, 0, 0]}, "image_px"),
         ({"image_px": [10, 9.5], "crop": [0, 0, 0, 0]}, "whole numbers"),
         ({"image_px": [10, 10], "crop": [0, 0, 0]}, "crop"),

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.attempt import depth_in_mm
 from robot.drivers.replay import ImagesSensor, ReplayCamera, VideoSensor
 from robot.errors import DeviceError, RobotConfigError
-from robot.recording import RecordingWriter
+from robot.grasping.attempt import depth_in_mm
+from robot.recording.folder import RecordingWriter
 from tests.fake_video import EXTRINSICS
 
 LEVELS = (20, 60, 100, 140, 180, 220)

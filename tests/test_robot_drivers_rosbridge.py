@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers import rosbridge
-from robot.drivers.rosbridge import RosbridgeLink, decode, encode
-from robot.drivers.rosbridge_emulator import Emulator, Faults, serve
+from robot.drivers.sawyer import rosbridge
+from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
+from robot.emulators.sawyer.server import Emulator, Faults, serve
 from robot.errors import DeviceError
 from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
 
@@ -339,7 +339,7 @@ def test_faults_are_drawn_from_a_seed_and_counted():
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
-    command = [sys.executable, "-m", "robot.drivers.rosbridge_emulator", "--port", "0", "--faults", "1"]
+    command = [sys.executable, "-m", "robot.emulators.sawyer.server", "--port", "0", "--faults", "1"]
     with running([*by, *command]) as process:
         url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
         link = RosbridgeLink(url, timeout_s=60.0)
@@ -354,7 +354,9 @@ def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
 
 
 def test_the_module_needs_no_optional_package_to_be_imported():
-    code = "import sys; import robot.drivers.sawyer, robot.drivers.manual_arm; print('websockets' in sys.modules)"
+    code = (
+        "import sys; import robot.drivers.sawyer.driver, robot.drivers.manual_arm; print('websockets' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "False"
     assert rosbridge.__doc__

@@ -16,14 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers import sawyer_messages as messages
-from robot.drivers import straight_line
-from robot.drivers.rosbridge import Arrival
-from robot.drivers.rosbridge_emulator import LIMB, Emulator, Faults, serve
-from robot.drivers.sawyer import Sawyer
-from robot.drivers.sawyer_messages import JOINTS, Mount
-from robot.drivers.sawyer_model import READY, SawyerModel, forward, inverse
-from robot.drivers.straight_line import Schedule, way_points
+from robot.drivers.sawyer import messages, straight_line
+from robot.drivers.sawyer.driver import Sawyer
+from robot.drivers.sawyer.messages import JOINTS, Mount
+from robot.drivers.sawyer.rosbridge import Arrival
+from robot.drivers.sawyer.straight_line import Schedule, way_points
+from robot.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
+from robot.emulators.sawyer.server import LIMB, Emulator, Faults, serve
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
 from tests.waiting import running, until
@@ -396,7 +395,7 @@ def test_a_collision_that_lasts_needs_a_person():
     ],
 )
 def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkeypatch):
-    monkeypatch.setattr("robot.drivers.sawyer._SLOW_STATE_AGE_S", 0.5)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.5)
     with connected(max_state_age_s=age_s) as (emulator, arm):
         with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
             arm.move_to(FAR, 20.0)
@@ -424,8 +423,8 @@ def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
 
 
 def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatch):
-    monkeypatch.setattr("robot.drivers.sawyer._SLOW_STATE_AGE_S", 0.1)
-    monkeypatch.setattr("robot.drivers.sawyer._BACK_OFF_S", 0.001)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.1)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
         emulator.silent.add(messages.COLLISION[0])
         until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
@@ -445,7 +444,7 @@ def test_however_often_the_robot_is_tried_no_wait_is_longer_than_seconds(monkeyp
     waits = []
     arm = arm_at("ws://127.0.0.1:9090", reconnect_tries=20)
     monkeypatch.setattr(arm, "_join", Mock(side_effect=DeviceError("nobody is there")))
-    monkeypatch.setattr("robot.drivers.sawyer.time", SimpleNamespace(sleep=waits.append))
+    monkeypatch.setattr("robot.drivers.sawyer.driver.time", SimpleNamespace(sleep=waits.append))
     with pytest.raises(DeviceError, match="nobody is there"):
         arm._rejoin()
     assert (len(waits), waits[0], max(waits)) == (19, 0.25, 5.0)
@@ -481,7 +480,7 @@ def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
 
 
 def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
-    monkeypatch.setattr("robot.drivers.sawyer._BACK_OFF_S", 0.001)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with contextlib.ExitStack() as robot:
         arm = arm_at(robot.enter_context(serve(Emulator())), reconnect_tries=3, timeout_s=5.0)
         arm.connect()
@@ -514,7 +513,7 @@ def test_ctrl_c_leaves_the_arm_standing():
 
 
 PROGRAM = """
-from robot.drivers.sawyer import Sawyer
+from robot.drivers.sawyer.driver import Sawyer
 from robot.readings import Box, Pose
 from tests.waiting import until
 box = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
@@ -681,7 +680,7 @@ def test_it_connects_closes_and_connects_again_and_leaves_no_thread():
     ],
 )
 def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds, monkeypatch, capsys):
-    monkeypatch.setattr("robot.drivers.sawyer._BACK_OFF_S", 0.01)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.01)
     faults, outcomes = Faults(rate, kinds, seed=20), Counter()
     with connected(Emulator(faults=faults), timeout_s=1.0) as (emulator, arm):
         for number in range(10):

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers import wsg50_codec as codec
-from robot.drivers import wsg50_commands as commands
-from robot.drivers.wsg50_codec import Frame, WireError, decode, encode
-from robot.drivers.wsg50_commands import Command, GraspingState, Status, SystemState
+from robot.drivers.wsg50 import codec, commands
+from robot.drivers.wsg50.codec import Frame, WireError, decode, encode
+from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState
 from robot.errors import DeviceError
 from tests.wsg50_frames import COMMANDS, FRAMES, MANUAL_REPLIES, bytes_of
 

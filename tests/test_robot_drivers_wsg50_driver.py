@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_commands import Statistics
-from robot.drivers.wsg50_emulator import Emulator
+from robot.drivers.wsg50.commands import Statistics
+from robot.drivers.wsg50.driver import WSG50
+from robot.emulators.wsg50.server import Emulator
 from robot.errors import DeviceError, RobotConfigError
 from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, TARE, bench
 

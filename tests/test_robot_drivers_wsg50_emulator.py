@@ -4,10 +4,10 @@ import struct
 
 import pytest
 
-from robot.drivers.wsg50_codec import Frame, decode, encode
-from robot.drivers.wsg50_emulator import Emulator, Faults
-from robot.drivers.wsg50_faults import KINDS
-from robot.drivers.wsg50_mechanics import Mechanics
+from robot.drivers.wsg50.codec import Frame, decode, encode
+from robot.emulators.wsg50.faults import KINDS
+from robot.emulators.wsg50.mechanics import Mechanics
+from robot.emulators.wsg50.server import Emulator, Faults
 from robot.errors import RobotConfigError
 from tests.wsg50_frames import bytes_of
 

@@ -5,10 +5,10 @@ import time
 
 import pytest
 
-from robot.drivers import wsg50
-from robot.drivers.wsg50_emulator import Emulator, Faults
-from robot.drivers.wsg50_faults import KINDS, Piece
-from robot.drivers.wsg50_port import LinkLost
+from robot.drivers.wsg50 import driver as wsg50
+from robot.drivers.wsg50.port import LinkLost
+from robot.emulators.wsg50.faults import KINDS, Piece
+from robot.emulators.wsg50.server import Emulator, Faults
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench

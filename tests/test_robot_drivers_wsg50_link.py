@@ -15,13 +15,14 @@ from contextlib import closing
 import pytest
 from serial.urlhandler import protocol_socket
 
-from robot.drivers import wsg50_codec, wsg50_link
-from robot.drivers import wsg50_commands as commands
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_codec import Frame, decode, encode
-from robot.drivers.wsg50_commands import Command, Status
-from robot.drivers.wsg50_link import CommandFailed, Link, NoEcho, NoReply
-from robot.drivers.wsg50_port import LinkLost, Port
+from robot.drivers.wsg50 import codec as wsg50_codec
+from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50 import link as wsg50_link
+from robot.drivers.wsg50.codec import Frame, decode, encode
+from robot.drivers.wsg50.commands import Command, Status
+from robot.drivers.wsg50.driver import WSG50
+from robot.drivers.wsg50.link import CommandFailed, Link, NoEcho, NoReply
+from robot.drivers.wsg50.port import LinkLost, Port
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_frames import bytes_of
@@ -442,5 +443,7 @@ def test_without_pyserial_it_says_what_to_install(monkeypatch):
 
 
 def test_no_module_of_the_driver_needs_pyserial_to_be_imported():
-    blocked = "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50, robot.drivers.wsg50_emulator"
+    blocked = (
+        "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, robot.emulators.wsg50.server"
+    )
     subprocess.run([sys.executable, "-c", blocked], check=True, timeout=60)

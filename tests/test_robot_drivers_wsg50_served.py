@@ -14,9 +14,9 @@ import time
 import numpy as np
 import pytest
 
-from robot.drivers import wsg50_emulated
-from robot.drivers.wsg50_codec import Frame, encode
-from robot.drivers.wsg50_emulator import Emulator, Faults, main, serve_pty, serve_tcp
+from robot.drivers.wsg50.codec import Frame, encode
+from robot.emulators.wsg50 import gripper as wsg50_emulated
+from robot.emulators.wsg50.server import Emulator, Faults, main, serve_pty, serve_tcp
 from tests.waiting import STARTED, STARTED_IDS, first_line, running
 from tests.wsg50_frames import bytes_of
 
@@ -150,7 +150,7 @@ def test_a_line_that_is_cut_can_be_taken_up_again():
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 @pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
 def test_it_runs_as_a_program_and_says_where(port, end, by):
-    program = [sys.executable, "-m", "robot.drivers.wsg50_emulator", *port, "--object-mm", "40"]
+    program = [sys.executable, "-m", "robot.emulators.wsg50.server", *port, "--object-mm", "40"]
     with running([*by, *program]) as process:
         line = first_line(process)
         assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())

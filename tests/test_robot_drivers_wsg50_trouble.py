@@ -10,10 +10,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from robot.drivers import wsg50, wsg50_emulated
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_commands import Status
-from robot.drivers.wsg50_emulator import Emulator
+from robot.drivers.wsg50 import driver as wsg50
+from robot.drivers.wsg50.commands import Status
+from robot.drivers.wsg50.driver import WSG50
+from robot.emulators.wsg50 import gripper as wsg50_emulated
+from robot.emulators.wsg50.server import Emulator
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_bench import ACK, FAST_STOP, GRASP, HOME, PORTS, QUICK, STOP, TARE, Script, bench
@@ -309,7 +310,7 @@ def test_connecting_to_nothing_is_a_sentence_and_leaves_nothing_open():
 def test_however_often_the_gripper_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
     """Doubled each time, the last of twenty waits would take more than a day."""
     waits = []
-    monkeypatch.setattr("robot.drivers.wsg50_setup.time", SimpleNamespace(sleep=waits.append))
+    monkeypatch.setattr("robot.drivers.wsg50.setup.time", SimpleNamespace(sleep=waits.append))
     for first, longest in ((0.2, 5.0), (30.0, 30.0)):
         waits.clear()
         gripper = WSG50(port="/nowhere/tty", reconnect_tries=20, reconnect_s=first)

@@ -1,8 +1,8 @@
 """A dry run: the motions of an attempt are said, and nothing moves."""
 
-from robot.attempt import Attempter
-from robot.attempt_settings import AttemptSettings
-from robot.dry_run import without_motion
+from robot.grasping.attempt import Attempter
+from robot.grasping.dry_run import without_motion
+from robot.grasping.settings import AttemptSettings
 from tests.fake_rig import FakeRig
 
 

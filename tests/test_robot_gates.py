@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, RobotError
-from robot.gates import ContactAreaGate, GraspFrames, difference, judge
+from robot.grasping.gates import ContactAreaGate, GraspFrames, difference, judge
 
 SHAPE = (60, 80, 3)
 

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from robot.cylinder import CylinderFit
 from robot.errors import PlanError, RobotConfigError
-from robot.grasp import GraspSettings, plan_grasp
+from robot.grasping.plan import GraspSettings, plan_grasp
 from robot.readings import Box
+from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
 
 FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot import devices, hand_eye
+from robot import devices
 from robot.errors import RobotConfigError
-from robot.hand_eye import fit_hand_eye, load, read_pairs
+from robot.sight import hand_eye
+from robot.sight.hand_eye import fit_hand_eye, load, read_pairs
 
 WRITTEN = datetime(2026, 3, 1, 12, tzinfo=UTC)
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from retrieval.lab.hard_cases.gel_pictures import _columns, _grams, naive_ridge, refused
+from retrieval.lab.hard_cases.rig import _exact_depth, _picture, _points, hard_cases, naive_circle
+from retrieval.lab.optics.least_squares import solve
 from robot.errors import SceneError
-from robot.hard_cases import _exact_depth, _picture, _points, hard_cases, naive_circle
-from robot.sim.hard_pictures import _columns, _grams, naive_ridge, refused
-from robot.sim.pose_fit import solve
 
 KERNELS = (
     "layer kernel",

@@ -10,7 +10,7 @@ import pytest
 from robot.errors import ImporterError, RecordingError, UnknownName
 from robot.importers import IMPORTERS, load_importer
 from robot.importers.billets import import_billets
-from robot.recording import RecordingWriter, read_recording
+from robot.recording.folder import RecordingWriter, read_recording
 
 DATA = Path(os.environ.get("TOUCH_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -5,14 +5,14 @@ import datetime
 import numpy as np
 import pytest
 
-from robot import hand_eye
+from robot.drivers.cameras.uvc import UvcCamera
 from robot.drivers.manual_arm import ManualArm
 from robot.drivers.replay import ImagesSensor
-from robot.drivers.uvc_camera import UvcCamera
-from robot.drivers.wsg50 import WSG50
+from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
 from robot.real_rig import DRIVERS, load_driver
 from robot.rig import load_rig
+from robot.sight import hand_eye
 
 TABLES = {
     "": 'rig = "real"\nsource = "bench 3"\nsensor = "gelsight mini"',

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot import recording as module
 from robot.errors import RecordingError, StorageError
-from robot.recording import RecordedGrasp, RecordingWriter, read_recording
+from robot.recording import folder as module
+from robot.recording.folder import RecordedGrasp, RecordingWriter, read_recording
 
 INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
 ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
@@ -257,7 +257,7 @@ def test_a_folder_that_is_no_recording_is_told_and_what_makes_one(tmp_path):
 
 def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
     write(tmp_path, ROW)  # its images do not exist
-    code = f"import sys; from robot.recording import read_recording; read_recording({str(tmp_path)!r}); "
+    code = f"import sys; from robot.recording.folder import read_recording; read_recording({str(tmp_path)!r}); "
     code += "assert not {'cv2', 'torch', 'scipy', 'retrieval'} & set(sys.modules)"
     root = Path(module.__file__).parents[1]
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from robot import recording as module
 from robot.errors import RobotError, StorageError
-from robot.recording import RecordedGrasp, RecordingWriter
+from robot.recording import folder as module
+from robot.recording.folder import RecordedGrasp, RecordingWriter
 from tests.test_robot_recording import INFO, ids, pictures, two_grasps
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from robot.errors import SceneError
-from robot.sim.body import SdfBody
-from robot.sim.objects import draw_object
-from robot.sim.relief import RELIEFS, Relief
-from robot.sim.shapes import SHAPES
-from robot.sim.shapes.extrusion import Extrusion, RoundedRectangle
-from robot.sim.shapes.revolution import Ball, Drum, Revolution
-from robot.sim.wall import FINEST_MM
+from robot.sim.objects.body import SdfBody
+from robot.sim.objects.draw import draw_object
+from robot.sim.objects.relief import RELIEFS, Relief
+from robot.sim.objects.shapes import SHAPES
+from robot.sim.objects.shapes.extrusion import Extrusion, RoundedRectangle
+from robot.sim.objects.shapes.revolution import Ball, Drum, Revolution
+from robot.sim.objects.wall import FINEST_MM
 
 SMOOTH = Relief("smooth", 0.0, 5.0)
 ATOL = 2e-3  # mm; float32 coordinates and two secants

@@ -9,7 +9,7 @@ import pytest
 from robot.errors import SceneError
 from robot.sim import camera as cameras
 from robot.sim.camera import Camera, Lighting, Placement, look
-from robot.sim.objects import draw_object
+from robot.sim.objects.draw import draw_object
 
 POST = draw_object(0, 0, family="cylinder", relief="smooth")
 HEIGHT_MM = float(POST.body.upper[2])

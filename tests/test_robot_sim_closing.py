@@ -5,12 +5,21 @@ import math
 import numpy as np
 import pytest
 
+from retrieval.lab.contact.closing_jaws import (
+    ForceLaw,
+    Jaws,
+    LinearLaw,
+    Motion,
+    TabulatedLaw,
+    close,
+    pressed_law,
+    settle,
+)
+from retrieval.lab.frontier.contact import spring_closing
+from retrieval.lab.hard_cases.contact import naive_close
 from robot.errors import RobotConfigError, SceneError
 from robot.readings import Pose
-from robot.sim.closing import ForceLaw, Jaws, LinearLaw, Motion, TabulatedLaw, close, pressed_law, settle
-from robot.sim.contact import Layer, press
-from robot.sim.frontier import spring_closing
-from robot.sim.hard_cases import naive_close
+from robot.sim.contact.layer import Layer, press
 from robot.sim.rig import SimRig
 
 

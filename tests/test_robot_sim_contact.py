@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from retrieval.lab.contact.closed_forms import closed_form_table
 from robot.errors import RobotConfigError, SceneError
-from robot.sim import kernels, pressing
-from robot.sim.closed_forms import closed_form_table
-from robot.sim.contact import Layer, press
-from robot.sim.kernels import influence
+from robot.sim.contact import kernels
+from robot.sim.contact import scaled_problem as pressing
+from robot.sim.contact.kernels import influence
+from robot.sim.contact.layer import Layer, press
 
 HALF_SPACE = Layer(0.2, 0.48)
 GEL = Layer(0.2, 0.48, 2.0)

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.sim.constrained_cg import Problem, nearest_of_sum
-from robot.sim.contact import Layer, press
-from robot.sim.hard_cases import hard_gaps, hard_layers, is_finite, naive_solve, stability_sweep
-from robot.sim.kernels import Operator, influence, periodic_influence
+from retrieval.lab.hard_cases.contact import hard_gaps, hard_layers, is_finite, naive_solve, stability_sweep
+from robot.sim.contact.constrained_cg import Problem, nearest_of_sum
+from robot.sim.contact.kernels import Operator, influence, periodic_influence
+from robot.sim.contact.layer import Layer, press
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from robot.errors import BadRobotInput
-from robot.sim import fitted_optics
-from robot.sim.fitted_optics import FittedOptics, Limits, fitted_names, load_fitted
-from robot.sim.surface import Field, Surface
+from robot.sim.gel import fitted_optics
+from robot.sim.gel.fitted_optics import FittedOptics, Limits, fitted_names, load_fitted
+from robot.sim.gel.surface import Field, Surface
 
 SMALL = Field(24, 32, 0.5)
 

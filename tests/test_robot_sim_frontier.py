@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from robot.sim.closed_forms import Check, Grid, hertz
-from robot.sim.closing import Jaws
-from robot.sim.frontier import (
+from retrieval.lab.contact.closed_forms import Check, Grid, hertz
+from retrieval.lab.contact.closing_jaws import Jaws
+from retrieval.lab.frontier.contact import (
     closed_form_table,
     closing_points,
     contact_points,
@@ -16,7 +16,7 @@ from robot.sim.frontier import (
     stability_sweep,
     timed,
 )
-from robot.sim.hard_cases import HardCase
+from retrieval.lab.hard_cases.contact import HardCase
 from tests.benchmarks import contact as benchmark
 
 

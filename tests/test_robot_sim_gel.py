@@ -10,13 +10,14 @@ import pytest
 
 from robot.errors import RobotConfigError, SceneError, UnknownName
 from robot.gel_settings import GelSettings
-from robot.sim import gel, optics
-from robot.sim.contact import Layer
-from robot.sim.fitted_optics import fitted_names, load_fitted
-from robot.sim.gel import OPTICS, GelSensor, Noise, draw_sensor
-from robot.sim.gel_marks import Flaws, Markers, flaw_maps, marker_positions
-from robot.sim.optics import Bar, LedOptics, cast_shadows, led_rays
-from robot.sim.surface import Field, Surface, resized
+from robot.sim.contact.layer import Layer
+from robot.sim.gel import optics
+from robot.sim.gel import sensor as gel
+from robot.sim.gel.fitted_optics import fitted_names, load_fitted
+from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_positions
+from robot.sim.gel.optics import Bar, LedOptics, cast_shadows, led_rays
+from robot.sim.gel.sensor import OPTICS, GelSensor, Noise, draw_sensor
+from robot.sim.gel.surface import Field, Surface, resized
 
 LAYER = Layer(0.3, 0.48, 3.0)
 SMALL = Field(24, 32, 0.5)

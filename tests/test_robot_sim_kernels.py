@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j0
 
-from robot.sim.hard_cases import naive_patch, naive_symbol
-from robot.sim.kernels import (
+from retrieval.lab.hard_cases.contact import naive_patch, naive_symbol
+from robot.sim.contact.kernels import (
     REACH,
     THIN_PIXELS,
     Operator,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, UnknownName
-from robot.sim.looks import Label, Looks, Paint, draw_looks
-from robot.sim.materials import MATERIALS, Material, draw_material
+from robot.sim.objects.looks import Label, Looks, Paint, draw_looks
+from robot.sim.objects.materials import MATERIALS, Material, draw_material
 
 
 def drawn(name=None, count=200):

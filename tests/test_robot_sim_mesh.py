@@ -12,7 +12,7 @@ import pytest
 from robot.collect import CollectSettings, collect
 from robot.errors import RecordingError, RobotConfigError, SceneError, UnknownName
 from robot.rig import load_rig
-from robot.sim.mesh import Mesh, load_mesh_object
+from robot.sim.objects.mesh import Mesh, load_mesh_object
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
 pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")

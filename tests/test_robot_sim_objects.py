@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, UnknownName
-from robot.sim.body import SdfBody
-from robot.sim.looks import Looks
-from robot.sim.materials import MATERIALS
-from robot.sim.objects import STROKE_MM, SimObject, draw_object
-from robot.sim.relief import RELIEFS, Relief
-from robot.sim.shapes import SHAPES
-from robot.sim.shapes.revolution import Drum, Revolution
+from robot.sim.objects.body import SdfBody
+from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
+from robot.sim.objects.looks import Looks
+from robot.sim.objects.materials import MATERIALS
+from robot.sim.objects.relief import RELIEFS, Relief
+from robot.sim.objects.shapes import SHAPES
+from robot.sim.objects.shapes.revolution import Drum, Revolution
 
 
 def solid(radius, height, material):

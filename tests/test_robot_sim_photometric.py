@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from retrieval.lab.optics import least_squares as pose_fit
+from retrieval.lab.optics import model_choice as press_model
+from retrieval.lab.optics import photometric
+from retrieval.lab.optics import real_presses as presses
+from retrieval.lab.optics.image_error import compare, ssim
+from retrieval.lab.optics.least_squares import Setting, aligned, columns_of, features, gram, labelled_poses, solve
+from retrieval.lab.optics.model_choice import fit, held_out_error, judged, select, to_optics
+from retrieval.lab.optics.real_presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
 from robot.errors import BadRobotInput, UnknownName
-from robot.sim import photometric, pose_fit, press_model, presses
-from robot.sim.fitted_optics import fitted_document, fitted_names, load_fitted, optics_from_json
-from robot.sim.image_error import compare, ssim
-from robot.sim.pose_fit import Setting, aligned, columns_of, features, gram, labelled_poses, solve
-from robot.sim.press_model import fit, held_out_error, judged, select, to_optics
-from robot.sim.presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
-from robot.sim.surface import Field, Surface
+from robot.sim.gel.fitted_optics import fitted_document, fitted_names, load_fitted, optics_from_json
+from robot.sim.gel.surface import Field, Surface
 
 real = pytest.mark.skipif(find_spec("taxim") is None, reason="real presses come with taxim: pip install .[calibration]")
 PLAIN = Setting(degree=2, places=3, reaches_mm=())
@@ -369,7 +372,8 @@ def test_the_shipped_fit_is_what_the_presses_give(name, packs):
     np.testing.assert_allclose(*colours, atol=0.5)  # grey levels; other BLAS round otherwise
 
 
-# What the table of `python -m robot.sim.photometric` shows, with some room: PSNR in dB and SSIM of held-out presses.
+# What the table of `python -m retrieval.lab.optics.photometric` shows, with some room: PSNR in dB and SSIM of held-out
+# presses.
 HELD_OUT = {"gelsight": (36.0, 0.974), "gelsight_mini": (33.0, 0.968)}
 
 

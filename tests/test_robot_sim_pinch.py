@@ -9,10 +9,10 @@ import pytest
 
 from robot.errors import SceneError
 from robot.readings import Pose
-from robot.sim.body import Body
 from robot.sim.camera import Placement
-from robot.sim.gel import draw_sensor
-from robot.sim.objects import draw_object
+from robot.sim.gel.sensor import draw_sensor
+from robot.sim.objects.body import Body
+from robot.sim.objects.draw import draw_object
 from robot.sim.pinch import GRAVITY_M_S2, Hand, Pinch
 
 SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}

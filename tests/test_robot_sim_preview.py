@@ -6,7 +6,7 @@ import pytest
 
 from robot.collect import CollectSettings, collect
 from robot.errors import RecordingError
-from robot.recording import RecordingWriter, read_recording
+from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import load_rig
 from robot.sim.preview import TILE_PX, write_preview
 

@@ -1,10 +1,11 @@
 """Relief families on an unrolled wall: range, seam, pitch, direction, edges."""
 
+import cv2
 import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, UnknownName
-from robot.sim.relief import RELIEFS, Relief, Sheet, draw_relief
+from robot.sim.objects.relief import RELIEFS, Relief, Sheet, draw_relief
 
 SHEET = Sheet(120.0, 60.0, 401, 800)
 WORN = [name for name in RELIEFS if name != "smooth"]
@@ -36,6 +37,20 @@ def test_relief_meets_itself_at_the_seam(name):
 def test_the_same_relief_is_the_same_again_and_another_seed_or_pitch_is_not(name):
     np.testing.assert_array_equal(height(name), height(name))
     assert np.abs(height(name) - height(name, pitch_mm=9.0, seed=4)).max() > 0.1
+
+
+@pytest.mark.parametrize("name", WORN)
+def test_a_relief_is_the_same_whatever_the_number_of_threads(name):
+    threads = cv2.getNumThreads()
+    found = []
+    try:
+        for number in (1, 2, 3):
+            cv2.setNumThreads(number)
+            found.append(height(name))
+    finally:
+        cv2.setNumThreads(threads)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
 
 
 def test_engraving_goes_in():

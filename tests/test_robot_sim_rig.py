@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from robot.attempt import Attempter
-from robot.attempt_settings import AttemptSettings
 from robot.collect import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.grasping.attempt import Attempter
+from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
-from robot.recording import read_recording
+from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.rig import STROKE_MM, SimRig
 

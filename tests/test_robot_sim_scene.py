@@ -9,8 +9,8 @@ import pytest
 from robot.errors import SceneError
 from robot.readings import Pose
 from robot.sim.camera import Placement
-from robot.sim.gel import draw_sensor
-from robot.sim.objects import draw_object
+from robot.sim.gel.sensor import draw_sensor
+from robot.sim.objects.draw import draw_object
 from robot.sim.scene import Grip, Scene
 
 SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from robot.sim.shapes import SHAPES
-from robot.sim.shapes.base import Cylindrical, arctan2, rounded, smooth_min
-from robot.sim.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
-from robot.sim.shapes.revolution import Ball, Cone, Drum, Revolution, Rod
-from robot.sim.shapes.solids import Bar, Bars, Brush, Comb, Ring, Superquadric, TwoSided
+from robot.sim.objects.shapes import SHAPES
+from robot.sim.objects.shapes.base import Cylindrical, arctan2, rounded, smooth_min
+from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
+from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Revolution, Rod
+from robot.sim.objects.shapes.solids import Bar, Bars, Brush, Comb, Ring, Superquadric, TwoSided
 
 
 def draw(family, seed):

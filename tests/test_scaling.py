@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from retrieval.features import Features
+from retrieval.training.features import Features
 from tests import scaling, synthetic
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.recording import read_recording
+from robot.recording.folder import read_recording
 from tests import synthetic
 from tests.synthetic import (
     DrawnObject,

@@ -24,22 +24,22 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from retrieval.binomial import binomial_interval
-from retrieval.checkpoint import Checkpoint, load_checkpoint
-from retrieval.dataset import load_grasps
-from retrieval.defaults import shipped_model
-from retrieval.encode import for_inference, photo_features, touch_batch
-from retrieval.features import encode_recording
-from retrieval.foreign import draw_foreign
-from retrieval.fusion import judge_of
-from retrieval.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.images import read_rgb
-from retrieval.posterior import Judged, Questions
-from retrieval.progress import Bar
-from retrieval.resize import RgbImage
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import load_grasps
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import RgbImage
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import for_inference, photo_features, touch_batch
+from retrieval.model.fusion import judge_of
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.posterior import Judged, Questions
+from retrieval.search.defaults import shipped_model
+from retrieval.training.features import encode_recording
+from retrieval.training.foreign import draw_foreign
 from robot.collect import CollectSettings, collect
 from robot.rig import load_rig
-from robot.sim.objects import draw_object
+from robot.sim.objects.draw import draw_object
 from tests import shipped
 
 FELT, PHOTOGRAPHED, GRASPS = 120, 1000, 8

@@ -6,10 +6,10 @@ from unittest.mock import patch
 import pytest
 from serial.urlhandler import protocol_socket
 
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_codec import Frame, encode
-from robot.drivers.wsg50_emulator import Emulator, Faults, serve_pty, serve_tcp
-from robot.drivers.wsg50_faults import Piece
+from robot.drivers.wsg50.codec import Frame, encode
+from robot.drivers.wsg50.driver import WSG50
+from robot.emulators.wsg50.faults import Piece
+from robot.emulators.wsg50.server import Emulator, Faults, serve_pty, serve_tcp
 from robot.errors import DeviceError
 
 SERVE = {"tcp": serve_tcp, "pty": serve_pty}

@@ -1,7 +1,7 @@
 """Leakage audit of a split: what the parts share, and near copies of test frames among those fitted or chosen on.
 
 Byte-identical files are found by their digests, what was encoded again, lit otherwise, moved or flipped by shape: see
-`retrieval.copies`, which also says of how many test frames a copy could have been told.
+`retrieval.data.check.copies`, which also says of how many test frames a copy could have been told.
 """
 
 from collections import defaultdict
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.check import check_split
-from retrieval.copies import Pictures, Thumbnail, look_at
-from retrieval.dataset import Grasp, Split, finger_count
-from retrieval.progress import Bar
+from retrieval.console.progress import Bar
+from retrieval.data.check.copies import Pictures, Thumbnail, look_at
+from retrieval.data.check.recording import check_split
+from retrieval.data.dataset import Grasp, Split, finger_count
 
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
 UNIT = "1 less the correlation of shapes (0: a copy; about 1: unlike pictures)"

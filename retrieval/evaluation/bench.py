@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.checkpoint import Checkpoint
-from retrieval.config import Config
-from retrieval.dataset import Split
-from retrieval.encode import one_thread
+from retrieval.console.output import say
+from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries
-from retrieval.features import Features
 from retrieval.methods import build_method
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import LateFusion
-from retrieval.output import say
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config
+from retrieval.model.encode import one_thread
+from retrieval.training.features import Features
 from retrieval.version import __version__
 
 SEEDLESS = frozenset({"cca", "plsca", "constant"})

@@ -1,8 +1,8 @@
 """Probabilities of pairs, of objects and of none: fitted on validation objects, judged on test objects.
 
 Ranking needs none of this. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`; which
-object it is, and whether it is any, has the posterior that queries have (`retrieval.posterior`). Both are fitted for
-each number of grasps on its own: a method scores a set of grasps in its own way, so a set counts as one grasp whose
+object it is, and whether it is any, has the posterior that queries have (`retrieval.model.posterior`). Both are fitted
+for each number of grasps on its own: a method scores a set of grasps in its own way, so a set counts as one grasp whose
 score is the set's.
 """
 
@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from retrieval.calibration import Calibration, fit_calibration
 from retrieval.errors import BadInput
 from retrieval.evaluation.protocols import asked
 from retrieval.evaluation.table import ScoreTable, object_scores
-from retrieval.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
+from retrieval.metrics.pairs import Calibration, fit_calibration
+from retrieval.model.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
 
 BINS = 15
 _PAIRS_OF_A_ROW = 8  # of each kind

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.dataset import Grasp
+from retrieval.data.dataset import Grasp
 from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Judged, main_measures, summaries
-from retrieval.features import encode_recording
+from retrieval.training.features import encode_recording
 
 METHOD = "late_fusion"
 CONTROLS = {

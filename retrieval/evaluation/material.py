@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from retrieval.check import require_fit
-from retrieval.checkpoint import Checkpoint, load_checkpoint, require_writable
-from retrieval.config import Config
-from retrieval.dataset import Grasp, Split, data_digest, finger_count, load_grasps, make_split, recording_source
+from retrieval.data.check.recording import require_fit
+from retrieval.data.dataset import Grasp, Split, data_digest, finger_count, load_grasps, make_split, recording_source
 from retrieval.errors import DatasetError
-from retrieval.finish import finish, unfinished
-from retrieval.fusion import Matcher
 from retrieval.methods.late_fusion import frozen_matcher
-from retrieval.train import Trainer
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.training.finish import finish, unfinished
+from retrieval.training.train import Trainer
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.checkpoint import read_tensors, write_tensors
-from retrieval.encode import one_thread
 from retrieval.errors import BadInput
 from retrieval.evaluation.queries import Queries
-from retrieval.features import Features
 from retrieval.methods.base import Method, add_up
+from retrieval.model.checkpoint import read_tensors, write_tensors
+from retrieval.model.encode import one_thread
+from retrieval.training.features import Features
 
 Scores = NDArray[np.float32]
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.calibration import Calibration
 from retrieval.errors import BadInput
-from retrieval.evaluation import ranking
-from retrieval.evaluation.metrics import guess_curves
-from retrieval.evaluation.table import Measure, ScoreTable, object_means, object_scores, object_weights
+from retrieval.evaluation.table import ScoreTable, object_scores
+from retrieval.metrics import ranking
+from retrieval.metrics.guesses import guess_curves
+from retrieval.metrics.measure import Measure, object_means, object_weights
+from retrieval.metrics.pairs import Calibration
 
 
 def asked(table: ScoreTable) -> ScoreTable:

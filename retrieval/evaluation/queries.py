@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.dataset import Grasp, Split
+from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
 
 PARTS = ("train", "validation", "test")

@@ -14,8 +14,9 @@ from scipy.special import logsumexp
 
 from retrieval.evaluation.calibrate import questions
 from retrieval.evaluation.protocols import asked, gallery_words, share_below
-from retrieval.evaluation.table import Measure, ScoreTable, object_weights
-from retrieval.posterior import Posterior
+from retrieval.evaluation.table import ScoreTable
+from retrieval.metrics.measure import Measure, object_weights
+from retrieval.model.posterior import Posterior
 
 TRUE_ACCEPTS = 0.95
 _CURVE_POINTS = 200

@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from indexes.regular import read_json
-from retrieval.batches import BatchImages
-from retrieval.config import Config
-from retrieval.dataset import Split
-from retrieval.encode import one_thread, photo_features, touch_features
+from indexes.store.regular import read_json
+from retrieval.console.files import write_atomically
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
 from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.controls import METHOD, control_benches, score_control
-from retrieval.evaluation.intervals import compare
 from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
-from retrieval.features import encode_recording
-from retrieval.files import write_atomically
 from retrieval.methods import METHODS, require_known
-from retrieval.progress import Bar
+from retrieval.metrics.intervals import compare
+from retrieval.model.config import Config
+from retrieval.model.encode import one_thread, photo_features, touch_features
+from retrieval.training.batches import BatchImages
+from retrieval.training.features import encode_recording
 from retrieval.version import __version__
 
 Jobs = Mapping[str, Sequence[int]]

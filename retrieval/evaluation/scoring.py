@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.calibration import Calibration
 from retrieval.evaluation import protocols
 from retrieval.evaluation.calibrate import Calibrations, Choice, calibrate, enough_objects, reliability
-from retrieval.evaluation.intervals import summarise
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import SHOWN_PHOTOS, Queries
 from retrieval.evaluation.reject import Rejection, reject
-from retrieval.evaluation.table import Measure, ScoreTable
+from retrieval.evaluation.table import ScoreTable
+from retrieval.metrics.intervals import summarise
+from retrieval.metrics.measure import Measure
+from retrieval.metrics.pairs import Calibration
 
 CHOICES = (Choice(5), Choice(10), Choice(5, 5, SHOWN_PHOTOS))
 _CONFUSIONS, _EXAMPLES, _RANKED = 12, 6, 6

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.config import Config
 from retrieval.errors import BadInput, NumericalError
+from retrieval.model.config import Config
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 Array = NDArray[np.float32]
 

@@ -20,7 +20,7 @@ from retrieval.methods.selection import Judge, judge
 from retrieval.methods.standardise import Standardiser
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 Matrix = NDArray[np.float64]
 

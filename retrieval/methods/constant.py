@@ -7,7 +7,7 @@ import numpy as np
 from retrieval.methods.base import Array, Method
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 
 class Constant(Method):

@@ -7,7 +7,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from retrieval.losses import (
+from retrieval.console.progress import Bar
+from retrieval.methods.base import Array, Method
+from retrieval.methods.optimise import Best, ObjectDraws, Optimisation, optimise, seeded, standardised
+from retrieval.methods.selection import Judge, judge
+from retrieval.methods.standardise import Standardiser
+from retrieval.model.losses import (
     LOG_SCALE_INIT,
     LOG_SCALE_MAX,
     SIGMOID_BIAS_INIT,
@@ -15,14 +20,9 @@ from retrieval.losses import (
     contrastive_loss,
     sigmoid_loss,
 )
-from retrieval.methods.base import Array, Method
-from retrieval.methods.optimise import Best, ObjectDraws, Optimisation, optimise, seeded, standardised
-from retrieval.methods.selection import Judge, judge
-from retrieval.methods.standardise import Standardiser
-from retrieval.progress import Bar
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 MOST_STEPS, JUDGE_EVERY = 800, 40
 LEARNING_RATE = 1e-3

@@ -10,15 +10,15 @@ from typing import Self
 import numpy as np
 import torch
 
-from retrieval.checkpoint import Checkpoint
-from retrieval.config import Config
-from retrieval.dataset import Grasp, Split
+from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput
-from retrieval.features import Features
-from retrieval.finish import finish, unfinished
-from retrieval.fusion import Matcher, score_halves
 from retrieval.methods.base import Array, Method, Setting
-from retrieval.train import Trainer, build_matcher
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher, score_halves
+from retrieval.training.features import Features
+from retrieval.training.finish import finish, unfinished
+from retrieval.training.train import Trainer, build_matcher
 
 SOURCE = "features of a recording"
 """What a checkpoint says it was trained on."""

@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from retrieval.console.progress import Bar
 from retrieval.errors import NumericalError
 from retrieval.methods.standardise import Standardiser
-from retrieval.progress import Bar
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from retrieval.methods.cca import Matrix, admissible, cosine, decompose, unit_ro
 from retrieval.methods.selection import judge, neighbours
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 REDUCED = 256
 """Principal components kept of each modality. Every step of the power iteration passes over all features of all rows:

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.checkpoint import Checkpoint
-from retrieval.distil import feature_halves, with_pruner
-from retrieval.features import Features
-from retrieval.fusion import score_halves
 from retrieval.methods.base import Array, Setting
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.fusion import score_halves
+from retrieval.training.distil import feature_halves, with_pruner
+from retrieval.training.features import Features
 
 SHARE = 0.25
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import NumericalError
-from retrieval.features import Features
+from retrieval.training.features import Features
 
 MOST_JUDGED = 512
 

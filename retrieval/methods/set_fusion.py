@@ -11,16 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retrieval.fusion import FusionHead
-from retrieval.losses import match_loss
+from retrieval.console.progress import Bar
 from retrieval.methods.base import Array, Method
 from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded, standardised
 from retrieval.methods.selection import judge, neighbours
 from retrieval.methods.standardise import Standardiser
-from retrieval.progress import Bar
+from retrieval.model.fusion import FusionHead
+from retrieval.model.losses import match_loss
 
 if TYPE_CHECKING:
-    from retrieval.features import Features
+    from retrieval.training.features import Features
 
 MOST_GRASPS, JUDGED_GRASPS = 8, 5
 MOST_STEPS, JUDGE_EVERY = 1000, 50

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from retrieval.console.files import write_atomically
 from retrieval.errors import RetrievalError
-from retrieval.files import write_atomically
 
 Figure = Any
 Axes = Any

@@ -6,8 +6,8 @@ Every number comes from results.json or timings.json; nothing is measured here.
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from retrieval.dataset import load_grasps
-from retrieval.files import MARKED, PAGE, TEXT, text_bytes, write_output
+from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
+from retrieval.data.dataset import load_grasps
 from retrieval.report import comparing, looking, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown

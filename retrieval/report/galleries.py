@@ -8,7 +8,7 @@ from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
-from retrieval.dataset import Grasp
+from retrieval.data.dataset import Grasp
 from retrieval.report.canvas import Axes, Figure, canvas
 from retrieval.report.pictures import thumbnail
 from retrieval.report.results import number, percent, short

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import resize
 from retrieval.errors import ImageError
-from retrieval.images import read_rgb
-from retrieval.resize import resize
 
 Thumbnail = NDArray[np.uint8]
 """(H, W, 3) red first."""

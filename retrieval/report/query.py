@@ -4,9 +4,9 @@ from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
 
-from retrieval.answer import QueryResult
 from retrieval.report.pictures import data_uri, jpeg, thumbnail
 from retrieval.report.templates import render
+from retrieval.search.answer import QueryResult
 
 _THUMBNAIL_PX = 320
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from indexes.regular import read_json
+from indexes.store.regular import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.intervals import FEW_OBJECTS
+from retrieval.metrics.intervals import FEW_OBJECTS
 
 NOTHING = "–"
 

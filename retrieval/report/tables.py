@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from retrieval.posterior import FORMULA
+from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
 from retrieval.report.results import (
     FEW,

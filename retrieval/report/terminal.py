@@ -4,8 +4,8 @@ import sys
 from collections.abc import Collection, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from retrieval.answer import QueryResult
-from retrieval.output import printable, printing, show
+from retrieval.console.output import printable, printing, show
+from retrieval.search.answer import QueryResult
 
 if TYPE_CHECKING:
     from retrieval.report.results import Results

@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, TactileSensor
-from robot.drivers.rectify import in_rgb, make_rectifier
+from robot.drivers.video.rectify import in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
-from robot.recording import INFO_FILE, parse_object, read_recording
+from robot.recording.folder import INFO_FILE, parse_object, read_recording
 
 _KEPT = 8
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 from typing import Any
 
-from robot.drivers.frames import MOST_S
+from robot.drivers.video.frames import MOST_S
 from robot.errors import DeviceError
 from robot.settings import check_range
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from robot.errors import UnknownName
-from robot.recording import Recording
+from robot.recording.folder import Recording
 
 Progress = Callable[[int, int], None]
 """Called with (done, total) after each grasp."""

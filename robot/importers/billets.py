@@ -16,7 +16,7 @@ from pathlib import Path
 
 from robot.errors import ImporterError, RecordingError
 from robot.importers import Progress
-from robot.recording import Recording, RecordingWriter, read_recording
+from robot.recording.folder import Recording, RecordingWriter, read_recording
 
 _FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
 _TRAP = (

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import SceneError
-from robot.sim.objects import SimObject
+from robot.sim.objects.draw import SimObject
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

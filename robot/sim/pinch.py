@@ -17,9 +17,9 @@ import numpy.typing as npt
 from robot.errors import SceneError
 from robot.readings import Pose
 from robot.sim.camera import Placement
-from robot.sim.contact import Contact, press
-from robot.sim.gel import GelSensor
-from robot.sim.objects import STROKE_MM, SimObject
+from robot.sim.contact.layer import Contact, press
+from robot.sim.gel.sensor import GelSensor
+from robot.sim.objects.draw import STROKE_MM, SimObject
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RecordingError
-from robot.recording import RecordedGrasp, read_recording
+from robot.recording.folder import RecordedGrasp, read_recording
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
 from robot.storage import file_content, storage_errors, write_file

@@ -12,22 +12,22 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from robot.attempt_settings import attempt_of
 from robot.devices import Arm, Gripper, TactileSensor
 from robot.devices import Camera as CameraDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
+from robot.grasping.settings import attempt_of
 from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
-from robot.recorded_grasp import RecordedGrasp
+from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.settings import check_range
 from robot.sim.camera import Camera, Placement
-from robot.sim.gel import draw_sensor
-from robot.sim.gel_marks import Markers
-from robot.sim.objects import STROKE_MM, SimObject, draw_object
+from robot.sim.gel.marks import Markers
+from robot.sim.gel.sensor import draw_sensor
+from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
+from robot.sim.objects.shapes import SHAPES
 from robot.sim.pinch import PAD_MM, SIDES, Hand
 from robot.sim.scene import Grip, Scene
-from robot.sim.shapes import SHAPES
 
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
@@ -85,8 +85,8 @@ class SimRig(Rig):
     `contact_grid` (rows, columns) and `contact_tolerance` of the contact solver. `shadow`: whether the lamp casts one.
     `localisation_mm`: how far off the camera's calibration is, drawn from this range. `grasp`, `attempt` and `gel` are
     the tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: force and place of a grasp
-    (robot.grasp.GraspSettings), how attempts are made (robot.attempt_settings.AttemptSettings), and what the gels are
-    made of (robot.gel_settings.GelSettings); what is not said of a gel is drawn for each.
+    (robot.grasping.plan.GraspSettings), how attempts are made (robot.grasping.settings.AttemptSettings), and what the
+    gels are made of (robot.gel_settings.GelSettings); what is not said of a gel is drawn for each.
     Raises RobotConfigError, UnknownName, SceneError.
     """
 
@@ -214,7 +214,7 @@ def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
 
 @lru_cache(maxsize=4)
 def _mesh(path: Path, seed: int) -> SimObject:
-    from robot.sim.mesh import load_mesh_object
+    from robot.sim.objects.mesh import load_mesh_object
 
     return load_mesh_object(path, seed)
 
@@ -236,7 +236,7 @@ def _mesh_digest(folder: str) -> str:
 
 def _may_be(object_id: str, path: Path) -> bool:
     """Whether the file's name fits, so that not every mesh must be read."""
-    from robot.sim.mesh import object_prefix
+    from robot.sim.objects.mesh import object_prefix
 
     return object_id.startswith(object_prefix(path))
 

@@ -21,8 +21,8 @@ from robot.errors import SceneError
 from robot.readings import Pose
 from robot.sim import camera as cameras
 from robot.sim.camera import Camera, Lighting, Placement
-from robot.sim.gel import GelSensor
-from robot.sim.objects import STROKE_MM, SimObject
+from robot.sim.gel.sensor import GelSensor
+from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.pinch import SIDES, Hand, Pinch
 
 _TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")

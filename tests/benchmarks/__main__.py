@@ -7,7 +7,7 @@ import json
 
 import torch
 
-from retrieval.towers import TOWERS
+from retrieval.model.towers import TOWERS
 from tests.benchmarks import arm, build, cameras, cold, cylinder, grasp, gripper, query, rerank, step
 from tests.benchmarks.common import config_of
 

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from robot.drivers import sawyer_messages as messages
-from robot.drivers.rosbridge_emulator import Emulator, serve
-from robot.drivers.sawyer import Sawyer
-from robot.drivers.straight_line import way_points
+from robot.drivers.sawyer import messages
+from robot.drivers.sawyer.driver import Sawyer
+from robot.drivers.sawyer.straight_line import way_points
+from robot.emulators.sawyer.server import Emulator, serve
 from robot.readings import Box, Pose
 from tests.benchmarks.common import Line, duration
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import cv2
 
-from retrieval.build import build_index
-from retrieval.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.config import Config
-from retrieval.embed import BATCH
-from retrieval.encode import encode_photos
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.config import Config
+from retrieval.model.encode import encode_photos
+from retrieval.search.build import build_index
+from retrieval.search.embed import BATCH
 from tests import synthetic
 from tests.benchmarks.common import Line, as_text, in_turns, matcher_of
 

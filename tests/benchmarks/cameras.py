@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from robot.devices import TactileSensor, read_together
-from robot.drivers.opencv_tactile import OpencvTactile
-from robot.drivers.rectify import Rectifier, in_rgb
+from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.replay import VideoSensor
+from robot.drivers.video.rectify import Rectifier, in_rgb
 from tests.benchmarks.common import Line, duration
 from tests.fake_video import FakeCamera
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from retrieval.checkpoint import Checkpoint, load_checkpoint
-from retrieval.defaults import shipped_model
-from retrieval.export import graph_of
-from retrieval.onnx_encoder import ENDING, sealed
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.export import graph_of
+from retrieval.model.onnx_encoder import ENDING, sealed
+from retrieval.search.defaults import shipped_model
 from tests.benchmarks.common import Line
 from tests.benchmarks.query import STAGES, gel_images, write_index
 
@@ -33,10 +33,11 @@ def step(name, function):
     value = function()
     ms[name] = 1e3 * (time.perf_counter() - start)
     return value
-for name in ("numpy", "PIL.Image", "retrieval.cli", "retrieval.search", backend, "indexes.flat"):
+names = ("numpy", "PIL.Image", "retrieval.commands.cli", "retrieval.search.searcher", backend, "indexes.kinds.flat")
+for name in names:
     step("import " + name, lambda: import_module(name))
 from pathlib import Path
-import retrieval.search as search
+import retrieval.search.searcher as search
 generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: search.read_stored(Path(model)))
 encoder = step("make the encoder", lambda: search.exported_beside(stored) or search._torch_encoder(stored))
@@ -107,7 +108,7 @@ def _help(repetitions: int) -> Line:
     seconds = []
     for _ in range(repetitions + 1):
         start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "retrieval.cli", "--help"], capture_output=True, check=True)
+        subprocess.run([sys.executable, "-m", "retrieval.commands.cli", "--help"], capture_output=True, check=True)
         seconds.append(time.perf_counter() - start)
     median = 1e3 * statistics.median(seconds[1:])
     return Line("cold", "no tower", f"`retrieve --help` takes {median:.0f} ms", {"help_ms": median})

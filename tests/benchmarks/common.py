@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from retrieval.config import Config, load_config
-from retrieval.fusion import Matcher
+from retrieval.model.config import Config, load_config
+from retrieval.model.fusion import Matcher
 
 REPETITIONS = 5
 LEAST_S = 0.2

@@ -8,9 +8,9 @@ import dataclasses
 import json
 from collections.abc import Iterator
 
-from robot.sim.closed_forms import Check
-from robot.sim.frontier import Point, closed_form_table, closing_points, contact_points, stability_sweep
-from robot.sim.hard_cases import HardCase
+from retrieval.lab.contact.closed_forms import Check
+from retrieval.lab.frontier.contact import Point, closed_form_table, closing_points, contact_points, stability_sweep
+from retrieval.lab.hard_cases.contact import HardCase
 
 Row = Check | HardCase | Point
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from robot.cylinder import fit_cylinder
 from robot.errors import PlanError
+from robot.sight.cylinder import fit_cylinder
 from tests import views
 from tests.benchmarks.common import Line
 from tests.test_robot_cylinder import naive_fit

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from robot.drivers import wsg50_commands as commands
-from robot.drivers.wsg50 import WSG50
-from robot.drivers.wsg50_commands import Command
-from robot.drivers.wsg50_emulator import Emulator, serve_pty, serve_tcp
-from robot.drivers.wsg50_link import Link
+from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50.commands import Command
+from robot.drivers.wsg50.driver import WSG50
+from robot.drivers.wsg50.link import Link
+from robot.emulators.wsg50.server import Emulator, serve_pty, serve_tcp
 from tests.benchmarks.common import Line, duration
 
 PORTS = {"TCP": serve_tcp, "pty": serve_pty}

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from retrieval.config import Config
-from retrieval.encode import encode_photos, encode_touches, to_batch, touch_batch
-from retrieval.fusion import judge_of
+from retrieval.model.config import Config
+from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
+from retrieval.model.fusion import judge_of
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of, random_images
 
 BATCH = 16

@@ -40,19 +40,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from indexes.choice import ladder
 from indexes.errors import ParameterError
-from indexes.generation import Generation
-from indexes.spool import Block, Kept
-from indexes.store import IndexStore
-from retrieval import cli
-from retrieval.binomial import binomial_interval
-from retrieval.checkpoint import Checkpoint, load_checkpoint
-from retrieval.dataset import load_grasps
-from retrieval.defaults import shipped_model
-from retrieval.features import encode_recording
-from retrieval.fusion import judge_of
-from retrieval.judge import Judge
+from indexes.kinds.choice import ladder
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.spool import Block, Kept
+from retrieval.commands import cli
+from retrieval.data.dataset import load_grasps
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.fusion import judge_of
+from retrieval.model.judge import Judge
+from retrieval.search.defaults import shipped_model
+from retrieval.training.features import encode_recording
 from tests.benchmarks.common import duration
 
 KINDS = ("flat", "ivf_sq8", "ivf_pq", "hnsw")
@@ -67,7 +67,7 @@ JUDGED = 3e13
 
 PROBE = """
 import sys, time
-from indexes.store import IndexStore
+from indexes.store.folder import IndexStore
 import numpy as np
 def anonymous():
     return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1])

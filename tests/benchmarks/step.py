@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from retrieval.config import Config
-from retrieval.dataset import PairBatch
-from retrieval.encode import to_batch, touch_batch
-from retrieval.step import batch_loss
-from retrieval.train import set_training_mode
+from retrieval.data.dataset import PairBatch
+from retrieval.model.config import Config
+from retrieval.model.encode import to_batch, touch_batch
+from retrieval.training.step import batch_loss
+from retrieval.training.train import set_training_mode
 from tests.benchmarks.common import Line, as_text, duration, in_turns, matcher_of, random_images
 
 Index = np.ndarray

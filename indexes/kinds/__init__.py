@@ -1,0 +1,1 @@
+"""Vector indexes: their contract, the exact one, and those of FAISS."""

@@ -1,0 +1,74 @@
+"""What every vector must satisfy before it is stored or searched for."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from indexes.errors import ParameterError, VectorError
+from indexes.kinds.scores import Doubles, Floats
+
+NORM_TOLERANCE = 1e-3
+"""Largest distance of a norm from 1. The rounding of float32 is 1e-7, of float16 storage 5e-4."""
+
+BLOCK_ROWS = 8192
+
+
+def check_unit(
+    vectors: object, *, dim: int | None = None, names: Sequence[str] | None = None, what: str = "row"
+) -> Floats:
+    """`vectors` as a C-contiguous (M, d) float32 array of finite unit vectors, or `VectorError`.
+
+    `names` gives the M names used in messages (default: the row numbers); `what` is the word before the name.
+    """
+    table = _check_shape(vectors, dim, what)
+    if names is not None and len(names) != len(table):
+        raise VectorError(f"as many vectors as {what} names are needed; got {len(table)} and {len(names)}")
+    norms = row_norms(table)
+    bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
+    if bad.size:
+        number = int(bad[0])
+        name = str(number) if names is None else names[number]
+        fault = _fault(table[number], float(norms[number]))
+        more = f" ({bad.size - 1} more like it)" if bad.size > 1 else ""
+        raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; {fault}{more}", name)
+    return table
+
+
+def check_k(k: int) -> int:
+    """`k`, a count of results of at least 1, or `ParameterError`."""
+    if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
+        raise ParameterError(f"k, the number of results, must be a whole number of at least 1; got {k!r}")
+    return int(k)
+
+
+def row_norms(table: Floats) -> Doubles:
+    """Euclidean norms (M,) in float64; NaN and infinite where a row is."""
+    norms = np.empty(len(table), dtype=np.float64)
+    for start in range(0, len(table), BLOCK_ROWS):
+        block = table[start : start + BLOCK_ROWS].astype(np.float64)
+        norms[start : start + BLOCK_ROWS] = np.sqrt(np.einsum("nd,nd->n", block, block))
+    return norms
+
+
+def _check_shape(vectors: object, dim: int | None, what: str) -> Floats:
+    if not isinstance(vectors, np.ndarray) or vectors.ndim != 2 or vectors.dtype != np.float32:
+        got = " ".join(str(getattr(vectors, name, "")) for name in ("dtype", "shape")).strip()
+        raise VectorError(f"{what} vectors must be float32 of shape (count, size); got {got or type(vectors).__name__}")
+    if vectors.shape[1] == 0:
+        raise VectorError(f"{what} vectors must have at least one component; got shape {vectors.shape}")
+    if dim is not None and vectors.shape[1] != dim:
+        raise VectorError(
+            f"{what} vectors must have {dim} components, the size of the index; got {vectors.shape[1]}. "
+            "Was the index built with another model?"
+        )
+    return np.ascontiguousarray(vectors)
+
+
+def _fault(row: Floats, norm: float) -> str:
+    if np.isnan(row).any():
+        return "it holds NaN (not a number)"
+    if np.isinf(row).any():
+        return "it holds an infinite component"
+    if norm == 0.0:
+        return "the vector is zero"
+    return f"got {norm:.6g}"

@@ -1,0 +1,20 @@
+"""The oracle: every vector scored against every query, in numpy alone.
+
+It scores in float64 and reads all vectors for each search; `flat` gives the same answer many times faster.
+"""
+
+from typing import ClassVar
+
+from indexes.kinds.base import VectorIndex
+from indexes.kinds.scores import Floats, Mask, Slots, scan
+
+
+class ExactIndex(VectorIndex):
+    """Exact search without a structure: the vectors are the index."""
+
+    kind: ClassVar[str] = "exact"
+    exact: ClassVar[bool] = True
+    structure_file: ClassVar[bool] = False
+
+    def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
+        return scan(self._vectors, queries, k, live)

@@ -1,0 +1,188 @@
+"""What the FAISS kinds share: FAISS names the candidates, `indexes.kinds.scores` scores and orders them."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+import faiss as _faiss
+import numpy as np
+
+from indexes.errors import CorruptIndex, EngineError
+from indexes.kinds.base import VectorIndex
+from indexes.kinds.scores import Doubles, Floats, Mask, Slots, best, grid_scores, on_grid, scan, slack
+from indexes.kinds.stack import blocks_of, parts_of
+
+faiss: Any = _faiss
+"""The library, untyped: its stubs leave out half of it."""
+
+GROWTH = 4
+"""How much further each round looks than the one before."""
+
+MOST_SCANNED = 0.10
+"""Share of the vectors that may stand outside the structure, to be scanned by every search, before it takes them in."""
+
+ADDED_ROWS = 1 << 16
+"""Vectors given to FAISS at once."""
+
+
+@contextmanager
+def guarded(doing: str, threads: int | None) -> Iterator[None]:
+    """Run FAISS with `threads` threads (None: its own setting) and turn what it raises into `EngineError`."""
+    before = faiss.omp_get_max_threads()
+    if threads is not None:
+        faiss.omp_set_num_threads(threads)
+    try:
+        yield
+    except (RuntimeError, AssertionError, ValueError, TypeError, MemoryError) as error:
+        raise EngineError(f"FAISS failed while {doing}: {error or type(error).__name__}") from error
+    finally:
+        faiss.omp_set_num_threads(before)
+
+
+class FaissIndex(VectorIndex):
+    """A kind whose candidates come from a FAISS structure over the first slots and a scan of the others.
+
+    Rounds: structure and scan name some candidates; they are scored and ordered exactly; a query is settled when
+    k live ones are there and, for an exact kind, no slot outside can reach the last of them. The unsettled
+    look `GROWTH` times further, and once everything would be asked for the vectors are scanned instead.
+
+    Vectors that are added stand outside the structure until they are `MOST_SCANNED` of all; then a copy of it takes
+    them in. So an index may share its structure with the one that it was copied from.
+    """
+
+    structure_type: ClassVar[str]
+    """Name of the FAISS class."""
+    build_threads: ClassVar[int | None] = None
+    """Threads of a build unless the caller names a number."""
+
+    _structure: Any = None
+    _scanned: list[Floats]
+    """The vectors outside the structure, in arrays that follow one another."""
+
+    @property
+    def covered(self) -> int:
+        """How many leading vectors the structure holds; those after them are scanned."""
+        return 0 if self._structure is None else int(self._structure.ntotal)
+
+    def shares_structure(self, other: VectorIndex) -> bool:
+        """Whether both search one structure; False for a kind that has none."""
+        return isinstance(other, FaissIndex) and self._structure is not None and self._structure is other._structure
+
+    def _make(self) -> Any:
+        """An empty, untrained structure for the resolved parameters."""
+        raise NotImplementedError
+
+    def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
+        """The structure's own scores and slots (Q, fetch), best first, -1 where it found none.
+
+        `effort` is 1 in the first round and grows; a kind that can look further multiplies by it.
+        """
+        raise NotImplementedError
+
+    def _training(self) -> Floats:
+        """The vectors to train the structure on."""
+        return np.ascontiguousarray(self._vectors[:])
+
+    def _first_fetch(self, k: int) -> int:
+        """How many candidates the first round asks for when every slot is live."""
+        return k
+
+    def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
+        scores = np.empty((len(queries), k), dtype=np.float32)
+        slots = np.empty((len(queries), k), dtype=np.int64)
+        dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
+        fetch, effort = math.ceil(self._first_fetch(k) * dilution), 1
+        pending = np.arange(len(queries))
+        while pending.size and fetch < self.count:
+            with guarded("searching", 1 if len(pending) == 1 else self.threads):
+                rough, found = self._named(queries[pending], fetch, effort)
+            gridded, open_still = on_grid(queries[pending]), []
+            for place, query in enumerate(pending):
+                ranked = self._rescored(gridded[place], found[place], k, live)
+                if self._settled(ranked[0], rough[place], k):
+                    scores[query], slots[query] = ranked
+                else:
+                    open_still.append(query)
+            pending = np.array(open_still, dtype=np.int64)
+            fetch, effort = fetch * GROWTH, effort * GROWTH
+        if pending.size:
+            scores[pending], slots[pending] = scan(self._vectors, queries[pending], k, live)
+        return scores, slots
+
+    def _named(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
+        """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
+        parts, first = [], self.covered
+        if first:
+            parts.append(self._candidates(queries, min(fetch, first), effort))
+        for vectors in self._scanned:
+            rough, found = faiss.knn(queries, vectors, min(fetch, len(vectors)), faiss.METRIC_INNER_PRODUCT)
+            parts.append((rough, found + first))
+            first += len(vectors)
+        if len(parts) == 1:
+            return parts[0]
+        rough, found = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
+        order = np.argsort(-rough, axis=1, kind="stable")[:, :fetch]
+        return np.take_along_axis(rough, order, axis=1), np.take_along_axis(found, order, axis=1)
+
+    def _rescored(self, query: Doubles, found: Slots, k: int, live: Mask | None) -> tuple[Floats, Slots]:
+        kept = found[found >= 0]
+        if live is not None:
+            kept = kept[live[kept]]
+        return best(grid_scores(query, on_grid(self._vectors[kept])), kept, k)
+
+    def _settled(self, scores: Floats, rough: Floats, k: int) -> bool:
+        if len(scores) < k:
+            return False
+        return not self.exact or float(scores[-1]) > float(rough.min()) + slack(self.dim)
+
+    def _building_threads(self) -> int | None:
+        return self.build_threads if self.threads is None else self.threads
+
+    def _build(self) -> None:
+        with guarded(f"building {self.kind}", self._building_threads()):
+            self._structure = self._make()
+            if not self._structure.is_trained:
+                self._structure.train(self._training())
+        self._take_in()
+
+    def _grown(self) -> None:
+        if self.count - self.covered > MOST_SCANNED * self.count:
+            with guarded(f"copying {self.kind}", None):
+                self._structure = faiss.clone_index(self._structure)
+            self._take_in()
+        self._set_scanned()
+
+    def _take_in(self) -> None:
+        """Give the structure the vectors that it does not have."""
+        with guarded(f"adding to {self.kind}", self._building_threads()):
+            for block in blocks_of(self._vectors[self.covered :], ADDED_ROWS):
+                self._structure.add(np.ascontiguousarray(block))
+        self._set_scanned()
+
+    def _set_scanned(self) -> None:
+        rest = self.covered
+        self._scanned = []
+        for part in parts_of(self._vectors):
+            if len(part) > rest:
+                self._scanned.append(part[rest:])
+            rest = max(0, rest - len(part))
+
+    def _write(self, path: Path) -> None:
+        with guarded(f"writing {path}", None):
+            faiss.write_index(self._structure, str(path))
+
+    def _read(self, path: Path, covered: int) -> None:
+        try:
+            structure = faiss.read_index(str(path))
+        except Exception as error:
+            raise CorruptIndex(f"{path}: FAISS cannot read it; build the index again ({error})") from error
+        got = (type(structure).__name__, structure.ntotal, structure.d, structure.metric_type)
+        must = (self.structure_type, covered, self.dim, faiss.METRIC_INNER_PRODUCT)
+        if got != must:
+            raise CorruptIndex(
+                f"{path}: must hold (type, count, size, metric) {must}, holds {got}; build the index again"
+            )
+        self._structure = structure
+        self._set_scanned()

@@ -1,0 +1,28 @@
+"""FAISS exact search: the default stored kind."""
+
+from typing import ClassVar
+
+from indexes.kinds.faiss_index import FaissIndex
+
+SPARE = 16
+"""Candidates beyond k in the first round, so that rounding at the last rank rarely needs a second one."""
+
+
+class FlatIndex(FaissIndex):
+    """Every vector is compared in float32, and whatever could be among the best k is scored again exactly.
+
+    There is no structure: FAISS scans the vectors where they lie.
+    """
+
+    kind: ClassVar[str] = "flat"
+    exact: ClassVar[bool] = True
+    structure_file: ClassVar[bool] = False
+
+    def _build(self) -> None:
+        self._set_scanned()
+
+    def _grown(self) -> None:
+        self._set_scanned()
+
+    def _first_fetch(self, k: int) -> int:
+        return k + SPARE

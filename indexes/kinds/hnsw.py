@@ -1,0 +1,49 @@
+"""FAISS graph search (Malkov and Yashunin, arXiv 1603.09320)."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from indexes.kinds import base
+from indexes.kinds.faiss_index import FaissIndex, faiss
+from indexes.kinds.scores import Floats, Slots
+
+
+@dataclass(frozen=True)
+class HNSWParameters(base.Parameters):
+    """Links per node (`neighbours`, M in the paper); breadth of the search when building and asking."""
+
+    neighbours: int = 32
+    ef_construction: int = 80
+    ef_search: int = 64
+
+    def __post_init__(self) -> None:
+        self.check("neighbours", "ef_construction", "ef_search")
+
+
+class HNSWIndex(FaissIndex):
+    """A graph of neighbours. Copies of one vector hide the rest of it, so give it distinct vectors.
+
+    It is built on one thread unless told otherwise: with more, the graph depends on their timing.
+    """
+
+    kind: ClassVar[str] = "hnsw"
+    structure_type: ClassVar[str] = "IndexHNSWFlat"
+    build_threads: ClassVar[int | None] = 1
+    search_settings: ClassVar[frozenset[str]] = frozenset({"ef_search"})
+    parameters_type: ClassVar[type[base.Parameters]] = HNSWParameters
+    parameters: HNSWParameters
+
+    def _make(self) -> Any:
+        structure = faiss.IndexHNSWFlat(self.dim, self.parameters.neighbours, faiss.METRIC_INNER_PRODUCT)
+        structure.hnsw.efConstruction = self.parameters.ef_construction
+        return structure
+
+    def _take_in(self) -> None:
+        # A graph read from disk has lost its generator: seed it by what is there, read or not.
+        self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self.covered)
+        super()._take_in()
+
+    def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
+        breadth = max(fetch, self.parameters.ef_search * effort)
+        rough, found = self._structure.search(queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth))
+        return rough, found

@@ -1,0 +1,261 @@
+"""The index on disk: a folder of generations, of which one is current.
+
+    CURRENT               the name of the current generation; the only file ever replaced
+    gen-000007/           a generation: written beside, checked, renamed into place, never changed afterwards
+      manifest.json       what it is, and size and SHA-256 of every other file; written last
+      rows-000005.jsonl   rows as lines of JSON: one file for each segment, named by the generation that wrote it
+      table-000005.npy    slot, bytes and keys of each of those lines (see `indexes.store.rows`)
+      NAME-000005.npy     per-row arrays
+      embeddings-000005.npy   (slots, d) float32, from which any kind of index is built
+      order.npy           which rows are shown and in which order, where that is not all of them as they lie
+      vectors.faiss       the structure of the index, for kinds that have one
+      NAME.json           documents
+    LOCK                  held by the writer
+    unfinished/           what a build had embedded when it was cut off, of no generation (see
+    `indexes.store.unfinished`)
+
+A file of a segment never changes. A generation made from a parent gives the parent's files a second name (a hard link)
+and writes what is new; rows that are gone stay in their segments until they are a tenth of all. Small segments are
+joined as they come (see `indexes.kinds.stack.segments_kept`).
+
+One writer, many readers. A writer killed at any moment leaves the old or the new generation current, whole;
+the next writer sweeps up what the killed one left.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from os import getpid
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from indexes import load_kind
+from indexes.errors import AGAIN, CorruptIndex, NoIndex, RowError, WriteFailed
+from indexes.kinds.base import Parameters
+from indexes.kinds.scores import Floats
+from indexes.store import files
+from indexes.store.generation import Generation, read_generation
+from indexes.store.locking import WriterLock
+from indexes.store.regular import read_regular
+from indexes.store.spool import Block, Kept, check_documents
+from indexes.store.writing import Job, Settle, write_generation
+
+GENERATION = re.compile(r"gen-(\d{6,})")
+LEFT = re.compile(r"(gen-\d{6,}|CURRENT)\.tmp-\d+")
+"""What killed writers leave: unfinished and half-deleted generations, and files beside CURRENT."""
+
+
+class IndexStore:
+    """The index in the folder `path`, which need not exist before the first `write`.
+
+    >>> import numpy as np
+    >>> store = indexes.IndexStore("photos")
+    >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
+    >>> store.write(rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": "abc"}).name
+    'gen-000001'
+    >>> store.open(expect={"checkpoint": "abc"}).count
+    2
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._lock = WriterLock(self.path / "LOCK")
+
+    def open(
+        self, *, verify: bool = True, expect: Mapping[str, str] | None = None, threads: int | None = None
+    ) -> Generation:
+        """The current generation, checked whole.
+
+        `verify` False leaves out the SHA-256 of the files (sizes are still checked). `expect` names values
+        that the fingerprint must have. `threads` is the number used by searches.
+
+        Raises `NoIndex`, `CorruptIndex`, `UnsupportedFormat`, or `MismatchedIndex` (see `indexes.errors`).
+        """
+        name = self.current()
+        try:
+            generation = self._read(name, verify, threads)
+        except CorruptIndex:
+            newer = self.current()
+            if newer == name:
+                raise
+            generation = self._read(newer, verify, threads)  # a writer replaced it while it was being read
+        generation.require(expect or {})
+        return generation
+
+    def current(self) -> str:
+        """The name of the current generation, as CURRENT says."""
+        path = self.path / "CURRENT"
+        try:
+            text = read_regular(path).decode("ascii", "replace").strip()
+        except FileNotFoundError as error:
+            raise NoIndex(f"{self.path}: there is no index here; run `retrieve build-index` first") from error
+        except OSError as error:
+            raise NoIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+        if not GENERATION.fullmatch(text):
+            raise CorruptIndex(f"{path}: must name a generation such as gen-000001, holds {text!r}; {AGAIN}")
+        return text
+
+    def lock(self) -> WriterLock:
+        """`with store.lock():` keeps other writers out over several steps, `write` among them."""
+        return self._lock
+
+    def write(
+        self,
+        rows: Sequence[Mapping[str, Any]],
+        embeddings: Floats | None,
+        arrays: Mapping[str, NDArray[Any]] | None = None,
+        documents: Mapping[str, Any] | None = None,
+        **settings: Any,
+    ) -> Generation:
+        """Write a new generation holding exactly `rows`, make it current, and return it opened.
+
+        rows         JSON objects with a distinct text "id", and a "digest" of the content for later reuse
+        embeddings   (F, d) float32 unit vectors; arrays: name -> (F, ...) finite numbers
+        documents    name -> JSON; never taken over from the parent
+        settings     those of `write_blocks`. Rows that `parent.reusable` gives for their ids and digests keep its
+                     vectors and arrays, and F counts only the other rows, in their order (embeddings may be None
+                     when F = 0). Without a parent, F is the number of rows.
+        """
+        return self.write_blocks([Block(rows, embeddings, arrays or {})], documents, **settings)
+
+    def write_blocks(
+        self,
+        blocks: Iterable[Block | Kept],
+        documents: Mapping[str, Any] | None = None,
+        *,
+        fingerprint: Mapping[str, str],
+        about: Mapping[str, Any] | None = None,
+        kind: str = "flat",
+        parameters: Parameters | None = None,
+        parent: Generation | None = None,
+        software: str = "",
+        seed: int = 0,
+        threads: int | None = None,
+        settle: Settle | None = None,
+        queries: Floats | None = None,
+        self_check: int = 256,
+        keep: int = 2,
+    ) -> Generation:
+        """As `write`, from blocks of rows that are put on the disk as they come: memory holds one of them.
+
+        fingerprint  what made the vectors; `open(expect=...)` compares it
+        about        anything else for the manifest
+        parent       a generation to take rows over from, as `Block` and `Kept` say
+        software     version that writes
+        settle       chooses kind, parameters and more of `about` instead, once all rows are on the disk
+        queries      (Q, d) unit vectors to measure recall with; None draws them near the index's own
+        self_check   rows that must find themselves before the switch (see `Generation.self_check`)
+        keep         generations before the new one that stay on disk for readers that are just opening them
+
+        Raises `RowError`, `VectorError`, `ParameterError`, `MismatchedIndex` for bad input, `LockedIndex`
+        while another writer works, `SelfRetrievalFailed`, and then the index is as it was; `WriteFailed` when
+        the disk refuses, and then it is the old one or the new one, whole.
+        """
+        job = Job(
+            documents=check_documents(documents or {}),
+            fingerprint=dict(fingerprint),
+            about=dict(about or {}),
+            kind=load_kind(kind),
+            asked=load_kind(kind).asked(parameters),
+            parent=parent,
+            software=software,
+            seed=seed,
+            threads=threads,
+            settle=settle,
+            queries=queries,
+        )
+        check_about(fingerprint, about or {})
+        self._require_ours()
+        with self._lock, self._writing():
+            self._sweep()
+            return self._publish(self._next_number(), blocks, job, self_check, keep)
+
+    def _require_ours(self) -> None:
+        """A file called CURRENT in a folder without a generation is not of an index, and would be replaced."""
+        path = self.path / "CURRENT"
+        try:
+            if not self._numbers() and read_regular(path).strip():
+                raise NoIndex(f"{path} is not of an index, and is left as it is; give another folder for the index")
+        except (FileNotFoundError, NotADirectoryError):  # where a file lies in its place, the lock says so
+            return
+        except OSError as error:
+            raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
+
+    def _publish(self, number: int, blocks: Iterable[Block | Kept], job: Job, self_check: int, keep: int) -> Generation:
+        name = generation_name(number)
+        folder = self.path / f"{name}.tmp-{getpid()}"
+        try:
+            folder.mkdir()
+            write_generation(folder, name, number, blocks, job)
+            generation = read_generation(folder, verify=False, threads=job.threads)  # the digests were just taken
+            generation.self_check(self_check)
+            folder.rename(self.path / name)
+        except BaseException:
+            _discard(folder)
+            raise
+        files.sync(self.path)
+        files.replace_text(self.path / "CURRENT", f"{name}\n")
+        generation.folder = self.path / name
+        self._forget(keep)
+        return generation
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            where = error.filename or self.path
+            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
+
+    def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
+        folder = self.path / name
+        if not folder.is_dir():
+            raise CorruptIndex(f"{self.path}: CURRENT names {name}, which is missing; {AGAIN}")
+        generation = read_generation(folder, verify=verify, threads=threads)
+        if generation.name != name:
+            raise CorruptIndex(f"{folder}: the manifest is that of {generation.name}; {AGAIN}")
+        return generation
+
+    def _numbers(self) -> list[int]:
+        found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
+        return sorted(int(match[1]) for match in found if match)
+
+    def _next_number(self) -> int:
+        return max(self._numbers(), default=0) + 1
+
+    def _sweep(self) -> None:
+        """Delete what killed writers left, and nothing else."""
+        for path in [path for path in self.path.iterdir() if LEFT.fullmatch(path.name)]:
+            if path.is_dir() and not path.is_symlink():
+                files.remove_folder(path)
+            else:
+                path.unlink()
+
+    def _forget(self, keep: int) -> None:
+        """Delete all generations but the newest and `keep` before it."""
+        numbers = self._numbers()
+        for number in numbers[: max(0, len(numbers) - 1 - keep)]:
+            _discard(self.path / generation_name(number))
+
+
+def generation_name(number: int) -> str:
+    """The name of a generation, such as gen-000007."""
+    return f"gen-{number:06d}"
+
+
+def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> None:
+    """The fingerprint is text, and `about` JSON; or `RowError`."""
+    odd = [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]
+    if odd:
+        raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
+    files.check_json(dict(about), "about")
+
+
+def _discard(folder: Path) -> None:
+    """Delete a folder that nobody needs; what cannot be deleted is left for the next writer."""
+    try:
+        files.remove_folder(folder)
+    except OSError:
+        return

@@ -1,0 +1,321 @@
+"""One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes import load_kind
+from indexes.errors import (
+    AGAIN,
+    CorruptIndex,
+    IndexesError,
+    MismatchedIndex,
+    ParameterError,
+    SelfRetrievalFailed,
+    UnsupportedFormat,
+)
+from indexes.kinds.base import VectorIndex
+from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, row_norms
+from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
+from indexes.kinds.stack import Vectors, blocks_of, parts_of, stacked
+from indexes.store.manifest import Manifest, check_files, read_manifest
+from indexes.store.regular import read_json
+from indexes.store.rows import RECORD, Records, Rows, Segment, keys_of
+
+STRUCTURE, ORDER = "vectors.faiss", "order.npy"
+SHOWN_IDS = 5
+CHECKED = 1000
+
+
+class Generation:
+    """What a reader holds. It stays usable, arrays and all, when writers replace and delete it on the disk.
+
+    rows        the N rows as they were written, in their order, each parsed when it is asked for
+    slots       (N,) int64, the slot of each row; rows with equal vectors share one
+    embeddings  (S, d) float32 unit vectors, one for each slot, memory-mapped
+    arrays      name -> (N, ...) per-row array, memory-mapped; an array, or a `Stack` of several
+    documents   name -> JSON document
+    manifest    what `manifest.json` says
+    index       the vector index over the slots
+    identities  file name -> the file that was opened, as `file_identity` says
+
+    >>> import numpy as np
+    >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
+    >>> generation = indexes.IndexStore("searched").write(rows, np.eye(2, dtype=np.float32), fingerprint={})
+    >>> numbers, scores = generation.search(np.float32([[0.6, 0.8]]), 1)[0]
+    >>> generation.rows[int(numbers[0])]["object_id"], round(float(scores[0]), 3)
+    ('tin', 0.8)
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        manifest: Manifest,
+        records: Records,
+        order: Slots | None,
+        embeddings: Vectors,
+        documents: Mapping[str, Any],
+        index: VectorIndex,
+        identities: Mapping[str, tuple[int, int]],
+    ) -> None:
+        self.folder, self.manifest, self.records = folder, manifest, records
+        self.rows = Rows(records, np.arange(len(records)) if order is None else order)
+        self.embeddings, self.documents, self.index, self.identities = embeddings, documents, index, identities
+        self.arrays: dict[str, Any] = {name: records.array(name, order) for name in manifest.arrays}
+        self.slots: Slots = records.column("slot", order)
+        self._by_slot = np.argsort(self.slots, kind="stable")
+        self._per_slot = np.bincount(self.slots, minlength=len(embeddings))
+        self._starts = np.cumsum(self._per_slot) - self._per_slot
+        self._live: Mask | None = None if self._per_slot.all() else self._per_slot > 0
+
+    @property
+    def name(self) -> str:
+        """The generation's name, such as gen-000007."""
+        return self.manifest.generation
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def dim(self) -> int:
+        """Number of components of a vector."""
+        return self.manifest.dim
+
+    @property
+    def fingerprint(self) -> dict[str, str]:
+        """What made the vectors."""
+        return self.manifest.fingerprint
+
+    def require(self, expect: Mapping[str, str]) -> None:
+        """Check that the fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
+        for key, value in expect.items():
+            got = self.fingerprint.get(key)
+            if got != value:
+                raise MismatchedIndex(
+                    f"{self.folder.parent}: the index was made with {key} {got and got[:12]!r}, "
+                    f"asked for is {value[:12]!r}; "
+                    f"use what made it, or {AGAIN}"
+                )
+
+    def row_number(self, row_id: str) -> int:
+        """The number of the row with that id; KeyError where there is none."""
+        number = int(self.rows.find([row_id])[0])
+        if number < 0:
+            raise KeyError(row_id)
+        return number
+
+    def codes(self, field: str) -> Slots:
+        """For each row (N,) a number that rows share when their `field` is the same text; no row is parsed.
+
+        field is one of `indexes.store.rows.KEYS`; numbers count up from 0 in the order of the rows that have them
+        first.
+        """
+        _, first, code = np.unique(self.rows.keys(field), return_index=True, return_inverse=True)
+        rank = np.empty(len(first), np.int64)
+        rank[np.argsort(first)] = np.arange(len(first))
+        return rank[code]
+
+    def search(self, queries: Floats, k: int) -> list[tuple[Slots, Floats]]:
+        """For each unit query (Q, d) the rows of the best k slots: row numbers (n,) and scores (n,) float32.
+
+        A slot stands for all its rows, so n may exceed k. Order: (-score, id).
+        """
+        scores, slots = self.index.search(queries, k + 1, self._live)
+        return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
+
+    def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
+        """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
+        numbers, keys = self.rows.find(ids), keys_of(digests)
+        same = (keys != b"") & (keys == self._digests[numbers])
+        return np.where((numbers >= 0) & same, numbers, -1)
+
+    def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
+        """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
+        numbers = self.matching(list(wanted), wanted.values()).tolist()
+        return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
+
+    def self_check(self, sample: int = 256, seed: int = 0) -> None:
+        """Search for the vectors of `sample` rows; `SelfRetrievalFailed` names those that do not come first.
+
+        A row passes when its slot, or one that scores as high (a near-copy), is at rank 1. Where a search for one
+        misses it, one for a hundredth of all rows may find it: candidates are asked for by the hundred, and codes
+        cannot tell near-copies apart.
+        """
+        drawn = np.random.default_rng(seed).permutation(self.count)[:sample]
+        for k in sorted({1, max(1, min(CHECKED, self.count // 100))}):
+            drawn = self._lost(drawn, k)
+        lost = sorted(self.rows.ids(drawn))
+        if lost:
+            shown = ", ".join(lost[:SHOWN_IDS]) + (", ..." if len(lost) > SHOWN_IDS else "")
+            raise SelfRetrievalFailed(
+                f"{len(lost)} of {min(sample, self.count)} rows do not find themselves in the {self.manifest.kind} "
+                f"index ({shown}); choose the kind flat, or a broader search",
+                lost,
+            )
+
+    def _lost(self, numbers: Slots, k: int) -> Slots:
+        """Those of the rows for whose vectors a search for k slots puts a worse one first."""
+        if not len(numbers):
+            return numbers
+        own = np.ascontiguousarray(self.embeddings[self.slots[numbers]])
+        top = self.index.search(own, k, self._live)[0][:, 0]
+        must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
+        return numbers[top < must]
+
+    def file_bytes(self, name: str) -> memoryview:
+        """The bytes of a file of a segment, whether it is still on the disk or not."""
+        numbers = self.manifest.segments
+        held: dict[str, NDArray[Any]] = {}
+        for number, segment in zip(numbers["records"], self.records.segments, strict=True):
+            columns = {"rows": segment.text, "table": segment.table} | dict(segment.arrays)
+            held |= {segment_name(column, number): array for column, array in columns.items()}
+        for number, part in zip(numbers["vectors"], parts_of(self.embeddings), strict=True):
+            held[segment_name("embeddings", number)] = part
+        array = held[name]
+        while isinstance(array.base, np.ndarray):
+            array = array.base
+        return memoryview(array.base)  # type: ignore[arg-type]  # the mapping of the whole file
+
+    @cached_property
+    def _digests(self) -> NDArray[np.bytes_]:
+        return self.rows.keys("digest")
+
+    def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
+        """The rows of the best k of k + 1 slots; where slots tie for the last place, their ids say which stays."""
+        wanted = k
+        while len(scores) > wanted and scores[wanted] == scores[k - 1]:
+            wanted *= 2
+            found_scores, found = self.index.search(query[None], wanted + 1, self._live)
+            scores, slots = found_scores[0], found[0]
+        if wanted == k:
+            return self._expanded(scores[:k], slots[:k])
+        rows, spread = self._expanded(scores, slots)
+        _, first = np.unique(self.slots[rows], return_index=True)
+        stay = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
+        return rows[stay], spread[stay]
+
+    def _expanded(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
+        """All rows of slots in the order of their scores, and their scores; equal scores in the order of ids."""
+        counts = self._per_slot[slots]
+        spread = np.repeat(scores, counts)
+        inside = np.arange(len(spread)) - np.repeat(np.cumsum(counts) - counts, counts)
+        rows = self._by_slot[np.repeat(self._starts[slots], counts) + inside]
+        edges = np.flatnonzero(np.diff(spread)) + 1
+        starts, ends = np.concatenate([[0], edges]), np.append(edges, len(spread))
+        tied = ends - starts > 1
+        for start, end in zip(starts[tied], ends[tied], strict=True):
+            ids = self.rows.ids(rows[start:end])
+            rows[start:end] = rows[start:end][sorted(range(len(ids)), key=ids.__getitem__)]
+        return rows, spread
+
+
+def segment_name(what: str, number: int) -> str:
+    """The file of a segment: of "rows", "table", "embeddings" or an array, written by generation `number`."""
+    return f"{what}-{number:06d}.{'jsonl' if what == 'rows' else 'npy'}"
+
+
+def file_identity(path: Path) -> tuple[int, int]:
+    """What tells one file from another under the same name."""
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def mapped(path: Path) -> NDArray[Any]:
+    """The array in a file, memory-mapped."""
+    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    return array
+
+
+def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:
+    """Open a generation's folder, checked as `IndexStore.open` says."""
+    manifest = read_manifest(folder)
+    _require_listed(folder, manifest)
+    check_files(folder, manifest, verify=verify)
+    try:
+        identities = {name: file_identity(folder / name) for name in manifest.files}
+        records = Records([_segment(folder, manifest, number) for number in manifest.segments["records"]])
+        order = mapped(folder / ORDER) if ORDER in manifest.files else None
+        names = [segment_name("embeddings", number) for number in manifest.segments["vectors"]]
+        embeddings = stacked([mapped(folder / name) for name in names])
+        documents = {name: read_json(folder / f"{name}.json") for name in manifest.documents}
+        _check_counts(manifest, records, order, embeddings)
+        if verify:
+            _check_vectors(folder, embeddings)
+        index = _read_index(folder, manifest, embeddings, threads)
+        return Generation(folder, manifest, records, order, embeddings, documents, index, identities)
+    except ParameterError as error:
+        raise UnsupportedFormat(f"{folder}: {error}. Update the software, or {AGAIN}") from error
+    except IndexesError:
+        raise
+    except Exception as error:  # damaged files raise anything: OSError, ValueError, KeyError, SyntaxError
+        raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
+
+
+def _require_listed(folder: Path, manifest: Manifest) -> None:
+    """Every file that is opened is among those that are checked."""
+    needed = {f"{name}.json" for name in manifest.documents}
+    needed |= {segment_name("embeddings", number) for number in manifest.segments["vectors"]}
+    for number in manifest.segments["records"]:
+        needed |= {segment_name(what, number) for what in ("rows", "table", *manifest.arrays)}
+    if lacking := sorted(needed - set(manifest.files)):
+        raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
+
+
+def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
+    # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
+    text = np.asarray(np.memmap(folder / segment_name("rows", number), np.uint8, "r"))
+    table = np.asarray(mapped(folder / segment_name("table", number)))
+    arrays = {name: mapped(folder / segment_name(name, number)) for name in manifest.arrays}
+    must = {"fields": RECORD, "bytes of text": len(text)} | dict.fromkeys(arrays, len(table))
+    got = {"fields": table.dtype, "bytes of text": int(table["stop"][-1])}
+    got |= {name: len(array) for name, array in arrays.items()}
+    if got != must:
+        raise CorruptIndex(f"{folder}: segment {number} must hold {must}, holds {got}; {AGAIN}")
+    starts, stops = table["start"], table["stop"]
+    if starts.min() < 0 or stops.max() > len(text) or not (starts < stops).all():
+        raise CorruptIndex(f"{folder}: the lines of segment {number} must lie in its text, and do not; {AGAIN}")
+    return Segment(text, table, arrays)
+
+
+def _check_vectors(folder: Path, embeddings: Vectors) -> None:
+    for block in blocks_of(embeddings, BLOCK_ROWS):
+        if not (np.abs(row_norms(block) - 1.0) <= NORM_TOLERANCE).all():
+            raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
+
+
+def _check_counts(manifest: Manifest, records: Records, order: Slots | None, embeddings: Vectors) -> None:
+    counts = manifest.counts
+    if order is not None and (order.dtype != np.int64 or order.min() < 0 or order.max() >= len(records)):
+        raise CorruptIndex(f"{manifest.generation}: the order must name records 0 to {len(records) - 1}; {AGAIN}")
+    slots = records.column("slot", order)
+    if slots.min() < 0 or slots.max() >= counts.slots:
+        raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")
+    got = {
+        "rows": len(slots),
+        "records": len(records),
+        "slots": len(embeddings),
+        "tombstones": counts.slots - int(np.count_nonzero(np.bincount(slots))),
+        "components": embeddings.shape[1],
+    }
+    must = {
+        "rows": counts.rows,
+        "records": counts.records,
+        "slots": counts.slots,
+        "tombstones": counts.tombstones,
+        "components": manifest.dim,
+    }
+    if got != must:
+        raise CorruptIndex(f"{manifest.generation}: the manifest says {must}, the files hold {got}; {AGAIN}")
+
+
+def _read_index(folder: Path, manifest: Manifest, embeddings: Vectors, threads: int | None) -> VectorIndex:
+    kind = load_kind(manifest.kind)
+    parameters = kind.parameters_from(manifest.parameters)
+    path, covered = folder / STRUCTURE if kind.structure_file else None, manifest.counts.structure_slots
+    return kind.load(path, embeddings, parameters, covered=covered, seed=manifest.seed, threads=threads)

@@ -1,0 +1,207 @@
+"""`manifest.json`: what a generation is and what its files must be."""
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
+from indexes.store.files import digest, durable, encoded
+from indexes.store.regular import open_regular, read_json
+
+FORMAT = 2
+NAME = "manifest.json"
+_NUMBER = range(10**9)
+_WORD = re.compile(r"[a-z][a-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Rows; records (those that no row shows any more too); slots (distinct vectors); tombstones (slots without a row).
+
+    built_slots were there when the structure was trained, structure_slots are in it; those after them are scanned.
+    """
+
+    rows: int
+    records: int
+    slots: int
+    tombstones: int
+    built_slots: int
+    structure_slots: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The fields of the file, in its order. `asked` are the parameters before None was filled in.
+
+    segments: "records" and "vectors" -> the numbers of the generations that wrote their segments, in order.
+    """
+
+    generation: str
+    parent: str | None
+    created: str
+    software: str
+    fingerprint: dict[str, str]
+    about: dict[str, Any]
+    dim: int
+    metric: str
+    kind: str
+    parameters: dict[str, Any]
+    asked: dict[str, Any]
+    seed: int
+    recall: dict[str, Any]
+    counts: Counts
+    segments: dict[str, list[int]]
+    arrays: list[str]
+    documents: list[str]
+    files: dict[str, dict[str, Any]]
+    format: int = FORMAT
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content as JSON types, the format first."""
+        return {"format": self.format} | asdict(self)
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the file, with a digest of its own content at the end."""
+    content = manifest.as_dict()
+    content["sha256"] = _own_digest(content)
+    with durable(folder / NAME) as handle:
+        handle.write(encoded(content, indent=2) + b"\n")
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a generation's folder; `CorruptIndex` or `UnsupportedFormat` where it is bad."""
+    path = folder / NAME
+    try:
+        content = read_json(path)
+    except OSError as error:
+        raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+    except ValueError as error:
+        raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
+    if not isinstance(content, dict):
+        raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
+    _check_format(path, content.get("format"))
+    if content.pop("sha256", None) != _own_digest(content):
+        raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
+    return _parsed(path, content)
+
+
+def sealed(folder: Path, known: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file in the folder; those of the names in `known` are taken from there."""
+    return {
+        path.name: known.get(path.name) or {"bytes": path.stat().st_size, "sha256": digest(path)}
+        for path in sorted(folder.iterdir())
+    }
+
+
+def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
+    """Every file has its size and, with `verify`, its SHA-256; or `CorruptIndex` naming the file."""
+    for name, must in manifest.files.items():
+        path = folder / name
+        try:
+            with open_regular(path) as file:
+                size = os.fstat(file.fileno()).st_size
+            fits = size == must["bytes"] and (not verify or digest(path) == must["sha256"])
+        except OSError as error:
+            raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+        if size != must["bytes"]:
+            raise CorruptIndex(f"{path}: must have {must['bytes']} bytes, has {size}; {AGAIN}")
+        if not fits:
+            raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest's, it was altered; {AGAIN}")
+
+
+def _check_format(path: Path, version: object) -> None:
+    if not isinstance(version, int) or isinstance(version, bool):
+        raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
+    if version == FORMAT:
+        return
+    if version > FORMAT:
+        raise UnsupportedFormat(
+            f"{path}: has format {version}, this software reads {FORMAT}; update the software, or {AGAIN}"
+        )
+    raise UnsupportedFormat(f"{path}: has the older format {version}, this software reads {FORMAT}; {AGAIN}")
+
+
+def _own_digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
+    known = {field.name for field in fields(Manifest)}
+    if set(content) != known:
+        odd = ", ".join(sorted(set(content) ^ known))
+        raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}")
+    wrong = [name for name, is_right in _RIGHT.items() if not is_right(content[name])]
+    if wrong:
+        raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
+    return Manifest(**content | {"counts": Counts(**content["counts"])})
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and value in _NUMBER
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
+
+
+def _is_words(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(each, str) and bool(_WORD.fullmatch(each)) for each in value)
+
+
+def _is_counts(value: object) -> bool:
+    names = {field.name for field in fields(Counts)}
+    return isinstance(value, dict) and set(value) == names and all(_is_count(each) for each in value.values())
+
+
+def _is_segments(value: object) -> bool:
+    if not isinstance(value, dict) or set(value) != {"records", "vectors"}:
+        return False
+    return all(isinstance(part, list) and part and all(map(_is_count, part)) for part in value.values())
+
+
+def _is_files(value: object) -> bool:
+    """Names inside the folder, each with its size and digest."""
+    if not isinstance(value, dict):
+        return False
+    return all(
+        Path(name).name == name
+        and name.isprintable()
+        and isinstance(must, dict)
+        and set(must) == {"bytes", "sha256"}
+        and type(must["bytes"]) is int
+        and isinstance(must["sha256"], str)
+        for name, must in value.items()
+    )
+
+
+def _is(*types: type) -> Callable[[object], bool]:
+    return lambda value: type(value) in types
+
+
+_RIGHT: Mapping[str, Callable[[object], bool]] = {
+    "generation": _is(str),
+    "parent": _is(str, type(None)),
+    "created": _is(str),
+    "software": _is(str),
+    "fingerprint": _is_texts,
+    "about": _is(dict),
+    "dim": _is_count,
+    "metric": _is(str),
+    "kind": _is(str),
+    "parameters": _is(dict),
+    "asked": _is(dict),
+    "seed": _is(int),
+    "recall": _is(dict),
+    "counts": _is_counts,
+    "segments": _is_segments,
+    "arrays": _is_words,
+    "documents": _is_words,
+    "files": _is_files,
+}
+"""What each field must be: whoever alters a file can reckon its digest again."""

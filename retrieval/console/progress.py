@@ -1,0 +1,93 @@
+"""Progress of long work on stderr: a bar with time left on a terminal, else a line now and then."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Any, Protocol
+
+from retrieval.console.output import printable, say
+
+
+class Bar:
+    """A bar for `total` units of work; use as a context manager.
+
+    `unit` names what is counted (the rate is printed per second); `done` starts above 0 when work resumes;
+    `quiet` prints nothing.
+    """
+
+    _LINE_EVERY_S = 15.0
+
+    def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
+        self.title, self.total, self.unit, self.done = title, total, unit, done
+        self._first, self._start, self._last_line = done, time.monotonic(), time.monotonic()
+        self._rich: Any = None
+        self._quiet = quiet
+
+    def __enter__(self) -> "Bar":
+        if sys.stderr.isatty() and not self._quiet:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as RichProgress
+
+            self._rich = RichProgress(
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn(f"{self.unit}  {{task.fields[note]}}", markup=False),
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+            )
+            self._rich.start()
+            self._task = self._rich.add_task(self.title, total=self.total, completed=self.done, note="")
+        return self
+
+    def advance(self, count: int = 1, note: str = "") -> None:
+        """Say that `count` more units are done; `note` shows the latest figures."""
+        self.done += count
+        if self._rich:
+            self._rich.update(self._task, advance=count, note=printable(note))
+        elif not self._quiet and (time.monotonic() - self._last_line > self._LINE_EVERY_S or self.done == self.total):
+            self._last_line = time.monotonic()
+            rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
+            left = (self.total - self.done) / rate if rate else float("nan")
+            text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left:.0f} s left"
+            say(f"{text}  {note}".rstrip())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._rich:
+            self._rich.stop()
+
+
+class Collected(Protocol):
+    """What `CollectBar` asks of robot.collect.Progress."""
+
+    settled: int
+    wanted: int
+    attempts: int
+    objects: int
+    objects_done: int
+
+    @property
+    def accept_rate(self) -> float: ...
+
+
+class CollectBar:
+    """Shows robot.collect's progress on a bar, which is made when the first is told."""
+
+    def __init__(self) -> None:
+        self._bar: Bar | None = None
+
+    def __call__(self, now: Collected) -> None:
+        if self._bar is None:
+            self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
+        note = f"{now.objects_done} of {now.objects} objects, {now.accept_rate:.0%} of {now.attempts} attempts accepted"
+        self._bar.advance(now.settled - self._bar.done, note)
+
+    def __enter__(self) -> "CollectBar":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(*error)

@@ -1,0 +1,1 @@
+"""Pictures, catalogues and recordings, as towers and searches want them."""

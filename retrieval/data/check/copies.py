@@ -1,0 +1,186 @@
+"""Near copies: pictures that another one was made into by encoding it again, more light, a shift or a flip.
+
+All gel images of a sensor look alike, and so do photos of one table: what they share, the median picture of their kind,
+says nothing. So each picture is reduced to 16 x 16 grey levels, the best multiple of the median picture and a constant
+are taken off, and what remains is its shape. The distance of two pictures is 1 less the correlation of their shapes,
+the least over the four flips of one of them: 0 for a copy, about 1 for unlike pictures.
+
+How far a copy may lie is measured on the picture itself: it is saved as JPEG of quality 20, made a tenth brighter, and
+moved by 2 pixels along either diagonal; the farthest of these, `SLACK` times as far, is its limit. A touch that hardly
+differs from the untouched gel, or shows fine relief alone, loses its shape to such a change. So a picture counts as
+CHECKED only where its limit is less than a quarter of the way to the third nearest other object, which is no copy; of
+the others only copies are found that are as near as the gentlest of these changes, such as flipped ones.
+
+Measured on simulated recordings of 12 objects: limits of .002 to .12, other objects from .17 on; JPEG 20 left 64-bit
+perceptual hashes 0 to 18 bits from their picture, where other objects' touches began at 2: no threshold tells these
+apart, since hashes see what the pictures share. Hence shapes, and no hash library with its wavelets.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.data.images import decode_rgb, read_bytes
+from retrieval.data.resize import RgbImage
+
+PX = 16
+SLACK = 1.25
+_FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_BLOCK = 512
+_MANY, _PART = 3, 0.25
+_LEAST_LIMIT, _MOST_LIMIT = 0.02, 0.1
+"""Of pictures compared alone: what another size adds, and what unlike pictures do not reach (.34 was the nearest of
+photos and touches on simulated recordings)."""
+
+Greys = NDArray[np.float32]
+"""(n, 256): thumbnails in grey levels of 255."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """One picture: the digest of its bytes, its grey levels (256,), and those of its damaged copies (4, 256)."""
+
+    digest: str
+    grey: Greys
+    damaged: Greys
+
+
+def look_at(path: Path) -> Thumbnail:
+    """Read a picture. Raises ImageError."""
+    data = read_bytes(path)
+    return thumbnail(data, decode_rgb(data, path))
+
+
+def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
+    """Of a picture's bytes and what they decode to."""
+    picture = np.rint(255 * image).astype(np.uint8)
+    return Thumbnail(
+        sha256(data).hexdigest(), _small(picture), np.stack([_small(changed(picture)) for changed in DAMAGES])
+    )
+
+
+def _small(picture: NDArray[np.uint8]) -> Greys:
+    grey = picture.mean(axis=2, dtype=np.float32)
+    return np.asarray(cv2.resize(grey, (PX, PX), interpolation=cv2.INTER_AREA).ravel())
+
+
+def as_jpeg(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Through JPEG of quality 20."""
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 20])[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))  # blue and red change places twice
+
+
+def brighter(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """With a tenth more light."""
+    return np.asarray(np.clip(np.rint(picture * np.float32(1.1)), 0, 255).astype(np.uint8))
+
+
+def shifted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Moved by 2 pixels down and to the right; the border repeats."""
+    height, width = picture.shape[:2]
+    return np.asarray(np.pad(picture, ((2, 0), (2, 0), (0, 0)), "edge")[:height, :width])
+
+
+def shifted_across(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Moved by 2 pixels down and to the left."""
+    return shifted(picture[:, ::-1])[:, ::-1]
+
+
+DAMAGES = (as_jpeg, brighter, shifted, shifted_across)
+
+
+def shapes(greys: Greys, common: Greys | None = None) -> Greys:
+    """Unit vectors (n, 256) of what is left of thumbnails without a constant and `common` (256,); zeros for nothing."""
+    shared = [np.ones(PX**2, np.float32)] + ([] if common is None else [common])
+    basis = np.linalg.qr(np.stack(shared, axis=1).astype(np.float64))[0].astype(np.float32)
+    rest = greys - (greys @ basis) @ basis.T
+    length = np.linalg.norm(rest, axis=-1, keepdims=True)
+    return np.asarray(rest / np.where(length > 1e-3, length, np.inf))
+
+
+def flipped(greys: Greys, flip: tuple[int, int]) -> Greys:
+    """Thumbnails (n, 256) of the flipped pictures."""
+    turned = greys.reshape(-1, PX, PX)[:, :: flip[0], :: flip[1]]
+    return np.ascontiguousarray(turned).reshape(-1, PX**2)
+
+
+def is_copy(one: Thumbnail, other: Thumbnail) -> bool:
+    """Whether `one` is a near copy of `other` by their own shapes, with nothing known of pictures of their kind."""
+    original = shapes(other.grey)
+    limit = max(SLACK * (1 - float((shapes(other.damaged) @ original).min())), _LEAST_LIMIT)
+    likeness = max(float(shapes(flipped(one.grey[None], flip))[0] @ original) for flip in _FLIPS)
+    return 1 - likeness <= min(limit, _MOST_LIMIT)
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """Of each query (q,): row and distance of the nearest picture of another object, whether a copy of the query could
+    have been told from other pictures, and whether that nearest one is a copy."""
+
+    row: NDArray[np.int64]
+    distance: NDArray[np.float64]
+    checked: NDArray[np.bool_]
+    copy: NDArray[np.bool_]
+
+
+class Pictures:
+    """All pictures of one kind, such as the photos or the touches of one finger, and the objects that they are of."""
+
+    def __init__(self, thumbnails: Sequence[Thumbnail], objects: Sequence[str]) -> None:
+        self.greys = np.array([one.grey for one in thumbnails], dtype=np.float32).reshape(-1, PX**2)
+        self.common = np.median(self.greys, axis=0) if len(self.greys) else None
+        self.objects = np.unique(np.array(objects, dtype=str), return_inverse=True)[1]
+        self._shapes = shapes(self.greys, self.common)
+        copies = [shapes(one.damaged, self.common) for one in thumbnails]
+        likeness = [copy @ shape for copy, shape in zip(copies, self._shapes, strict=True)]
+        self.changed = SLACK * (1 - np.array(likeness, dtype=np.float64).reshape(-1, len(DAMAGES)))
+
+    def nearest(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> Nearest:
+        """Of the pictures `queries` (rows), the nearest of those in `among` that show another object."""
+        if not len(queries) or not len(among):
+            nothing = np.zeros(len(queries), dtype=bool)
+            return Nearest(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)
+        parts = [self._nearest(queries[at : at + _BLOCK], among) for at in range(0, len(queries), _BLOCK)]
+        row, distance, third = (np.concatenate(part) for part in zip(*parts, strict=True))
+        most = _PART * third
+        checked = self.changed[queries].max(axis=1) < most
+        # Either may be the copy, and what was saved as JPEG once hardly changes the next time.
+        changed = np.maximum(self.changed[queries], self.changed[row])
+        farthest, gentlest = changed.max(axis=1), changed.min(axis=1)
+        limit = np.where(farthest < most, farthest, np.minimum(gentlest, most))
+        return Nearest(row, distance, checked, np.asarray(distance <= limit))
+
+    def _nearest(
+        self, queries: NDArray[np.int64], among: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Row of the nearest picture of another object, its distance, and that of the third nearest other object (1
+        where there are fewer)."""
+        among = among[np.argsort(self.objects[among], kind="stable")]
+        likeness = np.full((len(queries), len(among)), -1.0, np.float32)
+        for flip in _FLIPS:
+            turned = shapes(flipped(self.greys[queries], flip), self.common)
+            np.maximum(likeness, turned @ self._shapes[among].T, out=likeness)
+        distance = 1.0 - likeness.astype(np.float64)
+        distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
+        first = np.flatnonzero(np.diff(self.objects[among], prepend=-1))
+        by_object = np.sort(np.minimum.reduceat(distance, first, axis=1), axis=1)
+        third = by_object[:, _MANY - 1] if by_object.shape[1] >= _MANY else np.full(len(queries), np.inf)
+        at = distance.argmin(axis=1)
+        return among[at], distance[np.arange(len(queries)), at], np.minimum(third, 1.0)
+
+    def within_objects(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Distance of each of the pictures to the nearest other one of its own object; objects with one are left
+        out."""
+        found = [np.zeros(0)]
+        for name in np.unique(self.objects[rows]):
+            own = self._shapes[rows[self.objects[rows] == name]]
+            likeness = own @ own.T
+            np.fill_diagonal(likeness, -np.inf)
+            if len(own) > 1:
+                found.append(1.0 - likeness.max(axis=1).astype(np.float64))
+        return np.concatenate(found)

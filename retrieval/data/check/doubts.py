@@ -1,0 +1,218 @@
+"""Doubts about a recording by what its pictures look like; each yields findings on the grasps it is given.
+
+A minority is judged against the rest. What cannot be told is a note: no look at the pictures tells two fingers apart
+whose gels are alike, before from during where nothing was touched, and two objects whose photos were exchanged
+throughout.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+from string import ascii_lowercase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.data.check.copies import Pictures, Thumbnail, is_copy
+from retrieval.data.check.findings import Files, Finding, named, some
+from retrieval.data.check.looks import Looks, exchanged_photos, named_by, swapped_fingers, swapped_moments
+from retrieval.data.dataset import Grasp
+
+_LEAST_GRASPS = 4
+_BY_LIGHT, _BY_TOUCH = 0.35, 0.6
+"""How far from chance to always may light alone name the object: by frames without contact, and by the mean colour of
+touches, which names it a little by what was felt (0.2 to 0.35 of the way on simulated recordings)."""
+
+
+def swapped(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Gel images share one look (the gel's tint and lamps); photos of different objects do not.
+
+    So small pictures of touches lie close to their median and those of photos lie far from it. A grasp whose photo lies
+    closer than its touch is suspect; when the photos of the whole recording are the tighter cloud, everything is.
+    """
+    if len(grasps) < 3:
+        return
+    touches, photos = _small(seen, [one.touches[0] for one in grasps]), _small(seen, [one.photo for one in grasps])
+    if _spread(photos) < _spread(touches) / 2:
+        yield Finding(
+            "error",
+            "swapped",
+            "touches and photos look swapped throughout (the photos are the more alike); exchange the columns",
+            tuple(grasp.grasp_id for grasp in grasps),
+        )
+        return
+    look = np.median(touches, axis=0)
+    closer = _distance(photos, look) < _distance(touches, look) / 2
+    names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
+    yield from named("error", "swapped", "touch and photo look swapped", names, grasps)
+
+
+def fingers(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Frames of two fingers, before and during the grasp, that look exchanged."""
+    both = [grasp for grasp in grasps if len(grasp.backgrounds) == len(grasp.touches)]
+    for moment, those in (("touch", grasps), ("untouched gel", both)):
+        if len(those) < _LEAST_GRASPS:
+            continue
+        fingers = range(min(len(grasp.touches) for grasp in those))
+        frames = [_small(seen, [_of(grasp, moment)[finger] for grasp in those]) for finger in fingers]
+        for a, b in combinations(fingers, 2):
+            which = f"{ascii_lowercase[a]} and {ascii_lowercase[b]}"
+            found = swapped_fingers(frames[a], frames[b])
+            if found is None:
+                text = f"fingers {which} look too much alike to find swapped ones ({moment})"
+                yield Finding("note", "unchecked-fingers", text)
+                continue
+            names = [those[row].grasp_id for row in found]
+            yield from named("error", "swapped-fingers", f"fingers {which} look swapped ({moment})", names, those)
+
+
+def moments(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Touches and frames of the untouched gel that look exchanged."""
+    both = [grasp for grasp in grasps if grasp.backgrounds and len(grasp.backgrounds) == len(grasp.touches)]
+    if len(both) < _LEAST_GRASPS:
+        return
+    suspects: set[str] = set()
+    for finger in range(min(len(grasp.touches) for grasp in both)):
+        before, during = (_small(seen, [_of(one, moment)[finger] for one in both]) for moment in ("before", "touch"))
+        found = swapped_moments(before, during)
+        if found.throughout:
+            yield Finding(
+                "error",
+                "swapped-moments",
+                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the untouched gel (its "
+                "frames are the less alike); exchange the columns",
+                tuple(grasp.grasp_id for grasp in both),
+            )
+            return
+        suspects |= {both[row].grasp_id for row in found.swapped}
+        if 2 * found.faint > len(both):
+            text = (
+                f"{found.faint} of {len(both)} touches of finger {ascii_lowercase[finger]} hardly differ from the "
+                "untouched gel: whether these two are swapped cannot be told"
+            )
+            yield Finding("note", "unchecked-moments", text)
+    names = [grasp.grasp_id for grasp in both if grasp.grasp_id in suspects]
+    yield from named("error", "swapped-moments", "touch and untouched gel look swapped", names, both)
+
+
+def light(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Lamps or gels that changed from object to object, so that light names the object."""
+    objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1] if grasps else np.zeros(0, int)
+    repeated = Counter(objects.tolist())
+    if len(repeated) < 2 or max(repeated.values()) < 2:
+        yield Finding(
+            "note", "unchecked-light", "light that names the object cannot be looked for: no object came twice"
+        )
+        return
+    has_before = all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps)
+    fingers = range(min(len(grasp.touches) for grasp in grasps))
+    for moment, allowed in (("before", _BY_LIGHT), ("touch", _BY_TOUCH)):
+        if moment == "before" and not has_before:
+            yield Finding(
+                "note",
+                "unchecked-light",
+                "without a frame of the untouched gel in every grasp, light that names the object is found only where "
+                "it is strong",
+            )
+            continue
+        frames = [_small(seen, [_of(grasp, moment)[finger] for grasp in grasps]) for finger in fingers]
+        values = np.stack(frames, axis=1)
+        found = named_by(values if moment == "before" else values.mean(axis=(2, 3)), objects)
+        if found.beyond(allowed):
+            what = "the untouched gel" if moment == "before" else "the mean colour of the touch"
+            yield Finding(
+                "warning",
+                "light",
+                f"{what} alone names the object in {found.share:.0%} of {found.grasps} grasps (chance "
+                f"{found.chance:.0%}): light or gel changed from object to object, and a model can learn that instead "
+                "of touch; mix the objects while recording, and compare with `retrieve evaluate`'s controls",
+            )
+            return
+
+
+def exchanged(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Photos of two objects that look exchanged."""
+    photos = np.array([seen[grasp.photo].photo for grasp in grasps], dtype=np.float32)
+    names, objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)
+    if len(names) < 2:
+        return
+    found = exchanged_photos(photos, objects)
+    if found.pairs:
+        rows = dict.fromkeys(row for pair in found.pairs for row in pair)
+        where = [f"{grasps[one].grasp_id} with {grasps[other].grasp_id}" for one, other in found.pairs]
+        yield Finding(
+            "warning",
+            "exchanged-photos",
+            f"the photos of {len(found.pairs)} pair(s) of grasps look exchanged between two objects: {some(where)}",
+            tuple(grasps[row].grasp_id for row in rows),
+        )
+    if found.told_apart < found.all:
+        yield Finding(
+            "note",
+            "unchecked-photos",
+            f"photos exchanged between two objects can be noticed for {found.told_apart} of {found.all} pairs of "
+            "objects; the others look too much alike, or have fewer than 4 photos",
+        )
+
+
+# Copies ----------------------------------------------------------------------------------------------------
+
+
+def own_photo(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Touches that are their own photo, encoded or sized in another way."""
+    names = [
+        grasp.grasp_id
+        for grasp in grasps
+        if any(is_copy(_thumbnail(seen, touch), _thumbnail(seen, grasp.photo)) for touch in grasp.touches)
+    ]
+    yield from named("error", "same-modality", "a touch shows its own photo", names, grasps)
+
+
+def copies(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Near copies of pictures of another object."""
+    kinds = {"photo": [(grasp, grasp.photo) for grasp in grasps]}
+    for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
+        kinds[f"touch {ascii_lowercase[finger]}"] = [(grasp, grasp.touches[finger]) for grasp in grasps]
+    for kind, frames in kinds.items():
+        one_each = list({path: (grasp, path) for grasp, path in frames}.values())  # grasps may share a photo
+        pictures = Pictures([_thumbnail(seen, path) for _, path in one_each], [one.object_id for one, _ in one_each])
+        rows = np.arange(len(one_each))
+        found = pictures.nearest(rows, rows)
+        pairs = {
+            tuple(sorted((row, int(found.row[row])))): f"{one_each[row][0].grasp_id} and {other.grasp_id}"
+            for row in np.flatnonzero(found.copy).tolist()
+            if seen[one_each[row][1]].digest != seen[(near := one_each[found.row[row]])[1]].digest
+            for other in (near[0],)
+        }
+        if pairs:
+            text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
+            yield Finding("error", "near-copy", f"{text}: {some(list(pairs.values()))}")
+        if not found.checked.all():
+            text = f"near copies could be looked for of {found.checked.sum()} of {len(rows)} images ({kind})"
+            yield Finding("note", "unchecked-copies", f"{text}; the others show too little to tell a copy by")
+
+
+# Helpers ---------------------------------------------------------------------------------------------------
+
+
+def _of(grasp: Grasp, moment: str) -> tuple[Path, ...]:
+    return grasp.touches if moment == "touch" else grasp.backgrounds
+
+
+def _small(seen: Files, paths: Sequence[Path]) -> Looks:
+    return np.array([seen[path].small for path in paths], dtype=np.float32)
+
+
+def _thumbnail(seen: Files, path: Path) -> Thumbnail:
+    found = seen[path].thumbnail
+    assert found is not None  # made of every photo and touch of the accepted grasps
+    return found
+
+
+def _spread(images: Looks) -> float:
+    return float(np.median(_distance(images, np.median(images, axis=0))))
+
+
+def _distance(images: Looks, centre: Looks) -> NDArray[np.float32]:
+    return np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3)))  # type: ignore[no-any-return]

@@ -1,0 +1,52 @@
+"""What a check of a recording says, and what it keeps of every picture."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.data.check.copies import Thumbnail
+from retrieval.data.dataset import Grasp
+
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One remark. severity: "error" (do not train on this), "warning" or "note" (what could not be checked). kind:
+    short name for programs. grasps: those it is about, where it is about single ones."""
+
+    severity: str
+    kind: str
+    message: str
+    grasps: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is kept of one picture, or why it cannot be read: the digest of its bytes, a small picture (6, 8, 3), of
+    photos a larger one too, and of accepted photos and touches what copies are found by."""
+
+    digest: str = ""
+    small: NDArray[np.float32] | None = None
+    photo: NDArray[np.float32] | None = None
+    thumbnail: Thumbnail | None = None
+    broken: str = ""
+
+
+Files = dict[Path, Seen]
+
+
+def named(severity: str, kind: str, what: str, names: Sequence[str], grasps: Sequence[Grasp]) -> Iterator[Finding]:
+    """A remark on those of the grasps that are named, if any."""
+    if names:
+        where = f"in {len(names)} of {len(grasps)} grasps: {some(names)}"
+        yield Finding(severity, kind, f"{what} {where}", tuple(names))
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

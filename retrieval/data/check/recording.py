@@ -1,0 +1,172 @@
+"""Lint of a recording: what would spoil a training, or make its result too good to be true.
+
+An ERROR is certain, or so far from the rest of the recording that nothing else explains it: do not train. A WARNING is
+a judgement by looks, or a lack: see for yourself. A NOTE says what could not be checked.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
+from pathlib import Path
+
+from retrieval.console.progress import Bar
+from retrieval.data.check import doubts
+from retrieval.data.check.copies import thumbnail
+from retrieval.data.check.findings import Files, Finding, Seen, named, some
+from retrieval.data.dataset import Attempt, Grasp, Split, load_all, require_accepted
+from retrieval.data.images import decode_rgb, read_bytes
+from retrieval.data.resize import resize
+from retrieval.errors import DatasetError, ImageError
+
+_SMALL, _PHOTO = (6, 8), (64, 64)
+
+_Check = Callable[[Sequence[Grasp], Files], Iterable[Finding]]
+
+
+def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = False) -> list[Finding]:
+    """Check every photo and gel image of a recording, those of rejected grasps too, and the split where one is given.
+
+    Depth pictures are not opened: nothing is trained on them. A grasp that one check names is left out of the later
+    ones. Raises DatasetError where the recording cannot be read at all, or holds no accepted grasp.
+    """
+    attempts = load_all(folder)
+    accepted = require_accepted(folder, attempts)
+    seen = _look_at_all(attempts, quiet)
+    grasps = [attempt.grasp for attempt in attempts]
+    findings = [*_broken(folder, seen), *_single(accepted), *_duplicates(folder, grasps, seen)]
+    whole = [one.grasp for one in attempts if all(not seen[path].broken for path in _pictures(one))]
+    trained_on = {grasp.grasp_id for grasp in accepted}
+    of_all: tuple[_Check, ...] = (_same_images, doubts.swapped, doubts.fingers, doubts.moments)
+    of_accepted: tuple[_Check, ...] = (doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies)
+    for check in of_all + of_accepted:
+        known = {name for finding in findings for name in finding.grasps}
+        left = [grasp for grasp in whole if grasp.grasp_id not in known]
+        findings += check([one for one in left if check in of_all or one.grasp_id in trained_on], seen)
+    findings += check_split(accepted, split) if split else []
+    return sorted(findings, key=lambda finding: finding.severity == "note")
+
+
+def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
+    """Objects and sequences that stand on two sides of a split, and objects on none."""
+    parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    part_of: dict[str, set[str]] = defaultdict(set)
+    for part, objects in parts.items():
+        for name in objects:
+            part_of[name].add(part)
+    shared = sorted(name for name, on in part_of.items() if len(on) > 1)
+    if shared:
+        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {some(shared)}")
+    sides: dict[str, set[str]] = defaultdict(set)
+    for grasp in grasps:
+        if grasp.sequence_id is not None:
+            sides[grasp.sequence_id] |= part_of.get(grasp.object_id, set())
+    leaking = sorted(name for name, on in sides.items() if len(on) > 1)
+    if leaking:
+        yield Finding(
+            "error",
+            "split-sequences",
+            f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides: "
+            f"{some(leaking)}",
+        )
+    recorded = {grasp.object_id for grasp in grasps}
+    unknown = sorted(set(part_of) - recorded)
+    if unknown:
+        yield Finding(
+            "warning", "split-unknown", f"the split names {len(unknown)} object(s) not recorded: {some(unknown)}"
+        )
+    absent = sorted(recorded - set(part_of))
+    if absent:
+        yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {some(absent)}")
+
+
+def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
+    """Raise DatasetError for a split that leaks, or whose parts have too few objects in the recording for pairs."""
+    for finding in check_split(grasps, split):
+        if finding.severity == "error":
+            raise DatasetError(f"{finding.message}; every object and sequence must stand in one part of the split")
+    for part in ("train", "validation"):
+        count = len({grasp.object_id for grasp in split.select(grasps, part)})
+        if count < 2 and (part == "train" or split.validation):
+            raise DatasetError(
+                f"pairs need at least 2 objects in the {part} part of the split; the recording has {count} of them"
+            )
+
+
+# Files -----------------------------------------------------------------------------------------------------
+
+
+def _pictures(attempt: Attempt) -> tuple[Path, ...]:
+    grasp = attempt.grasp
+    return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
+
+
+def _look_at_all(attempts: Sequence[Attempt], quiet: bool) -> Files:
+    files = sorted({path for attempt in attempts for path in _pictures(attempt)})
+    photos = {attempt.grasp.photo for attempt in attempts}
+    copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
+
+    def look(path: Path) -> Seen:
+        try:
+            data = read_bytes(path)
+            image = decode_rgb(data, path)
+        except ImageError as error:
+            return Seen(broken=error.reason)
+        return Seen(
+            sha256(data).hexdigest(),
+            resize(image, _SMALL),
+            resize(image, _PHOTO) if path in photos else None,
+            thumbnail(data, image) if path in copied else None,
+        )
+
+    seen: Files = {}
+    with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images", quiet=quiet) as bar:
+        for path, found in zip(files, pool.map(look, files), strict=True):
+            seen[path] = found
+            bar.advance()
+    return seen
+
+
+def _broken(folder: Path, seen: Files) -> Iterator[Finding]:
+    for path, image in seen.items():
+        if image.broken:
+            yield Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
+
+
+def _single(grasps: Sequence[Grasp]) -> Iterable[Finding]:
+    counts = Counter(grasp.object_id for grasp in grasps)
+    single = sorted(name for name, count in counts.items() if count == 1)
+    if single:
+        yield Finding(
+            "warning",
+            "one-grasp",
+            f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
+            f"the same moment: {some(single)}",
+        )
+
+
+def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """The same bytes under two objects."""
+    holders: dict[str, dict[str, Path]] = defaultdict(dict)
+    for grasp in grasps:
+        for path in (grasp.photo, *grasp.touches):
+            if seen[path].digest:
+                holders[seen[path].digest].setdefault(grasp.object_id, path)
+    for objects in holders.values():
+        if len(objects) > 1:
+            where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
+            yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {some(where)}")
+
+
+def _same_images(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """The same bytes for the photo and a touch, or for two fingers, of one grasp."""
+    kinds = {"same-modality": ("error", "photo and touch are"), "same-fingers": ("warning", "two fingers have")}
+    names: dict[str, list[str]] = {kind: [] for kind in kinds}
+    for grasp in grasps:
+        touches = [seen[path].digest for path in grasp.touches]
+        if seen[grasp.photo].digest in touches:
+            names["same-modality"].append(grasp.grasp_id)
+        if len(set(touches)) < len(touches):
+            names["same-fingers"].append(grasp.grasp_id)
+    for kind, (severity, what) in kinds.items():
+        yield from named(severity, kind, f"{what} the same image", names[kind], grasps)

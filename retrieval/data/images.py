@@ -1,0 +1,383 @@
+"""Pictures: from a file's bytes to float32 RGB in 0..1, resized, with the gel's background taken off.
+
+    bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> what a tower sees
+
+Pillow reads and checks every file. It keeps only the high byte of 16-bit colour, so deeper samples are
+decoded a second time with OpenCV after Pillow has loaded the file whole. (OpenCV's imread fills what a
+truncated JPEG lacks with grey and says nothing.) Colour profiles and gamma chunks are not applied.
+"""
+
+import hashlib
+import io
+import json
+import struct
+import threading
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, UnidentifiedImageError
+
+from indexes.store.regular import read_regular
+from retrieval.data.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
+from retrieval.data.resize import RgbImage, check_rgb, resize
+from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
+
+EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
+MAX_PIXELS = 20_000_000
+"""Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
+MOST_REDUCED = 160_000_000
+"""Pixels of such a file."""
+MAX_BYTES = 512 * 2**20
+PREPROCESSING_VERSION = 2
+"""Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
+
+_FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
+_NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
+_EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
+_DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"})
+_ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
+
+
+class _Quiet:
+    """No warnings while any thread is inside. The filters belong to the whole process: `warnings.catch_warnings` in
+    each thread would let them be put back in the wrong order, and a lock around it would decode one picture at a
+    time."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._filters = threading.Lock(), 0, warnings.catch_warnings()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._filters = warnings.catch_warnings()
+                self._filters.__enter__()
+                warnings.simplefilter("ignore")
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._filters.__exit__(None, None, None)
+
+
+_quiet = _Quiet()
+
+
+# Reading ---------------------------------------------------------------------------------------------
+
+
+def read_rgb(path: str | Path) -> RgbImage:
+    """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright. Raises ImageError."""
+    return decode_rgb(read_bytes(path), path)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the bytes of a regular file of at most MAX_BYTES. Raises ImageError."""
+    try:
+        return read_regular(path, MAX_BYTES)
+    except FileNotFoundError:
+        raise ImageError(path, "no such file") from None
+    except IsADirectoryError:
+        raise ImageError(path, "is a folder; give the picture's file") from None
+    except (OSError, ValueError, MemoryError) as error:
+        raise ImageError(path, f"cannot be read: {_reason(error)}") from error
+
+
+def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
+    """Decode one picture to (H, W, 3) float32 RGB in 0..1; `name` stands for it in messages.
+
+    Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
+    several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
+    """
+    if not data:
+        raise ImageError(name, "the file is empty")
+    try:
+        return _decode(data, name)
+    except ImageError:
+        raise
+    except UnidentifiedImageError:
+        raise ImageError(name, _NO_IMAGE) from None
+    except Exception as error:  # OSError, SyntaxError, struct.error, cv2.error, MemoryError, ...
+        raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
+
+
+def to_float(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """Scale uint8 or uint16 samples of any shape to float32 in 0..1. Raises BadInput for another type."""
+    if image.dtype not in (np.uint8, np.uint16):
+        raise BadInput(f"samples must be uint8 or uint16, got {image.dtype}")
+    scaled = np.divide(image, np.iinfo(image.dtype).max, dtype=np.float32)
+    return cast(npt.NDArray[np.float32], scaled)
+
+
+def _reason(error: BaseException) -> str:
+    text = getattr(error, "strerror", None) or str(error) or "no reason given"
+    return f"{' '.join(text.split())} ({type(error).__name__})"
+
+
+def _decode(data: bytes, name: str | Path) -> RgbImage:
+    check_pixels(_webp_size(data), name)
+    decoder = decoder_of(data, name)
+    with _quiet:
+        try:
+            image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
+        except Image.DecompressionBombError:
+            raise ImageError(name, _too_large("far more")) from None
+        with image:
+            _reduce(image)
+            check_pixels(image.size, name)
+            image.load()
+            orientation = _orientation(image)
+            rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
+    return np.ascontiguousarray(_upright(rgb, orientation))
+
+
+def _reduce(image: Image.Image) -> None:
+    """Have a large JPEG file decoded smaller, which takes the memory of what comes out. A progressive one is not: its
+    decoder holds the whole."""
+    width, height = image.size
+    if image.format != "JPEG" or width * height > MOST_REDUCED or image.info.get("progressive"):
+        return
+    if scale := next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None):
+        image.draft(None, (width // scale, height // scale))
+
+
+def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
+    """An opened Pillow image as `decode_rgb` gives its file, but for samples beyond 8 bits, which Pillow has dropped
+    by then. Raises ImageError."""
+    try:
+        check_pixels(image.size, name)
+        with _quiet:
+            image.load()
+            rgb = _eight_bit_rgb(image, name)
+        return np.ascontiguousarray(_upright(rgb, _orientation(image)))
+    except ImageError:
+        raise
+    except Exception as error:  # a file behind it that is damaged, or closed by now
+        raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
+
+
+def check_pixels(size: tuple[int, int], name: str | Path) -> None:
+    """Refuse a size from a header before anything of that size is allocated."""
+    width, height = size
+    if width < 1 or height < 1:
+        raise ImageError(name, f"has no pixels ({width} x {height})")
+    if width * height > MAX_PIXELS:
+        raise ImageError(name, _too_large(f"{width} x {height} = {width * height}"))
+
+
+def _too_large(size: str) -> str:
+    return f"{size} pixels; at most {MAX_PIXELS} are decoded: make the picture smaller"
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """(width, height) by a WebP header, else (1, 1): Pillow allocates a WebP canvas as it opens the file."""
+    chunk = data[12:16]
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
+        return 1, 1
+    if chunk == b"VP8X":
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    if chunk == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    width, height = struct.unpack_from("<HH", data, 26)
+    return max(width & 0x3FFF, 1), max(height & 0x3FFF, 1)
+
+
+def _is_deep(image: Image.Image, data: bytes) -> bool:
+    """Whether samples have more than 8 bits: byte 24 of a PNG file (IHDR), BitsPerSample of a TIFF file."""
+    if image.format == "PNG":
+        return data[24] > 8
+    return max(_tiff_tag(image, _BITS, (8,))) > 8
+
+
+def _tiff_tag(image: Image.Image, tag: int, default: tuple[int, ...]) -> tuple[int, ...]:
+    value = getattr(image, "tag_v2", {}).get(tag, default)
+    return tuple(value) if isinstance(value, tuple | list) else (int(value),)
+
+
+def _eight_bit_rgb(image: Image.Image, name: str | Path) -> RgbImage:
+    if image.mode not in _EIGHT_BIT_MODES:
+        raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
+    if not image.has_transparency_data:
+        return to_float(np.asarray(image.convert("RGB")))
+    samples = to_float(np.asarray(image.convert("RGBA")))
+    return _on_white(samples[..., :3], samples[..., 3:])
+
+
+def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
+    """Decode 16-bit samples with OpenCV, which gives blue first and neither inverts nor un-premultiplies."""
+    import cv2
+
+    layout = (_tiff_tag(image, _PHOTOMETRIC, (2,)), _tiff_tag(image, _PLANAR, (1,)))
+    bits = set(_tiff_tag(image, _BITS, (16,)))
+    if image.mode not in _DEEP_MODES or bits != {16} or layout not in (((1,), (1,)), ((2,), (1,))):
+        raise ImageError(name, f"this pixel type ({image.mode}, {max(bits)} bits) is not supported; save it as PNG")
+    if image.format == "PNG" and not _chunks_fit(data):
+        raise ImageError(name, "damaged or truncated: a PNG chunk is longer than the file")
+    samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if samples is None or samples.dtype != np.uint16 or samples.shape[:2] != (image.height, image.width):
+        raise ImageError(name, "its 16-bit samples cannot be decoded; save it as 8-bit PNG")
+    samples = np.atleast_3d(samples)
+    rgb = np.repeat(samples, 3, axis=2) if samples.shape[2] < 3 else samples[..., 2::-1]
+    if image.mode == "RGBA":
+        premultiplied = _tiff_tag(image, _EXTRA_SAMPLES, (2,)) == (1,)
+        return _on_white(to_float(rgb), to_float(samples[..., 3:]), premultiplied)
+    if "transparency" in image.info:  # a PNG file may name one colour that is see-through
+        opaque = (rgb != np.asarray(image.info["transparency"])).any(axis=2, keepdims=True)
+        return _on_white(to_float(rgb), opaque.astype(np.float32))
+    return to_float(rgb)
+
+
+def _chunks_fit(data: bytes) -> bool:
+    """Whether all chunks of a PNG file end inside it; OpenCV allocates what a chunk claims, up to 4 GB."""
+    start = 8
+    while start + 12 <= len(data) and data[start + 4 : start + 8] != b"IEND":
+        start += 12 + int.from_bytes(data[start : start + 4], "big")
+    return start + 12 <= len(data)
+
+
+def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32], premultiplied: bool = False) -> RgbImage:
+    """Composite on white: `rgb` (H, W, 3), `alpha` (H, W, 1), all in 0..1."""
+    colour = rgb if premultiplied else rgb * alpha
+    white: RgbImage = np.minimum(colour + (1 - alpha), np.float32(1))
+    return white
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF orientation 1..8 that is still to be applied; both decoders turn TIFF files themselves."""
+    if image.format == "TIFF":
+        return 1
+    try:
+        value = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # damaged EXIF is no reason to refuse good pixels
+        return 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _upright(image: RgbImage, orientation: int) -> RgbImage:
+    """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) turn."""
+    if orientation >= 5:
+        image = image.swapaxes(0, 1)
+    rows = -1 if orientation in (3, 4, 7, 8) else 1
+    columns = -1 if orientation in (2, 3, 6, 7) else 1
+    return image[::rows, ::columns]
+
+
+# The gel's background --------------------------------------------------------------------------------
+
+_SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
+    "difference": lambda touch, reference: touch - reference,
+    "difference+0.5": lambda touch, reference: np.clip(touch - reference + np.float32(0.5), 0, 1),
+    "abs": lambda touch, reference: np.abs(touch - reference),
+}
+BACKGROUNDS = ("none", *_SUBTRACT)
+"""What is done with R, the untouched gel: nothing; T - R in -1..1; that plus 0.5, clipped; |T - R|."""
+
+
+def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
+    """Take the untouched gel off a touch, both (H, W, 3) float32 in 0..1, by one of BACKGROUNDS.
+
+    "none" returns `touch` itself. In float32: uint8 subtraction wraps, and turns 1 grey level darker into 255
+    brighter. Raises ConfigError for an unknown policy or a missing reference, BadInput for other shapes.
+    """
+    _check_policy(policy)
+    check_rgb(touch, "touch")
+    if policy == "none":
+        return touch
+    if reference is None:
+        raise _missing_reference(policy)
+    check_rgb(reference, "reference")
+    if touch.shape != reference.shape:
+        raise BadInput(f"touch and reference must have one shape, got {touch.shape} and {reference.shape}")
+    return _SUBTRACT[policy](touch, reference)
+
+
+def _check_policy(policy: object) -> None:
+    if policy not in BACKGROUNDS:
+        raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {policy!r}")
+
+
+def _missing_reference(policy: str) -> ConfigError:
+    return ConfigError(
+        f'background = "{policy}" needs a picture of the untouched gel beside each touch: '
+        'give a reference, or set background = "none"'
+    )
+
+
+# Both together ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How files become what the towers see: sides of the squares in pixels, and one of BACKGROUNDS."""
+
+    touch_px: int = 128
+    photo_px: int = 256
+    background: str = "none"
+
+    def __post_init__(self) -> None:
+        for key in ("touch_px", "photo_px"):
+            side = getattr(self, key)
+            if type(side) is not int or not 1 <= side <= 4096:
+                raise ConfigError(f"{key} must be a whole number of pixels from 1 to 4096, got {side!r}")
+        _check_policy(self.background)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON types; `from_dict` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":
+        """Make from named settings; one left out takes its default. Raises ConfigError for an unknown one."""
+        known = [field.name for field in fields(cls)]
+        if unknown := sorted(set(settings) - set(known)):
+            raise ConfigError(f"unknown preprocessing setting {unknown[0]!r}; known: {', '.join(known)}")
+        return cls(**settings)
+
+    def digest(self) -> str:
+        """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
+        content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def photo(self, image: RgbImage) -> RgbImage:
+        """(H, W, 3) in 0..1 to (photo_px, photo_px, 3). Raises BadInput, NumericalError."""
+        return _finite(resize(image, (self.photo_px, self.photo_px)), "photo")
+
+    def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
+        """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
+
+        The background goes after resizing: the two files may have different sizes, the work is less, and for
+        "abs" sensor noise is averaged away while it has both signs instead of adding up to a grey veil.
+        """
+        size = (self.touch_px, self.touch_px)
+        if self.background == "none" or reference is None:
+            return _finite(subtract_background(resize(image, size), None, self.background), "touch")
+        touch = subtract_background(resize(image, size), resize(reference, size), self.background)
+        return _finite(touch, "touch")
+
+    def load_photo(self, path: str | Path) -> RgbImage:
+        """Read a photo as (photo_px, photo_px, 3) float32. Raises ImageError."""
+        return self.photo(read_rgb(path))
+
+    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
+        """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.
+
+        Raises ImageError, and ConfigError where the policy needs a reference that is not given.
+        """
+        if self.background == "none":
+            return self.touch(read_rgb(path))
+        if reference is None:
+            raise _missing_reference(self.background)
+        return self.touch(read_rgb(path), read_rgb(reference))
+
+
+def _finite(image: RgbImage, what: str) -> RgbImage:
+    if not np.isfinite(image).all():
+        raise NumericalError(f"the {what} holds a NaN or infinite sample; every sample must lie in 0..1")
+    return image

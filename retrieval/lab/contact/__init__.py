@@ -1,0 +1,1 @@
+"""The contact solver beside what is known without a grid."""

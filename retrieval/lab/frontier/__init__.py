@@ -1,0 +1,41 @@
+"""Error against run time of every approximation in the system, and the hard cases of every numerical kernel.
+
+A new approximation is one function from a `Sample` to a `Row`, one row of `APPROXIMATIONS`, one test parameter.
+"""
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.lab.frontier.points import Row
+    from retrieval.lab.frontier.sample import Sample
+
+APPROXIMATIONS = {
+    "candidates": "retrieval.lab.frontier.candidates:candidates",
+    "index_kinds": "retrieval.lab.frontier.kinds:index_kinds",
+    "towers": "retrieval.lab.frontier.formats:towers",
+    "halves": "retrieval.lab.frontier.formats:halves",
+    "image_size": "retrieval.lab.frontier.pixels:image_size",
+    "grasps": "retrieval.lab.frontier.grasps:grasps",
+    "cca_solver": "retrieval.lab.frontier.correlation:cca_solver",
+    "cca_components": "retrieval.lab.frontier.correlation:cca_components",
+    "contact": "retrieval.lab.frontier.simulated:contact",
+    "closing": "retrieval.lab.frontier.simulated:closing",
+    "gel_optics": "retrieval.lab.frontier.simulated:gel_optics",
+}
+"""Name -> the function that measures it, imported when it is used."""
+
+NEED_NOTHING = frozenset({"cca_solver", "contact", "closing", "gel_optics"})
+"""Measured without a model and without a recording."""
+
+
+def load_approximation(name: str) -> "Callable[[Sample], Row]":
+    """The function that measures `name`. Raises ConfigError for an unknown one."""
+    if name not in APPROXIMATIONS:
+        raise ConfigError(f"an approximation must be one of {', '.join(APPROXIMATIONS)}; got {name!r}")
+    module, function = APPROXIMATIONS[name].split(":")
+    measure: Callable[[Sample], Row] = getattr(import_module(module), function)
+    return measure

@@ -1,0 +1,1 @@
+"""Gel optics fitted to real presses, and judged on presses held out."""

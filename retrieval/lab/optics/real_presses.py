@@ -1,0 +1,238 @@
+"""Real presses of a ball into a GelSight, and the surface that each should have made.
+
+The data are the `dataPack.npz` of the package `taxim` (MIT): `f0` the untouched gel, `imgs` the pressed one,
+`touch_center` (x, y) and `touch_radius` in pixels, labelled by hand. The arrays are plain; nothing is unpickled.
+
+Channels are kept as stored and the first is called red. It cannot be told from the files: looked at so, the presses
+on the Mini have the colours of other Mini recordings, and the lamps of the older sensor stand red below on the left,
+green above on the left, blue on the right. (The package itself takes the first for blue.)
+
+The surface is our own contact solver's: a ball on a bonded layer, solved once for a row of depths; a press is
+found between them by its contact radius. Only shape is asked here, so the gel's modulus does not matter.
+"""
+
+import math
+import zipfile
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
+
+from robot.errors import BadRobotInput, UnknownName
+from robot.sim.contact.layer import Layer, press
+
+Matrix = NDArray[np.float64]
+
+CROP = 200
+PIXEL_MM = 0.0295
+# Of the ball of the Mini's presses nothing is said: its radius is chosen with the rest of the model.
+BALLS_MM = {"gelsight": (2.0,), "gelsight_mini": (0.7, 0.85, 1.0, 2.0)}
+TAXIM_BALL_MM = 2.0  # with this radius Taxim's tables do best, on either sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Presses:
+    """`untouched` (rows, cols, 3), `pictures` (count, rows, cols, 3), both uint8; labels in pixels."""
+
+    name: str
+    untouched: NDArray[np.uint8]
+    pictures: NDArray[np.uint8]
+    centres: Matrix
+    radii: Matrix
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def smooth_untouched(self, blur_px: float) -> Matrix:
+        """(rows, cols, 3): the untouched gel, its noise blurred away (standard deviation; 0 leaves it alone)."""
+        return _blurred(self, blur_px)
+
+    def crop(self, index: int) -> tuple[slice, slice]:
+        """Rows and columns of 200 x 200 pixels round the labelled centre, moved inside the picture."""
+        starts = [
+            min(max(round(float(middle)) - CROP // 2, 0), size - CROP)
+            for middle, size in zip(self.centres[index][::-1], self.untouched.shape[:2], strict=True)
+        ]
+        return slice(starts[0], starts[0] + CROP), slice(starts[1], starts[1] + CROP)
+
+
+@lru_cache(maxsize=16)
+def _blurred(presses: Presses, blur_px: float) -> Matrix:
+    image = presses.untouched.astype(np.float64)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px)) if blur_px > 0 else image
+
+
+def find_presses() -> Path:
+    """The folder with a folder per sensor in the installed `taxim`. Raises BadRobotInput where it is missing."""
+    spec = find_spec("taxim")
+    if spec is None or not spec.submodule_search_locations:
+        raise BadRobotInput(
+            "real presses come with the package taxim, which is missing; "
+            "run pip install 'touch-retrieval[calibration]' or give their folder with --data"
+        )
+    return Path(next(iter(spec.submodule_search_locations))) / "calib"
+
+
+def read_presses(folder: str | Path, name: str) -> Presses:
+    """Read `<folder>/<name>/dataPack.npz`. Raises UnknownName, BadRobotInput for a file that is not one."""
+    if name not in BALLS_MM:
+        raise UnknownName(f"no presses are called {name!r}; known are {', '.join(BALLS_MM)}")
+    path = Path(folder) / name / "dataPack.npz"
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as pack:
+            found = [pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius")]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise BadRobotInput(
+            f"{path} must hold f0, imgs, touch_center and touch_radius as plain arrays: {error}"
+        ) from error
+    untouched, pictures, centres, radii = found
+    good = (
+        untouched.dtype == pictures.dtype == np.uint8 and pictures.ndim == 4 and pictures.shape[1:] == untouched.shape
+    )
+    if (
+        not good
+        or min(untouched.shape[:2]) < CROP
+        or centres.shape != (len(pictures), 2)
+        or radii.shape != (len(pictures),)
+    ):
+        shapes = [array.shape for array in found]
+        raise BadRobotInput(f"{path} must hold uint8 pictures of one size, {CROP} pixels or more, got {shapes}")
+    _check_labels(path, np.c_[centres, radii].astype(np.float64))
+    return Presses(name, untouched, pictures, centres.astype(np.float64), radii.astype(np.float64))
+
+
+def _check_labels(path: Path, labels: Matrix) -> None:
+    """labels (count, 3): x, y, radius. A NaN among them would make every fitted weight NaN."""
+    bad = np.flatnonzero(~(np.isfinite(labels).all(axis=1) & (labels[:, 2] > 0)))
+    if len(bad):
+        raise BadRobotInput(
+            f"{path} must hold labels that are finite, with radii above 0; press {bad[0]} has {labels[bad[0]]}"
+        )
+
+
+@lru_cache(maxsize=256)
+def seen_centre(presses: Presses, index: int, threshold: float = 25) -> tuple[float, float]:
+    """x, y of the middle of what changed in the crop (pixels of the picture): a start that needs no label."""
+    rows, cols = presses.crop(index)
+    change = np.abs(presses.pictures[index][rows, cols].astype(np.float32) - presses.untouched[rows, cols]).sum(axis=2)
+    change = cv2.GaussianBlur(change, (0, 0), 3)
+    change[change < threshold] = 0
+    total = float(change.sum())
+    if total == 0:
+        return float(presses.centres[index][0]), float(presses.centres[index][1])
+    x = float(change.sum(axis=0) @ np.arange(cols.start, cols.stop)) / total
+    return x, float(change.sum(axis=1) @ np.arange(rows.start, rows.stop)) / total
+
+
+# Surfaces --------------------------------------------------------------------------------------------------
+
+_GRID, _HALF_MM = 129, 8.0  # of the solved press: 0.12 mm; the skirt ends well inside
+_DEPTHS = 22
+_FINE = 1600  # points of a profile, 0.005 mm
+_EXACT = 0.98  # up to this share of the contact radius the gel is the ball
+
+
+@dataclass(frozen=True, eq=False)
+class BallTable:
+    """Profiles along the radius for a row of contact radii: displacement first, then smoothed over each reach."""
+
+    ball_mm: float
+    contact_mm: Matrix  # (depths,), rising
+    heights: Matrix  # (depths, 1 + reaches, points)
+    slopes: Matrix  # the same, along the radius
+
+    def at(self, contact_mm: float, x_mm: Matrix, y_mm: Matrix) -> list[tuple[Matrix, Matrix, Matrix]]:
+        """For displacement and each smoothed one: value, slope along x, slope along y, at these offsets."""
+        radius = np.hypot(x_mm, y_mm)
+        safe = np.maximum(radius, 1e-9)
+        out = []
+        for order, (height, slope) in enumerate(zip(*self._profiles(contact_mm), strict=True)):
+            place = np.minimum(radius / _HALF_MM * (_FINE - 1), _FINE - 1)
+            fall = np.interp(place, np.arange(_FINE), slope)
+            if order == 0:
+                fall = np.where(radius < _EXACT * contact_mm, -self._ball_slope(radius), fall)
+            out.append((np.interp(place, np.arange(_FINE), height), fall * x_mm / safe, fall * y_mm / safe))
+        return out
+
+    def _profiles(self, contact_mm: float) -> tuple[Matrix, Matrix]:
+        known = self.contact_mm
+        upper = int(np.clip(np.searchsorted(known, contact_mm), 1, len(known) - 1))
+        share = float(np.clip((contact_mm - known[upper - 1]) / (known[upper] - known[upper - 1]), 0, 1))
+        heights = (1 - share) * self.heights[upper - 1] + share * self.heights[upper]
+        return heights, (1 - share) * self.slopes[upper - 1] + share * self.slopes[upper]
+
+    def _ball_slope(self, radius: Matrix) -> Matrix:
+        """Steep, but finite, at the equator: r / sqrt(R^2 - r^2)."""
+        return radius / np.sqrt(np.maximum(self.ball_mm**2 - radius**2, (0.05 * self.ball_mm) ** 2))
+
+
+@lru_cache(maxsize=16)
+def ball_table(ball_mm: float, thickness_mm: float, poisson: float, reaches_mm: tuple[float, ...]) -> BallTable:
+    """Press a rigid ball to a row of depths; nearly to its equator for the deepest."""
+    pixel = 2 * _HALF_MM / _GRID
+    axis = (np.arange(_GRID) - _GRID // 2) * pixel
+    square = axis[:, None] ** 2 + axis**2
+    gap = np.where(square < ball_mm**2, ball_mm - np.sqrt(np.maximum(ball_mm**2 - square, 0)), math.inf)
+    contacts: list[float] = []
+    heights: list[Matrix] = []
+    for depth in np.geomspace(0.01, 1.3, _DEPTHS) * ball_mm:
+        contact = press(gap, pixel, Layer(0.3, poisson, thickness_mm), depth_mm=float(depth), tolerance=1e-4)
+        radius = math.sqrt(contact.area_mm2 / math.pi)
+        if not contacts or radius > contacts[-1]:
+            contacts.append(radius)
+            heights.append(_radial(contact.displacement_mm, reaches_mm, pixel))
+    profiles = CubicSpline(axis[_GRID // 2 :], np.stack(heights), axis=-1)
+    fine = np.linspace(0, _HALF_MM, _FINE)
+    return BallTable(ball_mm, np.array(contacts), profiles(fine), profiles(fine, 1))
+
+
+def _radial(displacement: Matrix, reaches_mm: tuple[float, ...], pixel: float) -> Matrix:
+    """(1 + reaches, points): the middle row to the right, as it is and smoothed over each reach."""
+    maps = [displacement, *(gaussian_filter(displacement, reach / pixel) for reach in reaches_mm)]
+    return np.stack([one[_GRID // 2, _GRID // 2 :] for one in maps])
+
+
+# Taxim's own prediction ------------------------------------------------------------------------------------
+
+
+def taxim_change(presses: Presses, index: int, table: Any) -> Matrix:
+    """The change (200, 200, 3) that Taxim's binned table predicts for a labelled press; a reproduction.
+
+    Si & Yuan, RA-L 2022: the ball inside the contact, outside it a pyramid of Gaussian blurs; slopes by np.gradient
+    (theirs are central differences too); 125 x 125 bins of tilt and direction with a polynomial in x and y each.
+    `table`: grad_r, grad_g, grad_b (125, 125, 6). Without their shadows and the curve of their gel pad.
+    """
+    rows, cols = presses.crop(index)
+    height, width = presses.untouched.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    heights = _pyramid(presses, index, x, y)
+    down, right = np.gradient(heights / PIXEL_MM)
+    bins = table["grad_r"].shape[0] - 1
+    tilt = np.floor(np.arctan(np.hypot(down, right)) / (0.5 * np.pi / bins)).astype(int)[rows, cols]
+    turn = np.floor((np.arctan2(down, right) + np.pi) / (2 * np.pi / bins)).astype(int)[rows, cols]
+    x, y = x[rows, cols], y[rows, cols]
+    terms = np.stack([x * x, y * y, x * y, x, y, np.ones_like(x)], axis=-1)
+    return np.stack([(table[f"grad_{name}"][tilt, turn] * terms).sum(axis=-1) for name in "rgb"], axis=-1)
+
+
+_PYRAMID_PX = (30.5, 15.5, 8.0, 3.5, 2.0, 1.1)
+
+
+def _pyramid(presses: Presses, index: int, x: Matrix, y: Matrix) -> Matrix:
+    """Heights in mm: the ball's cap above the flat gel, its rim smoothed, its core (deeper than 0.4) kept."""
+    ball_mm = TAXIM_BALL_MM
+    contact = min(presses.radii[index] * PIXEL_MM, 0.99 * ball_mm)
+    square = ((x - presses.centres[index][0]) ** 2 + (y - presses.centres[index][1]) ** 2) * PIXEL_MM**2
+    base = math.sqrt(ball_mm**2 - contact**2)
+    cap = np.maximum(np.sqrt(np.maximum(ball_mm**2 - square, 0)) - base, 0)
+    core, heights = cap > 0.4 * (ball_mm - base), cap
+    for sigma in _PYRAMID_PX:
+        heights = np.where(core, cap, cv2.GaussianBlur(heights, (0, 0), sigma))
+    return np.asarray(cv2.GaussianBlur(heights, (0, 0), 2.0))

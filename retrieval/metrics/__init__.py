@@ -1,0 +1,1 @@
+"""Measures of rankings and probabilities, with intervals, in numpy alone."""

@@ -1,0 +1,52 @@
+"""What a measure says of every query, and its means by object."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput, NumericalError
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Values of one protocol, query by query; shares, so that they lie between 0 and 1 on average.
+
+    values (Q, m): m = 1, or K for a guess curve; owner (Q,): object of the query, which is what intervals resample;
+    chance (m,): what a constant scorer gets, in closed form, averaged as the values are (objects alike);
+    gallery: what was searched, in plain words.
+    """
+
+    values: NDArray[np.float64]
+    owner: NDArray[np.int64]
+    chance: NDArray[np.float64]
+    gallery: str
+
+    def __post_init__(self) -> None:
+        wanted = (len(self.owner), len(self.chance))
+        if self.values.shape != wanted or 0 in wanted:
+            raise BadInput(
+                f"a measure must have values of shape {wanted}, and a query at least; got {self.values.shape}"
+            )
+        if not np.isfinite(self.values).all():
+            raise NumericalError("every value of a measure must be finite; one is not")
+
+    def by_object(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Numbers of the objects (R,), ascending, and the mean value of the queries of each (R, m)."""
+        return object_means(self.values, self.owner)
+
+
+def object_means(
+    values: NDArray[np.float64], owner: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Numbers of the objects (R,), ascending, and the mean of the rows of `values` (Q, m) that each owns, (R, m)."""
+    objects, place = np.unique(owner, return_inverse=True)
+    means = np.zeros((len(objects), values.shape[1]))
+    np.add.at(means, place, values)
+    return objects, means / np.bincount(place)[:, None]
+
+
+def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(Q,) weights that sum to 1 and make every object count alike, however many queries it has."""
+    _, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    return np.asarray(1 / (counts[place] * len(counts)))

@@ -1,0 +1,297 @@
+"""Checkpoints: one `.safetensors` file with the weights, and everything needed to use them in its header.
+
+Nothing is unpickled. A file is written beside its place, flushed to disk, then renamed: it is whole or absent.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours, write_atomically
+from retrieval.data.dataset import Split
+from retrieval.errors import BadInput, CheckpointError
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.model.gel_check import GelCheck
+from retrieval.model.gel_head import GelHead
+from retrieval.model.posterior import Posterior
+from retrieval.model.stored import (
+    FORMAT,
+    Stored,
+    file_digest,
+    matcher_header,
+    read_header,
+    stored_of,
+    unreadable,
+    unusable,
+)
+from retrieval.version import __version__
+
+_QUERIES = "queries.touch_halves"
+_GEL_HEAD = "gel_head."
+_DTYPES = {
+    torch.float16,
+    torch.bfloat16,
+    torch.float32,
+    torch.float64,
+    torch.int32,
+    torch.int64,
+    torch.bool,
+    torch.uint8,
+}
+
+
+@dataclass(frozen=True)
+class Checkpoint(Stored):
+    """A matcher ready for use (in evaluation mode) and what its file says of it.
+
+    posterior: what its logits mean; None where it was never calibrated. queries: (Q, hidden) halves of touches of
+    validation objects, by which an index can measure its own search.
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
+    ('none', 64)
+    """
+
+    matcher: Matcher
+    split: Split | None
+    posterior: Posterior | None = None
+    queries: NDArray[np.float16] | None = None
+
+
+def save_checkpoint(
+    path: Path,
+    matcher: Matcher,
+    config: Config,
+    *,
+    split: Split | None,
+    provenance: Mapping[str, Any],
+    posterior: Posterior | None = None,
+    gel_check: GelCheck | None = None,
+    queries: NDArray[np.float16] | None = None,
+    float16: bool = False,
+) -> None:
+    """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
+
+    float16: weights are stored so, at half the size, and reckoned with in float32 when they are loaded.
+    """
+    require_writable(path)
+    header = {
+        "config": config.to_dict(),
+        "split": split.to_dict() if split else None,
+        "posterior": posterior.to_dict() if posterior else None,
+        "gel_check": gel_check.to_dict() if gel_check else None,
+        "provenance": dict(provenance),
+    }
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
+    if float16:
+        state = {name: _half(path, name, tensor) for name, tensor in state.items()}
+    if queries is not None:
+        state[_QUERIES] = torch.from_numpy(queries)
+    write_tensors(path, state, header)
+    write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
+
+
+def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> None:
+    """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
+    save_checkpoint(
+        path,
+        made.matcher,
+        made.config,
+        split=made.split,
+        provenance=made.provenance,
+        posterior=made.posterior,
+        gel_check=made.gel_check,
+        queries=made.queries,
+        float16=float16,
+    )
+
+
+def _half(path: Path, name: str, tensor: Tensor) -> Tensor:
+    half = tensor.half() if tensor.is_floating_point() else tensor
+    if not bool(torch.isfinite(half).all()):
+        raise CheckpointError(f"{path} cannot hold {name} as float16, which ends at 65504; store it as float32")
+    return half
+
+
+def require_writable(path: Path) -> None:
+    """Raise CheckpointError where no checkpoint can be written to `path`; asked before hours are spent on one."""
+    if path.suffix == ".md":
+        raise CheckpointError(f"{path} is where the model card goes; name the checkpoint {path.stem}.safetensors")
+    if path.is_dir():
+        raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with NamedTemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
+    require_ours(path, CHECKPOINT)
+    require_ours(beside(path, ".md"), CARD)
+
+
+def beside(path: Path, ending: str) -> Path:
+    """The file that goes with a checkpoint: `model.safetensors` and ".md" give `model.md`, `v1.2` gives `v1.2.md`."""
+    return path.with_name(path.name.removesuffix(".safetensors") + ending)
+
+
+def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
+    """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
+
+    known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
+    digest nor checksum is reckoned again.
+
+    >>> from pathlib import Path
+    >>> retrieval.load_checkpoint(Path("model.safetensors")).config.matcher.fingers
+    2
+    >>> retrieval.load_checkpoint(Path("none.safetensors"))
+    Traceback (most recent call last):
+    retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
+    """
+    state, header = read_tensors(path, check=known is None)
+    header = matcher_header(path, header)
+    about = known or stored_of(path, file_digest(path), header)
+    try:
+        split = None if header["split"] is None else Split.from_dict(header["split"])
+        posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
+        queries = state.pop(_QUERIES, None)
+        matcher = _matcher(about.config, state)
+        kept = None if queries is None else _queries(about.config, queries)
+    except BadInput as error:
+        raise unusable(path, error) from error
+    return Checkpoint(
+        path, about.digest, about.config, about.provenance, about.gel_check, matcher, split, posterior, kept
+    )
+
+
+def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    _require_fit(_without_memory(config, state), state)
+    matcher = _unloaded(config, state)
+    matcher.load_state_dict(state)
+    return matcher.eval()
+
+
+def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    """A matcher as it is configured; its gel head is there where the file has one."""
+    matcher = Matcher(config.matcher)
+    if any(name.startswith(_GEL_HEAD) for name in state):
+        matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
+    return matcher
+
+
+def _without_memory(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+    """The matcher with shapes alone: a header may ask for more memory than there is, or than can be counted."""
+    try:
+        with torch.device("meta"):
+            return _unloaded(config, state)
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+        raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
+
+
+def _queries(config: Config, queries: Tensor) -> NDArray[np.float16]:
+    if queries.dtype != torch.float16 or queries.ndim != 2 or queries.shape[1] != config.matcher.hidden:
+        raise CheckpointError(
+            f"{_QUERIES} must be float16 (touches, {config.matcher.hidden}); got {queries.dtype} {tuple(queries.shape)}"
+        )
+    return np.asarray(queries.numpy())
+
+
+def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
+    _require_fit(module, state)
+    module.load_state_dict(state)
+
+
+def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
+    got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
+    for name in sorted(got.keys() | wanted.keys()):
+        if got.get(name) != wanted.get(name):
+            raise CheckpointError(
+                f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
+                f"must be {wanted.get(name, 'absent')}"
+            )
+
+
+def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
+    """Write tensors and a JSON header as one safetensors file with a checksum over both, atomically."""
+    content = {"format": FORMAT, "software": __version__, **header}
+    text = json.dumps({**content, "sha256": _checksum(state, content)}, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, save(state, {HEADER: text}))
+
+
+def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `write_tensors` wrote; check: that it is what was written. Raises CheckpointError."""
+    header = read_header(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, MemoryError) as error:
+        raise unreadable(path, error) from error
+    for name, tensor in state.items():
+        if tensor.dtype not in _DTYPES:
+            raise CheckpointError(f"{path} holds {name} as {tensor.dtype}, which no checkpoint of ours does")
+    checksum = header.pop("sha256", None)
+    if check and checksum != _checksum(state, header):
+        raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
+    if check and any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
+        raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
+    return state, header
+
+
+def _checksum(state: Mapping[str, Tensor], header: Mapping[str, Any]) -> str:
+    """SHA-256 of header and tensors: the format itself takes a flipped bit in a weight or a setting for what it is."""
+    return tensors_digest(state, json.dumps(header))
+
+
+def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
+    """SHA-256 (hex) of `about` and of tensors, whose names, types and shapes count."""
+    digest = hashlib.sha256(about.encode())
+    for name in sorted(state):
+        tensor = state[name].cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _model_card(name: str, header: Mapping[str, Any]) -> str:
+    matcher, provenance = header["config"]["matcher"], header["provenance"]
+    posterior, gel_check, split = header["posterior"], header["gel_check"], header["split"]
+    lines = [
+        f"# {name}",
+        "",
+        f"Matches touches of {matcher['fingers']} gel image(s) with photos. Tower `{matcher['tower']}`, "
+        f"output `{matcher['tower_output']}`.",
+        "",
+        f"* Trained on: {provenance['source']} (data digest `{provenance['data_digest'][:16]}`)",
+        f"* Kept step: {provenance['step']} of {header['config']['training']['iterations']}, "
+        f"seed {header['config']['training']['seed']}",
+    ]
+    if split:
+        lines.append(
+            "* Objects: " + ", ".join(f"{len(split[part])} {part}" for part in ("train", "validation", "test"))
+        )
+    for key, value in provenance["metrics"].items():
+        lines.append(f"* {key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"* {key}: {value}")
+    if posterior:
+        lines.append(
+            f"* Probabilities: fitted on {posterior['tests']} sets of validation touches; "
+            f"slope {posterior['slope']:.3f}, offset {posterior['offset']:.3f}, "
+            f"dependence of grasps {posterior['dependence']:.3f}"
+        )
+    if gel_check:
+        shares = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["shares"].items()]
+        lines.append(f"* Check of gel images, on validation objects: {', '.join(shares)}")
+    return "\n".join(lines) + "\n"

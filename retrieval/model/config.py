@@ -1,0 +1,197 @@
+"""Settings of a matcher and of its training: frozen dataclasses, read from TOML, unknown keys refused."""
+
+import dataclasses
+import math
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from indexes.store.regular import read_regular
+from retrieval.data.images import Preprocessing
+from retrieval.errors import ConfigError
+
+# How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
+
+
+@dataclass(frozen=True)
+class MatcherConfig:
+    """Architecture of a matcher.
+
+    tower: backbone of both towers (`retrieval.model.towers.TOWERS`). tower_output: "classes" (the paper: the 1000-way
+    outputs are fused) or "pooled". fingers: gel images in one touch (training takes it from the recording).
+    hidden: width of the fusion head. standardise: centre and scale the features by their statistics over the
+    training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
+    embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the networks that
+    make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the contrastive ones.
+    """
+
+    tower: str = "resnet50"
+    tower_output: str = "classes"
+    fingers: int = 2
+    hidden: int = 1024
+    dropout: float = 0.5
+    standardise: bool = False
+    embedding_dim: int = 128
+    pruner_width: int = 0
+
+    def __post_init__(self) -> None:
+        _require(self.pruner_width >= 0, f"pruner_width must be at least 0; got {self.pruner_width}")
+        for name in ("fingers", "hidden", "embedding_dim"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
+        _require(0 <= self.dropout < 1, f"dropout must be in [0, 1); got {self.dropout}")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a matcher is trained.
+
+    init: "random", "imagenet" or the path of a state dict. iterations: optimiser steps. touches_per_batch times
+    (positives_per_touch + negatives_per_touch) pairs make a batch. contrastive_weight: weight of the contrastive
+    term; 0 is exactly the paper's loss, and leaves the embeddings untrained. listwise_weight: weight of a term that
+    asks each touch of a batch to pick its object's photos by match logit out of all photos of the batch; 0 in the
+    paper. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way round would; not in
+    the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the paper; "batch" from the
+    photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is "batch" where towers are
+    trained. freeze_batch_norm: keep the batch statistics of the initial weights. freeze_towers: train only what comes
+    after the towers; every image is then encoded once for the whole training. distil_steps: steps of teaching the
+    pruner after training, where the matcher has one (`retrieval.training.distil`). validation_fraction, test_fraction:
+    shares of the objects.
+    """
+
+    init: str = "imagenet"
+    iterations: int = 26_000
+    touches_per_batch: int = 6
+    positives_per_touch: int = 4
+    negatives_per_touch: int = 4
+    learning_rate: float = 1e-4
+    schedule: str = "constant"
+    contrastive_weight: float = 0.0
+    listwise_weight: float = 0.0
+    shuffle_fingers: bool = False
+    negatives: str = "auto"
+    freeze_batch_norm: bool = False
+    freeze_towers: bool = False
+    distil_steps: int = 600
+    validation_fraction: float = 0.1
+    test_fraction: float = 0.184
+    validate_every: int = 500
+    precision: str = "auto"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in (
+            "iterations",
+            "touches_per_batch",
+            "positives_per_touch",
+            "negatives_per_touch",
+            "distil_steps",
+            "validate_every",
+        ):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
+        _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
+        for name in ("contrastive_weight", "listwise_weight"):
+            weight = getattr(self, name)
+            _require(0 <= weight < math.inf, f"{name} must be a number from 0; got {weight}")
+        _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
+        for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
+            value = getattr(self, name)
+            _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
+        held_out = (self.validation_fraction, self.test_fraction)
+        _require(
+            min(held_out) >= 0 and sum(held_out) < 1,
+            f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
+        )
+
+    def of_steps(self, iterations: int) -> "TrainingConfig":
+        """The same with so many optimiser steps, and at most as many to teach the pruner."""
+        return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
+
+
+SCHEDULES = ("constant", "cosine")
+NEGATIVES = ("auto", "batch", "dataset")
+PRECISIONS = ("auto", "float32", "bfloat16")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides what a training run makes, but the recording."""
+
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    preprocessing: Preprocessing = field(default_factory=Preprocessing)
+
+    @property
+    def has_embeddings(self) -> bool:
+        """Whether embeddings are trained, so that candidates can be searched by them."""
+        return self.matcher.pruner_width > 0 or self.training.contrastive_weight > 0
+
+    def without_pruner(self) -> "Config":
+        """The same with no pruner to be taught."""
+        return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionary, as in a TOML file."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
+        """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
+        if not isinstance(tables, Mapping):
+            raise ConfigError(f"a configuration must be tables of settings; got {tables!r}")
+        parts = {"matcher": MatcherConfig, "training": TrainingConfig, "preprocessing": Preprocessing}
+        _refuse_unknown("configuration", tables, parts)
+        return cls(**{name: _build(name, parts[name], table) for name, table in tables.items()})
+
+
+def load_config(name_or_path: str) -> Config:
+    """Read a named preset (`paper`, `small`, ...) or a TOML file. Raises ConfigError."""
+    file = Path(name_or_path)
+    if name_or_path in preset_names():
+        file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
+    elif os.path.isdir(file) or not os.path.exists(file):  # False, and no error, for a name that no disk takes
+        raise ConfigError(
+            f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
+        )
+    try:
+        return Config.from_dict(tomllib.loads(read_regular(file).decode()))
+    except OSError as error:
+        raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # what TOML or UTF-8 forbids
+        raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    files = (resources.files("retrieval") / "configs").iterdir()
+    return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
+
+
+def _build(table_name: str, cls: type[Any], table: Any) -> Any:
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
+    fields = {item.name: item for item in dataclasses.fields(cls)}
+    _refuse_unknown(f"[{table_name}]", table, fields)
+    return cls(**{key: _typed(f"{table_name}.{key}", fields[key].type, value) for key, value in table.items()})
+
+
+def _typed(name: str, wanted: Any, value: Any) -> Any:
+    if wanted is float and type(value) is int and abs(value) < 2**63:
+        return float(value)
+    if type(value) is not wanted:
+        raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")
+    return value
+
+
+def _refuse_unknown(where: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    for key in given:
+        if key not in known:
+            raise ConfigError(f"unknown setting {key!r} in {where}; known: {', '.join(known)}")
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise ConfigError(message)

@@ -1,0 +1,148 @@
+"""`retrieve export`: the touch encoder as ONNX, if it is faster so on this machine."""
+
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from retrieval.console.files import EXPORT, require_ours, write_atomically
+from retrieval.errors import BadInput, RetrievalError
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import TorchEncoder, for_inference
+from retrieval.model.fusion import Matcher
+from retrieval.model.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, sealed
+
+ROUNDS = 9
+TOLERANCE = 1e-3
+"""Largest difference of a half from PyTorch's, relative to the largest half, and of an embedding's component."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What came of an export. Times are medians for one touch; differences are the largest, of halves relative to the
+    largest half."""
+
+    path: str
+    torch_ms: float
+    onnx_ms: float
+    half_difference: float
+    embedding_difference: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.path}: a touch is encoded in {self.onnx_ms:.1f} ms by ONNX Runtime, in {self.torch_ms:.1f} ms by "
+            f"PyTorch ({self.torch_ms / self.onnx_ms:.2f} times); halves differ by {self.half_difference:.1g} of the "
+            f"largest, embeddings by {self.embedding_difference:.1g}"
+        )
+
+
+def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
+    """Write the touch encoder of a checkpoint as ONNX: beside the checkpoint, where `retrieve query` looks for it, or
+    to `out`.
+
+    Raises BadInput where `onnx` or `onnxruntime` is missing; RetrievalError, and nothing is written, where ONNX
+    Runtime is not the faster one here or gives other numbers than PyTorch.
+    """
+    lacking = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
+    if lacking:
+        raise BadInput(f"export needs {lacking[0]}; install it with `pip install 'touch-retrieval[onnx]'`")
+    path = out or checkpoint.path.with_suffix(ENDING)
+    if path.suffix != ENDING:
+        raise BadInput(f"an export must be named *{ENDING}; got {path}")
+    require_ours(path, EXPORT)
+    unsettled = path.with_name(f".{path.name}.unsettled")
+    try:
+        write_atomically(unsettled, sealed(graph_of(checkpoint)))
+        result = compare(checkpoint, unsettled, path)
+        _require_gain(result)
+        unsettled.replace(path)
+    finally:
+        unsettled.unlink(missing_ok=True)
+    return result
+
+
+def _require_gain(result: Exported) -> None:
+    if not max(result.half_difference, result.embedding_difference) <= TOLERANCE:
+        raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
+    if result.onnx_ms >= result.torch_ms:
+        raise RetrievalError(f"nothing is exported, as PyTorch is as fast on this machine. {result}")
+
+
+def graph_of(checkpoint: Checkpoint) -> bytes:
+    """The touch encoder as an ONNX model that carries the checkpoint's digest; any number of touches at once."""
+    import onnx
+
+    side = checkpoint.config.preprocessing.touch_px
+    example = torch.zeros(1, checkpoint.config.matcher.fingers, side, side, 3)
+    outputs = ["half", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
+    with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # the exporter by tracing is the old one; the new one needs one more package
+        torch.onnx.export(
+            _TouchEncoder(checkpoint.matcher).eval(),  # the exporter leaves modules, shared ones too, as it found this
+            (example,),
+            str(Path(folder, "model.onnx")),
+            input_names=["images"],
+            output_names=outputs,
+            dynamic_axes={name: {0: "touches"} for name in ("images", *outputs)},
+            opset_version=18,
+            dynamo=False,
+        )
+        model = onnx.load_model(str(Path(folder, "model.onnx")))
+    onnx.helper.set_model_props(model, {CHECKPOINT: checkpoint.digest})
+    return bytes(model.SerializeToString())
+
+
+class _TouchEncoder(nn.Module):
+    """Images (B, fingers, H, W, 3) to halves, embeddings and what the gel head reads, where the matcher has one;
+    without the checks of values, which ONNX has not."""
+
+    def __init__(self, matcher: Matcher) -> None:
+        super().__init__()
+        self.matcher = for_inference(matcher, ["touch_tower"])
+        if isinstance(matcher.touch_norm, nn.BatchNorm1d):
+            self.matcher.add_module("touch_norm", _Standardise(matcher.touch_norm))
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        tower = self.matcher.touch_tower
+        pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
+        features = tower._encode((pictures - tower.mean) / tower.std)
+        features = features.reshape(-1, self.matcher.config.fingers * tower.feature_count)
+        code, readings = self.matcher.touch_entry(features), self.matcher.gel_readings(features)
+        return (code.half, code.embedding) if readings is None else (code.half, code.embedding, readings)
+
+
+class _Standardise(nn.Module):
+    """Batch normalisation in evaluation mode, written out: the exporter wants to know the width of its input."""
+
+    def __init__(self, norm: nn.BatchNorm1d) -> None:
+        super().__init__()
+        self.mean, self.scale = norm.get_buffer("running_mean"), torch.rsqrt(norm.get_buffer("running_var") + norm.eps)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) * self.scale
+
+
+def compare(checkpoint: Checkpoint, written: Path, path: Path) -> Exported:
+    """Encode the same touch by both in turns; `path` is what `written` will be called."""
+    ours, theirs = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
+    side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
+    touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
+    (half, embedding, *_), (other_half, other_embedding, *_) = ours.encode([touch]), theirs.encode([touch])
+    times = [(_ms(lambda: ours.encode([touch])), _ms(lambda: theirs.encode([touch]))) for _ in range(ROUNDS)]
+    torch_ms, onnx_ms = (statistics.median(arm) for arm in zip(*times, strict=True))
+    half_difference = float(np.abs(half - other_half).max() / np.abs(half).max())
+    return Exported(str(path), torch_ms, onnx_ms, half_difference, float(np.abs(embedding - other_embedding).max()))
+
+
+def _ms(function: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    function()
+    return 1e3 * (time.perf_counter() - start)

@@ -1,0 +1,157 @@
+"""The matcher: two towers, the fusion head that judges a pair, and the projections for candidate search.
+
+The first layer of the head is linear in the concatenation of the modalities, so it is stored as two halves:
+`W [t; v] + b = (W_t t + b) + W_v v`. A photo's half can be computed once, stored, and added to any touch's.
+"""
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from retrieval.errors import BadInput
+from retrieval.model.config import MatcherConfig
+from retrieval.model.gel_head import GelHead
+from retrieval.model.judge import Judge
+from retrieval.model.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
+from retrieval.model.pruner import Pruner
+from retrieval.model.towers import build_tower
+
+
+class Code(NamedTuple):
+    """What the matcher keeps of one image: its share of the head's first layer and its place in the metric space.
+
+    half (B, hidden) and embedding (B, embedding_dim), float32; embeddings have norm 1.
+    """
+
+    half: Tensor
+    embedding: Tensor
+
+
+class FusionHead(nn.Module):
+    """Late fusion (Lin et al., ICRA 2019): two layers of `hidden` units with ReLU, dropout between, one logit."""
+
+    def __init__(self, touch_features: int, photo_features: int, hidden: int, dropout: float) -> None:
+        super().__init__()
+        self.touch_half = nn.Linear(touch_features, hidden)
+        self.photo_half = nn.Linear(photo_features, hidden, bias=False)
+        self.dropout = nn.Dropout(dropout)
+        self.second = nn.Linear(hidden, hidden)
+        self.out = nn.Linear(hidden, 1)
+        self._initialise_as_one_layer()
+
+    def _initialise_as_one_layer(self) -> None:
+        """PyTorch's default for the concatenated layer: uniform within 1 / sqrt(all inputs)."""
+        bound = 1 / math.sqrt(self.touch_half.in_features + self.photo_half.in_features)
+        for parameter in (self.touch_half.weight, self.touch_half.bias, self.photo_half.weight):
+            nn.init.uniform_(parameter, -bound, bound)
+
+    def forward(self, touch_half: Tensor, photo_half: Tensor) -> Tensor:
+        """Match logits (P,) of pairs of halves (P, hidden); either side broadcasts from (1, hidden)."""
+        x = self.dropout(functional.relu(touch_half + photo_half))
+        x = functional.relu(self.second(x))
+        return self.out(x).squeeze(-1)  # type: ignore[no-any-return]
+
+
+class Matcher(nn.Module):
+    """Touch and photo in, halves and embeddings out; halves in, match logit out."""
+
+    def __init__(self, config: MatcherConfig) -> None:
+        super().__init__()
+        self.config = config
+        # One set of weights for all fingers.
+        self.touch_tower = build_tower(config.tower, config.tower_output)
+        self.photo_tower = build_tower(config.tower, config.tower_output)
+        touch_features = config.fingers * self.touch_tower.feature_count
+        photo_features = self.photo_tower.feature_count
+        self.head = FusionHead(touch_features, photo_features, config.hidden, config.dropout)
+        # After the head, so that their initial weights do not change the paper's.
+        self.touch_projection = nn.Linear(touch_features, config.embedding_dim)
+        self.photo_projection = nn.Linear(photo_features, config.embedding_dim)
+        # Per feature and without parameters; at use a fixed affine map, so halves stay sums of shares.
+        norm = partial(nn.BatchNorm1d, affine=False) if config.standardise else nn.Identity
+        self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
+        self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
+        self.pruner = Pruner(config.hidden, config.pruner_width, config.embedding_dim) if config.pruner_width else None
+        self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.judgement`)
+
+    def touch_features(self, touches: Tensor) -> Tensor:
+        """Features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
+
+        Raises BadInput where the number of images is not the number of fingers this matcher was built for.
+        """
+        fingers = self.config.fingers
+        if touches.ndim != 5 or touches.shape[1] != fingers:
+            got = f"{touches.shape[1]} image(s)" if touches.ndim == 5 else f"an array of shape {tuple(touches.shape)}"
+            raise BadInput(f"this matcher takes {fingers} gel image(s) for one touch; got {got}")
+        features: Tensor = self.touch_tower(touches.flatten(0, 1))
+        return features.float().view(len(touches), -1)
+
+    def photo_features(self, photos: Tensor) -> Tensor:
+        """Features (B, features) of photos (B, 3, H, W) in 0..1."""
+        features: Tensor = self.photo_tower(photos)
+        return features.float()
+
+    def touch_code(self, features: Tensor) -> Code:
+        """Half of touch features, and their embedding by the contrastive projection."""
+        features = self.touch_norm(features)
+        return Code(self.head.touch_half(features), _unit(self.touch_projection(features)))
+
+    def photo_code(self, features: Tensor) -> Code:
+        """Half of photo features, and their embedding by the contrastive projection."""
+        features = self.photo_norm(features)
+        return Code(self.head.photo_half(features), _unit(self.photo_projection(features)))
+
+    def touch_entry(self, features: Tensor) -> Code:
+        """Half and embedding for candidate search of touch features."""
+        code = self.touch_code(features)
+        return code if self.pruner is None else Code(code.half, self.pruner.touch(code.half))
+
+    def gel_readings(self, features: Tensor) -> Tensor | None:
+        """(B, fingers, 2) what touch features say of each finger's image (`GelHead`); None without a check."""
+        if self.gel_head is None:
+            return None
+        readings: Tensor = self.gel_head(features.view(-1, self.config.fingers, self.touch_tower.feature_count))
+        return readings
+
+    def photo_entry(self, features: Tensor) -> Code:
+        """Half and embedding for candidate search of photo features: what an index keeps."""
+        code = self.photo_code(features)
+        return code if self.pruner is None else Code(code.half, self.pruner.photo(code.half))
+
+    def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
+        """Match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""
+        touch = self.touch_code(self.touch_features(touches))
+        photo = self.photo_code(self.photo_features(photos))
+        return self.head(touch.half, photo.half)  # type: ignore[no-any-return]
+
+    @torch.no_grad()
+    def clamp_scale(self) -> None:
+        """Hold the scale of the contrastive scores at 100 at most; on the parameter, so that it can come back."""
+        self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
+
+
+def _unit(x: Tensor) -> Tensor:
+    return functional.normalize(x.float(), dim=-1, eps=1e-6)
+
+
+def judge_of(head: FusionHead) -> Judge:
+    """What follows the halves of a head, dropout off whatever its mode; a view of its weights where they lie on the
+    CPU."""
+    parts = (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
+    return Judge(*(part.detach().cpu().numpy() for part in parts))
+
+
+def score_halves(
+    head: FusionHead,
+    touch_halves: Tensor,
+    photo_halves: NDArray[np.floating[Any]],
+    rows: NDArray[np.int64] | None = None,
+) -> NDArray[np.float32]:
+    """`Judge.logits` of a head in PyTorch and touch halves (G, hidden)."""
+    return judge_of(head).logits(touch_halves.detach().cpu().numpy(), photo_halves, rows)

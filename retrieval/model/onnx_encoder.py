@@ -1,0 +1,140 @@
+"""The touch encoder on ONNX Runtime, as `retrieve export` writes it beside a checkpoint: a query without PyTorch.
+
+The file is ONNX with the checkpoint's digest among its metadata. The last entry of these is a SHA-256 of everything
+before it, since ONNX itself takes a flipped bit in a weight for what it is.
+"""
+
+import ctypes
+import hashlib
+import logging
+import os
+from collections.abc import Sequence
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from weakref import WeakSet
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.store.regular import read_regular
+from retrieval.console.files import SEAL
+from retrieval.data.resize import RgbImage
+from retrieval.errors import CheckpointError
+from retrieval.model.encoded import TouchCodes
+from retrieval.model.stored import Stored
+
+log = logging.getLogger(__name__)
+ENDING = ".onnx"
+CHECKPOINT = "touch_retrieval.checkpoint"
+_SEAL_BYTES = 2 + 2 + len(SEAL) + 2 + 64
+Floats = NDArray[np.float32]
+
+
+class OnnxEncoder:
+    """An exported touch encoder, opened."""
+
+    name = "onnx"
+
+    def __init__(self, path: Path, checkpoint: str, threads: int | None = None) -> None:
+        """Open `path`, which must be the export of the checkpoint with that digest. threads: None leaves the choice
+        to ONNX Runtime. Raises CheckpointError for another or a damaged one."""
+        self._open = partial(_session, path, checkpoint, threads)
+        self._process, self._session = os.getpid(), self._open()
+
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
+        """Of touches, each its fingers' images in 0..1."""
+        images = np.stack([np.stack(fingers) for fingers in touches])
+        try:
+            half, embedding, *more = self._own_session().run(None, {"images": images})
+        except Exception as error:  # its errors have no common base
+            raise CheckpointError(f"the export of this checkpoint cannot be run ({error}); export it again") from error
+        codes = TouchCodes(half, embedding, more[0] if more else None)
+        for name, values, axes in (("half", half, 2), ("embedding", embedding, 2), ("reading", codes.readings, 3)):
+            if values is None:
+                continue
+            if values.ndim != axes or len(values) != len(touches) or values.dtype != np.float32:
+                raise CheckpointError(
+                    f"the export must give a {name} of float32 for each touch, gives {values.dtype} {values.shape}; "
+                    "export the checkpoint again"
+                )
+        return codes
+
+    def _own_session(self) -> Any:
+        """The session of this process; a fork opens its own."""
+        if self._process != os.getpid():
+            self._session = self._open()
+            self._process = os.getpid()
+        return self._session
+
+
+_sessions: WeakSet[Any] = WeakSet()
+
+
+def _leave_alone() -> None:
+    """A fork has none of the threads of the sessions it was born with, and would wait for them for ever, even to let
+    go of one: here they are never let go of."""
+    for session in _sessions:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+
+
+os.register_at_fork(after_in_child=_leave_alone)
+
+
+def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent; and no fork waits for its thread at the end
+    import onnxruntime
+
+    model = unsealed(path)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or 0
+    # Its threads would spin after a run, on the cores that decode the next images or judge candidates.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no common base
+        raise CheckpointError(f"{path} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
+    made_from = session.get_modelmeta().custom_metadata_map.get(CHECKPOINT, "unknown")
+    if made_from != checkpoint:
+        raise CheckpointError(f"{path} is the export of another checkpoint ({made_from[:12]})")
+    _sessions.add(session)
+    return session
+
+
+def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:
+    """The export that lies beside a checkpoint, where it is of this checkpoint and ONNX Runtime is installed.
+
+    One that is stale or damaged is not used, and a warning says so.
+    """
+    path = checkpoint.path.with_suffix(ENDING)
+    if not path.is_file() or find_spec("onnxruntime") is None:
+        return None
+    try:
+        return OnnxEncoder(path, checkpoint.digest)
+    except CheckpointError as error:
+        log.warning("%s; PyTorch is used instead (slower to start): run `retrieve export` again", error)
+        return None
+
+
+def sealed(model: bytes) -> bytes:
+    """`model` with one more entry of metadata: `metadata_props` is field 14 of ONNX's ModelProto, a map entry has its
+    key in field 1 and its value in field 2, and what stands last in a protocol buffer is merged with the rest."""
+    entry = _field(1, SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
+    return model + _field(14, entry)
+
+
+def unsealed(path: Path) -> bytes:
+    """The bytes of a sealed file. Raises CheckpointError where one of them changed."""
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
+    if len(data) <= _SEAL_BYTES or sealed(data[:-_SEAL_BYTES]) != data:
+        raise CheckpointError(f"{path} is damaged or no export of `retrieve export`")
+    return data
+
+
+def _field(number: int, content: bytes) -> bytes:
+    """A length-delimited field of a protocol buffer; for contents under 128 bytes."""
+    return bytes([number << 3 | 2, len(content)]) + content

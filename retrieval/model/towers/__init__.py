@@ -1,0 +1,36 @@
+"""Towers: one encoder per modality. A new backbone is one file, one row of `TOWERS` and one test parameter."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.model.towers.base import Tower
+
+TOWERS = {
+    "mobilenet_v2": "retrieval.model.towers.mobilenet:mobilenet_v2",
+    "resnet18": "retrieval.model.towers.resnet:resnet18",
+    "resnet34": "retrieval.model.towers.resnet:resnet34",
+    "resnet50": "retrieval.model.towers.resnet:resnet50",
+    "small": "retrieval.model.towers.small:small",
+}
+
+OUTPUTS = ("classes", "pooled", "stages")
+
+
+def build_tower(name: str, output: str = "pooled") -> "Tower":
+    """Build the tower `name` with random weights.
+
+    output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way
+    linear layer that ImageNet checkpoints carry, whose outputs the paper concatenates; "stages" gives mean, deviation
+    and maximum over the maps of several stages, from edges to parts.
+    Raises ConfigError for an unknown name or output.
+    """
+    if name not in TOWERS:
+        raise ConfigError(f"tower must be one of {', '.join(sorted(TOWERS))}; got {name!r}")
+    if output not in OUTPUTS:
+        raise ConfigError(f"tower output must be one of {', '.join(OUTPUTS)}; got {output!r}")
+    module, function = TOWERS[name].split(":")
+    tower: Tower = getattr(import_module(module), function)(output)
+    return tower

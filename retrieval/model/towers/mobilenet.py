@@ -1,0 +1,120 @@
+"""MobileNetV2, width 1.0 (Sandler et al., CVPR 2018), with the key names of torchvision's checkpoints."""
+
+import re
+from collections.abc import Iterator
+
+from torch import Tensor, nn
+
+from retrieval.model.towers.base import Tower, stage_statistics
+
+# Expansion, output channels, blocks, first stride: table 2 of the paper.
+_STAGES = (
+    (1, 16, 1, 1),
+    (6, 24, 2, 2),
+    (6, 32, 3, 2),
+    (6, 64, 4, 2),
+    (6, 96, 3, 1),
+    (6, 160, 3, 2),
+    (6, 320, 1, 1),
+)
+# Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
+_DESCRIBED = {6: 32, 10: 64, 13: 96, 17: 320}
+
+
+def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, groups=groups, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU6(inplace=True),
+    )
+
+
+class InvertedResidual(nn.Module):
+    """1 x 1 expansion, 3 x 3 depthwise, linear 1 x 1 projection; a shortcut where shapes allow."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, expansion: int) -> None:
+        super().__init__()
+        hidden = inputs * expansion
+        layers: list[nn.Module] = [] if expansion == 1 else [_convolution(inputs, hidden, 1)]
+        layers += [
+            _convolution(hidden, hidden, 3, stride, groups=hidden),
+            nn.Conv2d(hidden, outputs, 1, bias=False),
+            nn.BatchNorm2d(outputs),
+        ]
+        self.conv = nn.Sequential(*layers)
+        self.has_shortcut = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.conv(x)
+        return x + y if self.has_shortcut else y
+
+
+class MobileNetV2(Tower):
+    """Nineteen convolutional features, global average, and the 1000-way layer where it is asked for."""
+
+    optional_prefixes = ("classifier.", "features.18.")
+
+    def __init__(self, output: str) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [_convolution(3, 32, 3, stride=2)]
+        inputs = 32
+        for expansion, outputs, blocks, first_stride in _STAGES:
+            for block in range(blocks):
+                layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
+                inputs = outputs
+        self.output = output
+        if output == "stages":
+            self.feature_count = 3 * sum(_DESCRIBED.values())
+        else:
+            layers.append(_convolution(inputs, 1280, 1))
+            self.feature_count = 1000 if output == "classes" else 1280
+        self.features = nn.Sequential(*layers)
+        self.classifier = nn.Sequential(nn.Dropout(0.2), nn.Linear(1280, 1000)) if output == "classes" else None
+        _initialise(self)
+
+    def _encode(self, images: Tensor) -> Tensor:
+        if self.output == "stages":
+            return stage_statistics(self._stages(images))
+        x = nn.functional.adaptive_avg_pool2d(self.features(images), 1).flatten(1)
+        return x if self.classifier is None else self.classifier(x)
+
+    def _stages(self, x: Tensor) -> Iterator[Tensor]:
+        for number, layer in enumerate(self.features):
+            x = layer(x)
+            if number in _DESCRIBED:
+                yield x
+
+    @staticmethod
+    def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Map the flat key layout of early checkpoints (`features.1.conv.3.weight`) to today's nested one."""
+        if "features.2.conv.0.0.weight" in state or "features.2.conv.0.weight" not in state:
+            return state
+        return {_nested_key(key): value for key, value in state.items()}
+
+
+# A flat block lists conv, bn, relu of the expansion (absent in the first block) and the depthwise step, then conv, bn.
+_NESTED = {0: "0.0", 1: "0.1", 3: "1.0", 4: "1.1", 6: "2", 7: "3"}
+_NESTED_FIRST = {0: "0.0", 1: "0.1", 3: "1", 4: "2"}
+
+
+def _nested_key(key: str) -> str:
+    match = re.fullmatch(r"features\.(\d+)\.conv\.(\d+)\.(\w+)", key)
+    if match is None:
+        return key
+    block, layer, name = int(match[1]), int(match[2]), match[3]
+    return f"features.{block}.conv.{(_NESTED_FIRST if block == 1 else _NESTED)[layer]}.{name}"
+
+
+def _initialise(tower: nn.Module) -> None:
+    """He initialisation by fan-out for convolutions, N(0, 0.01) for the classifier, as for the published weights."""
+    for module in tower.modules():
+        if isinstance(module, nn.Conv2d):
+            nn.init.kaiming_normal_(module.weight, mode="fan_out")
+        elif isinstance(module, nn.Linear):
+            nn.init.normal_(module.weight, std=0.01)
+            nn.init.zeros_(module.bias)
+
+
+def mobilenet_v2(output: str) -> MobileNetV2:
+    """MobileNetV2: 1280 pooled features, 1536 of stages; 3,504,872 parameters with its 1000-way layer."""
+    return MobileNetV2(output)

@@ -1,0 +1,54 @@
+"""A tower for tests, the demo and two CPU cores: four strided convolutions with group normalisation.
+
+Group normalisation keeps every image's output independent of the rest of its batch, in training too.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+from retrieval.model.towers.base import Tower, stage_statistics
+
+_WIDTHS = (24, 48, 96, 128)
+
+
+class Small(Tower):
+    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features."""
+
+    optional_prefixes = ("fc.",)
+
+    def __init__(self, output: str) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        inputs = 3
+        for stage, width in enumerate(_WIDTHS):
+            kernel = 5 if stage == 0 else 3
+            layers += [
+                nn.Conv2d(inputs, width, kernel, stride=2, padding=kernel // 2, bias=False),
+                nn.GroupNorm(8, width),
+                nn.ReLU(inplace=True),
+            ]
+            inputs = width
+        self.stages = nn.Sequential(*layers)
+        self.output = output
+        self.fc = nn.Linear(2 * inputs, 1000) if output == "classes" else None
+        self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
+
+    def _encode(self, images: Tensor) -> Tensor:
+        if self.output == "stages":
+            return stage_statistics(self._maps(images))
+        x = self.stages(images).flatten(2)
+        x = torch.cat([x.mean(2), x.amax(2)], dim=1)
+        return x if self.fc is None else self.fc(x)
+
+    def _maps(self, x: Tensor) -> Iterator[Tensor]:
+        for layer in self.stages:
+            x = layer(x)
+            if isinstance(layer, nn.ReLU):
+                yield x
+
+
+def small(output: str) -> Small:
+    """The small tower: 256 pooled features, 888 of stages."""
+    return Small(output)

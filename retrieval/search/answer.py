@@ -1,0 +1,137 @@
+"""What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from retrieval.model.gel_check import NO_CONTACT, NOT_A_GEL
+
+MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
+EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_GEL: 5}
+"""Of `retrieve query`, by verdict."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """One object of a ranking, shown by its best photo.
+
+    logit: what ranks. probability: P(object | touches, catalogue); over all objects and "none of these" it adds up to
+    1; None where the model was never calibrated. photo: its path in the catalogue; photo_path: on the disk, absolute.
+    metadata: the user's own.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     best = searcher.query(["a.png", "b.png"]).top
+    >>> best.rank, best.photo_path.is_absolute(), best.photo_path.name == best.photo.split("/")[-1]
+    (1, True, True)
+    """
+
+    rank: int
+    object_id: str
+    logit: float
+    probability: float | None
+    photo: str
+    metadata: dict[str, Any]
+    photo_path: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
+        return {name: value for name, value in asdict(self).items() if name != "photo_path"}
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """A verdict and a ranking.
+
+    verdict: "match": the best object is likelier than that the catalogue lacks it. "none of these": it is not; the
+    ranking names the nearest. "no contact": no grasp felt anything; "not a gel image": one of the images is none, as
+    far as the model knows gels; both come without a ranking. "uncalibrated": a ranking of a model without
+    probabilities.
+
+    touches: the gel images of each grasp by name, files by their paths. grasps: what each shows, "contact", "no
+    contact" or "not a gel image"; only grasps with contact were judged. none_probability: that the object is none of
+    the catalogue's. posterior: the formula and its numbers (`retrieval.model.posterior`). index: what was searched with
+    what. timing_ms: by stage, of this query; of several at once (`Searcher.query_many`) an equal share for each.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     answer = searcher.query(["a.png", "b.png"])
+    >>> answer.top == answer.results[0]
+    True
+    >>> answer.to_dict()["query"]
+    {'touches': [['a.png', 'b.png']], 'grasps': ['contact']}
+    """
+
+    touches: list[list[str]]
+    grasps: list[str]
+    index: dict[str, Any]
+    timing_ms: dict[str, float]
+    verdict: str
+    none_probability: float | None
+    posterior: dict[str, Any] | None
+    results: list[Match]
+
+    @property
+    def top(self) -> Match | None:
+        """The best object; None where nothing was ranked."""
+        return self.results[0] if self.results else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The document of `retrieve query --json`."""
+        return {
+            "query": {"touches": self.touches, "grasps": self.grasps},
+            "index": self.index,
+            "timing_ms": self.timing_ms,
+            "verdict": self.verdict,
+            "none_probability": self.none_probability,
+            "posterior": self.posterior,
+            "results": [match.to_dict() for match in self.results],
+        }
+
+
+def in_words(result: QueryResult) -> str:
+    """The verdict as a sentence for people, and which grasps were left out."""
+    left_out = [number for number, shown in enumerate(result.grasps, start=1) if shown == NO_CONTACT]
+    remark = f"; grasps without contact were left out: {_listed(left_out)}" if left_out and result.results else ""
+    return _SENTENCES[result.verdict](result) + remark
+
+
+def _match_words(result: QueryResult) -> str:
+    best = result.results[0]
+    return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {result.none_probability:.2f}"
+
+
+def _none_words(result: QueryResult) -> str:
+    best = result.results[0]
+    return (
+        f"none of these: that the catalogue lacks the object has probability {result.none_probability:.2f}, its "
+        f"nearest, {best.object_id}, {best.probability:.2f}; more grasps may tell, and --none-prior says how likely it "
+        "is beforehand"
+    )
+
+
+def _no_contact_words(result: QueryResult) -> str:
+    return "no contact: the gels look untouched; close the jaws on the object, or press harder, and query again"
+
+
+def _not_a_gel_words(result: QueryResult) -> str:
+    numbers = [number for number, shown in enumerate(result.grasps, start=1) if shown == NOT_A_GEL]
+    return (
+        f"not a gel image: what was given for grasp {_listed(numbers)} does not look like a gel that the model knows "
+        f"(trained on: {result.index['trained_on']}); give gel images, or a model trained on this sensor"
+    )
+
+
+def _uncalibrated_words(result: QueryResult) -> str:
+    return f"uncalibrated: {result.results[0].object_id} comes first; this model has no probabilities"
+
+
+def _listed(numbers: list[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+_SENTENCES = {
+    MATCH: _match_words,
+    NONE_OF_THESE: _none_words,
+    NO_CONTACT: _no_contact_words,
+    NOT_A_GEL: _not_a_gel_words,
+    UNCALIBRATED: _uncalibrated_words,
+}

@@ -1,0 +1,236 @@
+"""From a folder of photos to a searchable index; only photos whose content changed are embedded again."""
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch  # before faiss, which the index imports: both bring OpenMP
+
+from indexes import load_kind
+from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.kinds.choice import choose_kind, require_buildable
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.manifest import read_manifest
+from indexes.store.spool import Block
+from indexes.store.unfinished import Unfinished
+from indexes.store.writing import RECALL_QUERIES, Chosen, Laid
+from retrieval.data.catalogue import Catalogue, list_catalogue
+from retrieval.data.naming import FOLDER, Naming, doubts, per_object
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.stored import fingerprint
+from retrieval.search.build_report import BuildReport
+from retrieval.search.embed import Embedder, Part, layouts
+from retrieval.search.operating import (
+    Asked,
+    Bench,
+    Settled,
+    all_judged,
+    can_measure,
+    kept,
+    needs_measuring,
+    query_codes,
+    sentence,
+    settle,
+)
+from retrieval.version import __version__
+
+
+def build_index(
+    folder: Path,
+    checkpoint: Checkpoint,
+    out: Path,
+    *,
+    objects_from: str | None = None,
+    kind: str | None = None,
+    min_recall: float | None = None,
+    max_ms: float | None = None,
+    quiet: bool = False,
+) -> BuildReport:
+    """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
+
+    objects_from: which object a photo shows (`retrieval.data.naming`); where None, as the index has it, else by folder.
+    kind, min_recall, max_ms: what is asked of the search (`retrieval.search.operating`); where all are None, exact
+    search. Where neither the photos' content nor their objects nor what is asked for changed, nothing is written.
+    Photos that cannot be read are skipped and reported. Raises BadInput for a rule that is none, DatasetError where no
+    photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the index as it was. What
+    was embedded until an error, or until the process was killed, is not embedded again by the next build
+    (`indexes.store.unfinished`).
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("index"), quiet=True)
+    >>> report.photos, report.embedded  # the index was there, and no photo changed
+    (4, 0)
+    """
+    asked = Asked(kind, min_recall, max_ms)
+    store = IndexStore(out)
+    named_before = _named_before(store)
+    naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
+    catalogue = list_catalogue(folder, naming)
+    if kind is not None:
+        require_buildable(kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
+    with store.lock():
+        parent, why = _parent(store, checkpoint)
+        if named_before not in (None, naming.text):
+            why = f"Objects are named by {naming.text} now, no longer by {named_before}. {why}".rstrip()
+        about = {
+            "checkpoint": str(checkpoint.path.resolve()),
+            "catalogue": str(folder.resolve()),
+            "objects_from": naming.text,
+            "asked": asdict(asked),
+        }
+        start = time.perf_counter()
+        with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
+            made = Embedder(checkpoint, parent, unfinished)
+            with closing(made.parts(catalogue, quiet)) as parts:
+                changed = _unless_same(parent, parts, about)
+                job = _Job(store, made, about, asked, quiet)
+                generation = parent if parent is not None and changed is None else job.write(changed or ())
+            unfinished.clear()
+        seconds = time.perf_counter() - start - job.settling_s
+    inside = out.resolve()
+    names = sorted(made.objects)
+    return BuildReport(
+        index=str(out),
+        generation=generation.name,
+        written=changed is not None,
+        model=str(checkpoint.path),
+        photos=generation.count,
+        objects=len(names),
+        objects_from=naming.text,
+        per_object=per_object(list(made.objects.values())),
+        examples=_examples(catalogue, names),
+        doubts=doubts(made.objects, naming),
+        embedded=made.embedded,
+        reused=made.photos - made.embedded,
+        renamed=made.renamed,
+        resumed=made.resumed,
+        removed=made.removed,
+        skipped=made.skipped,
+        ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(inside)],
+        without_photo=sorted(set(catalogue.object_ids) - set(names)),
+        notes=list(catalogue.notes),
+        kind=generation.manifest.kind,
+        reason=" ".join(filter(None, (why, generation.manifest.about["reason"]))),
+        recall=generation.manifest.recall,
+        candidates=generation.manifest.about["candidates"],
+        half_error=made.half_error,
+        seconds=seconds,
+    )
+
+
+def _named_before(store: IndexStore) -> str | None:
+    """The rule that named the objects of the index there, None where there is none that says so."""
+    try:
+        text = read_manifest(store.path / store.current()).about.get("objects_from")
+        return None if text is None else Naming(text).text
+    except (IndexesError, BadInput, TypeError):
+        return None
+
+
+def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str]]:
+    """The first, the middle and the last object, each with its first photo."""
+    wanted = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
+    found: dict[str, str] = {}
+    for photo in catalogue.photos:
+        found.setdefault(photo.object_id, photo.path)
+    return [(name, found[name]) for name in wanted]
+
+
+def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:
+    """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest say the
+    same. Parts are held back until one differs; these have rows alone."""
+    if parent is None or any(parent.manifest.about.get(key) != value for key, value in about.items()):
+        return parts
+    same: list[Part] = []
+    place = 0
+    for part in parts:
+        same.append(part)
+        if part.halves is not None or parent.rows[place : place + len(part.rows)] != part.rows:
+            return chain(same, parts)
+        place += len(part.rows)
+    return None if place == parent.count else iter(same)
+
+
+@dataclass
+class _Job:
+    """Writes a generation from parts, and settles how it is to be searched when all of them are on the disk."""
+
+    store: IndexStore
+    made: Embedder
+    about: Mapping[str, Any]
+    asked: Asked
+    quiet: bool
+    settling_s: float = 0.0
+
+    def write(self, parts: Iterable[Part]) -> Generation:
+        """Write the parts as they come."""
+        checkpoint = self.made.checkpoint
+        return self.store.write_blocks(
+            (_block(part) for part in parts),
+            {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
+            fingerprint=fingerprint(checkpoint),
+            about=self.about,
+            parent=self.made.parent,
+            software=__version__,
+            settle=self._settle,
+            queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
+        )
+
+    def _settle(self, laid: Laid) -> Chosen:
+        start = time.perf_counter()
+        settled = _settled(self.made, laid, self.asked, self.quiet)
+        self.settling_s = time.perf_counter() - start
+        about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
+        return Chosen(settled.kind, settled.parameters, about)
+
+
+def _block(part: Part) -> Block:
+    return Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
+
+
+def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, str]:
+    """The generation to take unchanged photos over from, and why not where there is one that cannot serve."""
+    try:
+        return store.open(expect=fingerprint(checkpoint)), ""
+    except NoIndex:
+        return None, ""
+    except MismatchedIndex:
+        return None, "The model or its preprocessing changed, so every photo was embedded again."
+    except (CorruptIndex, UnsupportedFormat) as error:
+        return None, f"The index there was not usable, so every photo was embedded again ({error})."
+
+
+def _settled(made: Embedder, laid: Laid, asked: Asked, quiet: bool) -> Settled:
+    """The kind to build and the candidates to judge, measured where there is something to measure with."""
+    photos, checkpoint = len(laid.slots), made.checkpoint
+    previous = None if made.parent is None else made.parent.manifest
+    before = None if previous is None else previous.about.get("candidates")
+    again = kept(before, asked, photos, made.embedded + made.resumed + made.removed)
+    if previous is not None and again is not None:
+        parameters = load_kind(previous.kind).parameters_from(previous.asked)
+        return Settled(previous.kind, parameters, sentence(again), again)
+    if not checkpoint.config.has_embeddings or not needs_measuring(photos, asked):
+        chosen, judged = asked.kind or "flat", all_judged(photos, asked)
+        return Settled(chosen, load_kind(chosen).parameters_type(), sentence(judged), judged)
+    if not can_measure(checkpoint):
+        return _by_neighbours(laid, asked)
+    return settle(Bench(checkpoint, laid.vectors, laid.slots, laid.arrays["halves"], quiet=quiet), asked)
+
+
+def _by_neighbours(laid: Laid, asked: Asked) -> Settled:
+    """The kind by its recall of nearest neighbours, where the checkpoint keeps no touches to find winners of."""
+    why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
+    if asked.kind is not None:
+        return Settled(asked.kind, load_kind(asked.kind).parameters_type(), f"It was asked for. {why}", None)
+    # Without a budget nothing is measured, so no vector need be read.
+    vectors = laid.vectors[:0] if asked.max_ms is None else laid.vectors[np.unique(laid.slots)]
+    choice = choose_kind(vectors, asked.max_ms, min_recall=asked.target, threads=torch.get_num_threads())
+    return Settled(choice.kind, choice.parameters, f"{choice.reason} {why}", None)

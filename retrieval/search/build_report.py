@@ -1,0 +1,124 @@
+"""What `build-index` did and understood, for people and for JSON."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import PurePosixPath
+from typing import Any
+
+from retrieval.data.catalogue import SkippedPhoto
+
+SHOWN, FEW = 20, 5
+"""Lines to show on a terminal of what has a reason each, and of what has not."""
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What a build did.
+
+    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that
+    names objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects, each
+    with a photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew,
+    `renamed` of which had another name in the index before, and `resumed` of which stood in no index yet, but had been
+    embedded by a build that was cut off. removed: names that are gone. skipped: pictures that could not be read;
+    ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all of whose
+    pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
+    (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
+    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
+
+    >>> from pathlib import Path
+    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("new-index"), quiet=True)
+    >>> report.written, report.objects, report.photos, report.skipped
+    (True, 2, 4, [])
+    """
+
+    index: str
+    generation: str
+    written: bool
+    model: str
+    photos: int
+    objects: int
+    objects_from: str
+    per_object: dict[str, float]
+    examples: list[tuple[str, str]]
+    doubts: list[str]
+    embedded: int
+    reused: int
+    renamed: int
+    resumed: int
+    removed: int
+    skipped: list[SkippedPhoto]
+    ignored: list[str]
+    without_photo: list[str]
+    notes: list[str]
+    kind: str
+    reason: str
+    recall: Any
+    candidates: dict[str, Any] | None
+    half_error: float
+    seconds: float
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many files were left out for each reason, the most frequent first."""
+        endings = (PurePosixPath(name).suffix.lower() or "without an ending" for name in self.ignored)
+        reasons = [f"no picture by name ({ending})" for ending in endings]
+        reasons += [item.reason.split(":")[0] for item in self.skipped]
+        return dict(Counter(reasons).most_common())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return asdict(self) | {"left_out": self.left_out}
+
+    def lines(self) -> Iterator[str]:
+        """The report for people."""
+        rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
+        renamed = f" ({self.renamed} under another name)" if self.renamed else ""
+        resumed = f", {self.resumed} from a build that was cut off" if self.resumed else ""
+        unchanged = self.reused - self.resumed
+        yield (
+            f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
+            f"{self.embedded} embedded{resumed}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
+        )
+        if not self.written:
+            yield "nothing changed, by the content of every file: the index stays as it is"
+        yield from self._understood()
+        yield f"candidate search: {self.kind}. {self.reason}{self._measured()}"
+        yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
+        yield from _some("remark(s)", self.notes)
+        if self.left_out:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
+            yield f"{sum(self.left_out.values())} file(s) left out: {reasons}"
+        yield from _some("ignored, no picture(s) by name", self.ignored, FEW)
+        yield from _some("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
+        if self.without_photo:
+            yield f"warning: {self.missing()}"
+
+    def _understood(self) -> Iterator[str]:
+        each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
+        yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
+        yield from (f"  {name} <- {photo}" for name, photo in self.examples)
+        yield from (f"warning: {doubt}" for doubt in self.doubts)
+
+    def _measured(self) -> str:
+        if not self.recall["queries"]:
+            return ""  # exact by construction
+        return f" Recall@{self.recall['at']} against exact search: {self.recall['value']:.3f}, measured on this index."
+
+    def missing(self) -> str:
+        """A sentence that counts and names the objects without a photo."""
+        count = len(self.without_photo)
+        more = f" and {count - SHOWN} more (--json lists them all)" if count > SHOWN else ""
+        return (
+            f"{count} of {self.objects + count} objects are not in the index, for none of their pictures can be read: "
+            f"{', '.join(self.without_photo[:SHOWN])}{more}"
+        )
+
+
+def _some(what: str, items: Sequence[str], shown: int = SHOWN) -> Iterator[str]:
+    if items:
+        yield f"{len(items)} {what}:"
+        yield from (f"  {item}" for item in items[:shown])
+    if len(items) > shown:
+        yield f"  and {len(items) - shown} more (--json lists them all)"

@@ -1,0 +1,144 @@
+"""What a command uses where the user names no model or index: what lies in the working folder, else what is shipped.
+
+Which model was trained and which index built last is remembered for each working folder on its own, in
+`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` where it is not set): a training in one folder never
+changes what a command in another one does.
+"""
+
+import json
+import os
+from contextlib import suppress
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from indexes.store.regular import read_json
+from retrieval.console.files import write_atomically
+from retrieval.errors import BadInput, CheckpointError
+
+if TYPE_CHECKING:
+    from indexes.store.manifest import Manifest
+
+SHIPPED = "simulated-mobilenet.safetensors"
+INDEX = Path("index")
+"""Where `build-index` writes and `query` looks, if nothing else is said."""
+
+MOST_FOLDERS = 100
+"""Of how many working folders it is remembered what was made there last."""
+
+
+def shipped_model() -> Path:
+    """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out.
+
+    >>> retrieval.shipped_model().name
+    'simulated-mobilenet.safetensors'
+    """
+    return Path(str(resources.files("retrieval") / "shipped" / SHIPPED))
+
+
+def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
+    """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
+
+    Raises CheckpointError where there is none, or where that of `index` is gone.
+    """
+    if given is not None:
+        return Path(given), "given"
+    here = _trained_here()
+    if manifest := _manifest(index):
+        own = model_of(manifest)
+        newer = f"; {here} was trained in this folder too: name it to take it" if here not in (None, own) else ""
+        return own, f"the one that {index} was built with{newer}"
+    if here is not None:
+        return here, "the last one trained in this folder"
+    if shipped_model().is_file():
+        return shipped_model(), "shipped; trained on the simulated rig: train your own for real sensors"
+    raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
+
+
+def model_of(manifest: "Manifest") -> Path:
+    """The checkpoint that built an index: where it lay then, else the last trained here or the shipped one, if equal.
+
+    Raises CheckpointError where none is.
+    """
+    from retrieval.model.stored import file_digest
+
+    path = Path(str(manifest.about.get("checkpoint")))
+    if path.is_file():
+        return path
+    for other in (_trained_here(), shipped_model()):
+        if other is not None and other.is_file() and file_digest(other) == manifest.fingerprint.get("checkpoint"):
+            return other
+    raise CheckpointError(
+        f"the model of this index is no longer at {path}; name it with --model, or build the index again with another"
+    )
+
+
+def find_index(given: str | None) -> tuple[Path, str]:
+    """The index to use and why: the one given, else ./index, else the last one built from this folder."""
+    if given is not None:
+        return Path(given), "given"
+    if (INDEX / "CURRENT").is_file():
+        return INDEX, "in this folder"
+    if (last := _noted().get("index")) and (Path(last) / "CURRENT").is_file():
+        return Path(last), "the last one built from this folder"
+    raise BadInput(
+        "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
+        "or name one with --index"
+    )
+
+
+def remember(kind: str, path: Path) -> None:
+    """Note `path` as the last "model" or "index" made from the working folder; does nothing where it cannot."""
+    try:
+        here = str(Path.cwd())
+        notes = _notes()
+        mine = {**notes.pop(here, {}), kind: str(path.resolve())}
+        notes = {**dict(list(notes.items())[-MOST_FOLDERS + 1 :]), here: mine}
+        _state_file().parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(_state_file(), json.dumps(notes).encode())
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
+        return
+
+
+def _trained_here() -> Path | None:
+    """The last model trained from the working folder, while it is there."""
+    path = Path(_noted().get("model", ""))
+    return path if path.is_file() else None
+
+
+def _manifest(index: Path) -> "Manifest | None":
+    """Of the index in this folder, if there is a usable one."""
+    from indexes.errors import IndexesError
+    from indexes.store.folder import IndexStore
+    from indexes.store.manifest import read_manifest
+
+    with suppress(IndexesError):
+        return read_manifest(index / IndexStore(index).current())
+    return None
+
+
+def _noted() -> dict[str, str]:
+    """The last "model" and "index" that were made from the working folder, by their whole paths."""
+    try:
+        return _notes().get(str(Path.cwd()), {})
+    except OSError:  # the working folder was removed
+        return {}
+
+
+def _notes() -> dict[str, dict[str, str]]:
+    """By working folder, the one noted last at the end."""
+    try:
+        notes = read_json(_state_file())
+    except (OSError, RuntimeError, ValueError):
+        return {}
+    mine = notes.items() if isinstance(notes, dict) else ()
+    return {
+        folder: {kind: path for kind, path in noted.items() if isinstance(path, str)}
+        for folder, noted in mine
+        if isinstance(noted, dict)
+    }
+
+
+def _state_file() -> Path:
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "touch-retrieval" / "last.json"

@@ -1,0 +1,258 @@
+"""Photos to rows, embeddings and halves: files are read and decoded while others are encoded.
+
+Every thread takes a whole batch from its files to its halves and computes alone. A team of threads for each product of
+the towers, as PyTorch's default is, waits for those of its members whose core is decoding a file.
+"""
+
+from collections import Counter
+from collections.abc import Container, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from indexes.store.generation import Generation
+from indexes.store.spool import Layouts
+from indexes.store.unfinished import Unfinished
+from retrieval.console.progress import Bar
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
+from retrieval.errors import DatasetError, NumericalError
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import Image, batches, encode_photos, one_thread
+from retrieval.search.ahead import ahead
+
+BATCH = 16
+READ = 32
+"""Files that a thread reads at a time: what a task costs by itself is a tenth of reading and hashing a photo."""
+
+
+HELD = 256
+"""Embeddings that were made before and stand in one part, at most: what waits between threads stays small."""
+
+
+@dataclass(frozen=True)
+class _Code:
+    """An embedding (d,) and a half (hidden,), and the largest rounding of the half where this index has none yet.
+    resumed: left by a build that was cut off; else the parent has it under another name."""
+
+    embedding: NDArray[np.float32]
+    half: NDArray[np.float16]
+    half_error: float
+    resumed: bool
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A photo's row, and where the parent does not have the photo its file, or a code of the same content."""
+
+    row: dict[str, Any]
+    file: PhotoBytes | None = None
+    code: _Code | None = None
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """A photo's row, and its preprocessed image where it is to be encoded."""
+
+    row: dict[str, Any]
+    image: Image | None
+    code: _Code | None
+
+
+@dataclass(frozen=True)
+class Part:
+    """Photos that follow each other, as many to encode among them as make a batch; what became of them.
+
+    rows: of all that could be read; embeddings (F, d) and halves (F, hidden): of those that the parent does not have
+    under their names, of which `embedded` were encoded now, and `resumed` by a build that was cut off.
+    """
+
+    rows: list[dict[str, Any]]
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    embeddings: NDArray[np.float32] | None = None
+    halves: NDArray[np.float16] | None = None
+    half_error: float = 0.0
+    embedded: int = 0
+    resumed: int = 0
+
+
+class Embedder:
+    """Makes parts of a catalogue's photos, and counts what became of them. What it encodes is kept in `unfinished`.
+
+    photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `renamed` had
+    another name in the parent, and `known` are the parent's own by id, with the same content or another. objects: how
+    many rows each has. half_error: largest rounding of a stored half.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, parent: Generation | None, unfinished: Unfinished) -> None:
+        self.checkpoint, self.parent, self.unfinished = checkpoint, parent, unfinished
+        self.skipped: list[SkippedPhoto] = []
+        self.objects: Counter[str] = Counter()
+        self.photos, self.embedded, self.resumed, self.renamed, self.known = 0, 0, 0, 0, 0
+        self.half_error = 0.0
+
+    @property
+    def removed(self) -> int:
+        """How many of the parent's photos are no longer there."""
+        return 0 if self.parent is None else self.parent.count - self.known
+
+    def parts(self, catalogue: Catalogue, quiet: bool) -> Generator[Part, None, None]:
+        """The catalogue's photos in its order. Raises DatasetError where none can be read, and NumericalError for
+        halves that float16 cannot hold."""
+        self.skipped += catalogue.skipped
+        threads = torch.get_num_threads()
+        lists = batches(catalogue.photos, READ)
+        found = ahead(lambda photos: self._find(catalogue, photos), lists, threads, 2 * threads)
+        with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
+            for part in ahead(self._encode, _full(chain.from_iterable(found)), threads, 2 * threads):
+                self._count(part)
+                bar.advance(len(part.rows) + len(part.skipped))
+                if part.rows:
+                    yield part
+        if not self.photos:
+            first = self.skipped[0]
+            raise DatasetError(f"no photo in {catalogue.folder} can be read; the first: {first.path}: {first.reason}")
+        if (
+            self.parent is not None and self.embedded + self.resumed < self.photos
+        ):  # what was taken over was rounded when it was made
+            self.half_error = max(self.half_error, self.parent.manifest.about.get("half_error", 0.0))
+
+    def _find(self, catalogue: Catalogue, photos: Sequence[CataloguePhoto]) -> list[_Found | SkippedPhoto]:
+        """Read photos' files, and keep the bytes of those with which there is more to do. Called on threads."""
+        items = [read_photo(catalogue, photo) for photo in photos]
+        read = [item for item in items if isinstance(item, PhotoBytes)]
+        known: set[str] = set()
+        if self.parent is not None:
+            known.update(self.parent.reusable({item.photo.photo_id: item.digest for item in read}))
+        codes = self._made_before([item.digest for item in read if item.photo.photo_id not in known])
+        return [item if isinstance(item, SkippedPhoto) else _found(item, known, codes) for item in items]
+
+    def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
+        """Codes of these contents, of the parent under other names, or of a build that was cut off."""
+        found: dict[str, _Code] = {}
+        if self.parent is not None and digests:
+            numbers = self.parent.rows.holding(digests)
+            having = [digest for digest, number in zip(digests, numbers, strict=True) if number >= 0]
+            rows = numbers[numbers >= 0]
+            embeddings = self.parent.embeddings[self.parent.slots[rows]]
+            halves = self.parent.arrays["halves"][rows]
+            codes = (_Code(*code, 0.0, resumed=False) for code in zip(embeddings, halves, strict=True))
+            found.update(zip(having, codes, strict=True))
+        left = self.unfinished.find(digest for digest in digests if digest not in found)
+        for digest, record in left.items():
+            found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), resumed=True)
+        return found
+
+    def _encode(self, found: Sequence[_Found | SkippedPhoto]) -> Part:
+        """Decode and encode those that must be. Called on threads."""
+        done = [self._decoded(item) for item in found]
+        skipped = [item for item in done if isinstance(item, SkippedPhoto)]
+        usable = [item for item in done if isinstance(item, _Decoded)]
+        rows = [item.row for item in usable]
+        codes = {item.row["id"]: item.code for item in usable if item.code is not None}
+        new = [item for item in usable if item.image is not None]
+        resumed = sum(code.resumed for code in codes.values())
+        codes |= self._encoded([item.row for item in new], [item.image for item in new if item.image is not None])
+        if not codes:
+            return Part(rows, skipped)
+        ordered = [codes[row["id"]] for row in rows if row["id"] in codes]
+        return Part(
+            rows,
+            skipped,
+            np.stack([code.embedding for code in ordered]),
+            np.stack([code.half for code in ordered]),
+            max(code.half_error for code in ordered),
+            embedded=len(new),
+            resumed=resumed,
+        )
+
+    def _encoded(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> dict[str, _Code]:
+        """Encode the images of these rows, and keep what comes of it against a sudden end."""
+        if not images:
+            return {}
+        with one_thread():
+            code = encode_photos(self.checkpoint.matcher, images, BATCH)
+        halves, embeddings, names = code.half.numpy(), code.embedding.numpy(), [row["id"] for row in rows]
+        stored = _as_float16(halves, names)
+        errors = np.abs(stored - halves).max(axis=1)
+        self.unfinished.keep(
+            [row["digest"] for row in rows], {"embedding": embeddings, "halves": stored, "half_error": errors}
+        )
+        made = zip(embeddings, stored, errors.tolist(), strict=True)
+        return {name: _Code(*of, resumed=False) for name, of in zip(names, made, strict=True)}
+
+    def _decoded(self, item: _Found | SkippedPhoto) -> "_Decoded | SkippedPhoto":
+        if isinstance(item, SkippedPhoto) or item.file is None:
+            return item if isinstance(item, SkippedPhoto) else _Decoded(item.row, None, item.code)
+        image = decode_photo(item.file)
+        if isinstance(image, SkippedPhoto):
+            return image
+        return _Decoded(item.row, self.checkpoint.config.preprocessing.photo(image), None)
+
+    def _count(self, part: Part) -> None:
+        self.skipped += part.skipped
+        self.objects.update(row["object_id"] for row in part.rows)
+        self.photos += len(part.rows)
+        self.embedded += part.embedded
+        self.resumed += part.resumed
+        self.renamed += 0 if part.halves is None else len(part.halves) - part.embedded - part.resumed
+        self.half_error = max(self.half_error, part.half_error)
+        if self.parent is not None:
+            self.known += int((self.parent.rows.find([row["id"] for row in part.rows]) >= 0).sum())
+
+
+def layouts(checkpoint: Checkpoint) -> Layouts:
+    """What `Unfinished` keeps of a photo for this checkpoint."""
+    config = checkpoint.config.matcher
+    return {
+        "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
+        "halves": (np.dtype(np.float16), (config.hidden,)),
+        "half_error": (np.dtype(np.float32), ()),
+    }
+
+
+def _found(item: PhotoBytes, known: Container[str], codes: Mapping[str, _Code]) -> _Found:
+    if item.photo.photo_id in known:
+        return _Found(_row(item))
+    code = codes.get(item.digest)
+    return _Found(_row(item), item if code is None else None, code)
+
+
+def _full(found: Iterable[_Found | SkippedPhoto]) -> Iterator[list[_Found | SkippedPhoto]]:
+    """Parts with a whole batch of photos to encode in each but the last."""
+    part: list[_Found | SkippedPhoto] = []
+    new, held = 0, 0
+    for item in found:
+        part.append(item)
+        new += isinstance(item, _Found) and item.file is not None
+        held += isinstance(item, _Found) and item.code is not None
+        if new == BATCH or held == HELD:
+            yield part
+            part, new, held = [], 0, 0
+    if part:
+        yield part
+
+
+def _row(item: PhotoBytes) -> dict[str, Any]:
+    photo = item.photo
+    return {
+        "id": photo.photo_id,
+        "object_id": photo.object_id,
+        "path": photo.path,
+        "digest": item.digest,
+        "metadata": photo.metadata,
+    }
+
+
+def _as_float16(halves: NDArray[np.float32], names: list[str]) -> NDArray[np.float16]:
+    largest = np.abs(halves).max(axis=1)
+    bad = np.flatnonzero(~(largest <= np.finfo(np.float16).max))
+    if len(bad):
+        raise NumericalError(
+            f"halves are stored as float16 and must stay within 65504; {names[bad[0]]} gives {largest[bad[0]]}; "
+            "the model has diverged, train again with a lower learning rate"
+        )
+    return halves.astype(np.float16)

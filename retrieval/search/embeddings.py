@@ -1,0 +1,41 @@
+"""Photos to embeddings, for those who bring an index of their own."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from retrieval.data.touches import AnyImage, read_image
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import encode_photos
+from retrieval.model.encoded import Encoded
+from retrieval.search.defaults import find_model
+
+
+def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> Encoded:
+    """The unit embeddings (N, embedding_dim) and halves (N, hidden) of N photos, in their order, float32.
+
+    photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first. model: a checkpoint or
+    its file; None is the one that `retrieve build-index` takes. The inner product of a touch's embedding
+    (`Searcher.encode`) with a photo's is the score by which an index of ours finds candidates. Raises ImageError,
+    BadInput where there is no photo, and CheckpointError.
+
+    >>> photos = ["catalog/mug/1.jpg", "catalog/tin/1.jpg"]
+    >>> embeddings, halves = retrieval.embed_photos(photos, model="model.safetensors")
+    >>> with retrieval.open("index") as searcher:
+    ...     touch = searcher.encode(["a.png", "b.png"])
+    ...     logits = searcher.judge.logits(touch.halves, halves)
+    >>> scores = touch.embeddings @ embeddings.T  # a row for each grasp
+    >>> scores.shape, logits.shape
+    ((1, 2), (2,))
+    """
+    if not photos:
+        raise BadInput("give at least one photo to embed")
+    checkpoint = model if isinstance(model, Checkpoint) else load_checkpoint(_path(model))
+    view = checkpoint.config.preprocessing.photo
+    images = (view(read_image(photo, f"photo {number}")) for number, photo in enumerate(photos, start=1))
+    code = encode_photos(checkpoint.matcher, images)
+    return Encoded(code.embedding.numpy(), code.half.numpy())
+
+
+def _path(model: str | Path | None) -> Path:
+    return find_model(None)[0] if model is None else Path(model)

@@ -1,0 +1,384 @@
+"""From gel images to ranked objects: encode the touch, take candidates, rerank them by match logit from halves."""
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.errors import UnsupportedFormat
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from retrieval.data.touches import AnyImage, AnyTouches, GivenImage
+from retrieval.errors import BadInput
+from retrieval.model.encoded import Encoded, Encoder, TouchCodes, TouchReader
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.judge import Judge
+from retrieval.model.onnx_encoder import exported_beside
+from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
+from retrieval.model.stopwatch import Stopwatch
+from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
+from retrieval.search import defaults
+from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
+from retrieval.search.listing import listed_photo, require_usable
+from retrieval.search.objects import JudgedObjects, Objects
+
+DEFAULT_CANDIDATES = 1000
+COMPLETED = 20
+"""Objects, at least, of which every photo is judged."""
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+
+class Searcher:
+    """An opened index with its model, for any number of queries.
+
+    Any number of threads may query it at once, and a process forked from this one too: no thread or lock outlives a
+    query. `close` it, or open it by `with`; a query that is under way then is answered.
+
+    >>> searcher = retrieval.open("index")
+    >>> one = searcher.query(["a.png", "b.png"], top=2)
+    >>> [match.rank for match in one.results]
+    [1, 2]
+    >>> mug, tin = [["a.png", "b.png"], ["a2.png", "b2.png"]], ["a2.png", "b2.png"]
+    >>> len(searcher.query_many([mug, tin]))
+    2
+    >>> searcher.close()
+    """
+
+    def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
+        self.index, self.generation, self.checkpoint = index, generation, checkpoint
+        self.encoder, self.judge = encoder, judge
+        self.gel_check = checkpoint.gel_check
+        compares = self.gel_check is not None and self.gel_check.level_above is not None
+        self.reader = TouchReader(checkpoint.config, encoder, compares)
+        self.posterior = _posterior_of(index, generation)
+        self.catalogue = Path(generation.manifest.about["catalogue"])
+        self.objects = Objects(generation)
+        self._closed = False
+
+    @classmethod
+    def open(cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True) -> "Searcher":
+        """Open the current generation of an index with the checkpoint that built it.
+
+        model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
+        Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) where there is one, and
+        PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`, CheckpointError, and
+        MismatchedIndex for another model.
+
+        >>> import numpy as np
+        >>> from PIL import Image
+        >>> pictures = [np.asarray(Image.open(name)) for name in ("a.png", "b.png")]  # as cameras give them
+        >>> with retrieval.open("index") as searcher:
+        ...     from_arrays, from_files = searcher.query(pictures), searcher.query(["a.png", "b.png"])
+        >>> from_arrays.results == from_files.results
+        True
+        """
+        generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
+        stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
+        _require(generation, stored)
+        require_usable(generation, stored.config.matcher.hidden)
+        return cls(
+            Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
+        )
+
+    def close(self) -> None:
+        """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""
+        self._closed = True
+        for name in ("generation", "encoder", "reader", "judge", "objects"):
+            vars(self).pop(name, None)
+
+    def __enter__(self) -> "Searcher":
+        return self._held()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def query(
+        self,
+        touches: AnyTouches,
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> QueryResult:
+        """Which of the catalogue's objects was felt in one or more grasps, or none of them?
+
+        touches: one grasp, which is a list with an image for each finger in their order, or a list of several such
+        grasps; for a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a
+        Pillow image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like
+        any other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
+        background: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
+        them what a contact is. top: objects to return. candidates: photos per grasp that the full classifier judges,
+        `top` at least, by default as many as the index was found to need; with no fewer than there are photos, or a
+        model without trained embeddings, it judges all of them and no candidate stage runs. none_prior: probability,
+        before anything is felt, that the catalogue lacks the object. Match logits of several grasps add; what the sum
+        is worth, and how objects and "none of these" get their probabilities, stands in `retrieval.model.posterior`.
+        Only grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
+        """
+        held = self._held()
+        limit = held._limit(top, candidates)
+        return held._answers([held.reader.grasps(touches)], background, top, limit, none_prior)[0]
+
+    def query_many(
+        self,
+        objects: Sequence[AnyTouches],
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> list[QueryResult]:
+        """Answer for several objects in the hand, each given as `query` takes it, in their order.
+
+        Their touches are encoded in batches. The logits are those of single queries within 1e-4, as a batch rounds in
+        another order. Where one object's touches are not fit, nothing is answered and the error names it.
+        """
+        held = self._held()
+        limit = held._limit(top, candidates)
+        asked = [held.reader.grasps(touches, of=f"object {number}, ") for number, touches in enumerate(objects, 1)]
+        return held._answers(asked, background, top, limit, none_prior) if asked else []
+
+    def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
+        """The unit embeddings (G, embedding_dim) and halves (G, hidden) of G grasps, given as `query` takes them.
+
+        The inner product with a photo's embedding (`retrieval.embed_photos`) is the score by which candidates are
+        found; it orders photos for one touch and is no probability. Match logits are
+        `searcher.judge.logits(halves, photo_halves)`, added over the grasps.
+        """
+        held = self._held()
+        grasps, references = held.reader.grasps(touches), held.reader.references(background)
+        codes = held.reader.encode(grasps, references, Stopwatch())
+        return Encoded(codes.embeddings, codes.halves)
+
+    @property
+    def default_candidates(self) -> int:
+        """Photos that the classifier judges where a query says no number: as measured on the index, else 1000."""
+        measured = self.generation.manifest.about.get("candidates")
+        return int(measured["k"]) if measured else DEFAULT_CANDIDATES
+
+    def _held(self) -> "Searcher":
+        """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
+        held = copy.copy(self)
+        if held._closed:
+            raise BadInput(f"this searcher of {self.index} was closed; open the index again")
+        return held
+
+    def _limit(self, top: int, candidates: int | None) -> int:
+        """Photos that are judged for each grasp."""
+        limit = self.default_candidates if candidates is None else candidates
+        if top < 1 or limit < 1:
+            raise BadInput(f"top and candidates must be 1 or more; got {top} and {limit}")
+        return max(top, limit)
+
+    # The stages: each takes and gives what belongs to one object, images of all objects side by side ------------
+
+    def _answers(
+        self,
+        asked: Sequence[Sequence[Sequence[GivenImage]]],
+        background: Sequence[AnyImage] | None,
+        top: int,
+        limit: int,
+        none_prior: float,
+    ) -> list[QueryResult]:
+        require_prior(none_prior)
+        clock = Stopwatch()
+        references = self.reader.references(background)
+        codes = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
+        ends = np.cumsum([len(grasps) for grasps in asked])[:-1]
+        shown = np.split(np.array(self._shown(codes)), ends)
+        felt = [_felt(own) for own in shown]
+        halves, embeddings = np.split(codes.halves, ends), np.split(codes.embeddings, ends)
+        with clock("candidates"):
+            rows = [self._candidates(own[used], limit) for own, used in zip(embeddings, felt, strict=True)]
+        with clock("rerank"):
+            judged = [
+                self._judged(own[used], found, top, none_prior)
+                for own, used, found in zip(halves, felt, rows, strict=True)
+            ]
+        timing_ms = clock.finished(len(asked))
+        return [
+            self._answer(grasps, own.tolist(), timing_ms, found, top, none_prior)
+            for grasps, own, found in zip(asked, shown, judged, strict=True)
+        ]
+
+    def _shown(self, codes: TouchCodes) -> list[str]:
+        """What each grasp shows, as far as the model has a check."""
+        if self.gel_check is None or codes.readings is None:
+            return [CONTACT] * len(codes.halves)
+        return self.gel_check.judge(codes.readings, codes.levels)
+
+    def _candidates(self, embeddings: Floats, k: int) -> Rows:
+        """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
+        if not len(embeddings):
+            return np.zeros(0, dtype=np.int64)
+        if not self.checkpoint.config.has_embeddings or k >= self.generation.count:
+            return np.arange(self.generation.count)
+        found = [rows for rows, _ in self.generation.search(embeddings, k)]
+        return np.unique(np.concatenate(found))
+
+    def _judged(self, halves: Floats, rows: Rows, top: int, none_prior: float) -> "_Judged | None":
+        """Objects by their judged photos, and what is believed of them; None where nothing was felt.
+
+        Candidates are some photos of an object: of the best objects the others are judged as well.
+        """
+        if not len(halves):
+            return None
+        meaning, logits = self.posterior or Posterior(), self._logits(halves, rows)
+        objects = self.objects.judged(rows, logits, meaning, len(halves))
+        if len(rows) < self.generation.count:
+            best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
+            rest = self.objects.rest_of(best, rows)
+        else:
+            rest = rows[:0]
+        if len(rest):
+            rows = np.concatenate([rows, rest])
+            logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
+            objects = self.objects.judged(rows, logits, meaning, len(halves))
+        if self.posterior is None:
+            return _Judged(len(rows), len(halves), objects, None)
+        unjudged = self.objects.count - len(objects.numbers)
+        sample = self._sample_logits(halves, objects) if unjudged else np.zeros(0)
+        belief = self.posterior.believe(
+            objects.logits, len(halves), none_prior=none_prior, unjudged=unjudged, sample=sample
+        )
+        return _Judged(len(rows), len(halves), objects, belief)
+
+    def _logits(self, halves: Floats, rows: Rows) -> Floats:
+        """Match logits of the rows, summed over grasps."""
+        every = len(rows) == self.generation.count
+        logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
+        return self.objects.equal_for_equals(rows, logits)
+
+    def _sample_logits(self, halves: Floats, judged: JudgedObjects) -> NDArray[np.float64]:
+        """Logits of a sample of the objects without a judged photo; where the sample holds none of them, they are taken
+        to be like the least of the judged ones, which candidates are not expected to be."""
+        rows = self.objects.sample_without(judged.numbers)
+        if not len(rows):
+            return np.array([judged.logits.min()])
+        meaning = self.posterior or Posterior()
+        return self.objects.judged(rows, self._logits(halves, rows), meaning, len(halves)).logits
+
+    def _answer(
+        self,
+        grasps: Sequence[Sequence[GivenImage]],
+        shown: list[str],
+        timing_ms: dict[str, float],
+        judged: "_Judged | None",
+        top: int,
+        none_prior: float,
+    ) -> QueryResult:
+        belief = judged.belief if judged else None
+        return QueryResult(
+            touches=[[image.name for image in grasp] for grasp in grasps],
+            grasps=shown,
+            index=self._about(judged.photos if judged else 0),
+            timing_ms=timing_ms,
+            verdict=_verdict(shown, belief),
+            none_probability=belief.none if belief else None,
+            posterior=self._meaning(judged, none_prior) if judged else None,
+            results=self._ranking(judged, top) if judged else [],
+        )
+
+    def _ranking(self, judged: "_Judged", top: int) -> list[Match]:
+        objects, belief = judged.objects, judged.belief
+        return [
+            self._match(
+                rank,
+                int(objects.rows[place]),
+                float(objects.logits[place]),
+                None if belief is None else float(belief.objects[place]),
+            )
+            for rank, place in enumerate(self.objects.best(objects, top), start=1)
+        ]
+
+    def _match(self, rank: int, row_number: int, logit: float, probability: float | None) -> Match:
+        photo = listed_photo(self.generation.rows[row_number])
+        path = self.catalogue.absolute() / photo.path
+        return Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path)
+
+    def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
+        """The formula of the probabilities, with the numbers of this answer."""
+        if self.posterior is None or judged.belief is None:
+            return None
+        return {
+            **self.posterior.to_dict(),
+            "none_prior": none_prior,
+            "grasps": judged.grasps,
+            "objects": self.objects.count,
+            "judged_objects": len(judged.objects.numbers),
+            "unjudged_probability": judged.belief.unjudged,
+        }
+
+    def _about(self, scored: int) -> dict[str, Any]:
+        return {
+            "path": str(self.index),
+            "generation": self.generation.name,
+            "kind": self.generation.manifest.kind,
+            "photos": self.generation.count,
+            "objects": self.objects.count,
+            "scored": scored,
+            "encoder": self.encoder.name,
+            "catalogue": str(self.catalogue),
+            "model": str(self.checkpoint.path),
+            "trained_on": self.checkpoint.provenance.get("source", "unknown"),
+        }
+
+
+def _posterior_of(index: Path, generation: Generation) -> Posterior | None:
+    """What the index keeps of its model's probabilities; None where the model was never calibrated."""
+    if "calibration" not in generation.documents:
+        return None
+    try:
+        return Posterior.from_dict(generation.documents["calibration"])
+    except BadInput as error:
+        raise UnsupportedFormat(
+            f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
+        ) from error
+
+
+class _Judged(NamedTuple):
+    """What was judged for one object in the hand: so many photos, by so many grasps."""
+
+    photos: int
+    grasps: int
+    objects: JudgedObjects
+    belief: Belief | None
+
+
+def _felt(shown: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Which grasps are judged: those with contact, and none where an image is no gel image."""
+    return np.asarray((shown == CONTACT) & (shown != NOT_A_GEL).all())
+
+
+def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
+    if NOT_A_GEL in shown:
+        return NOT_A_GEL
+    if CONTACT not in shown:
+        return NO_CONTACT
+    if belief is None:
+        return UNCALIBRATED
+    return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
+
+
+def _require(generation: Generation, stored: Stored) -> None:
+    wanted = fingerprint(stored)
+    if wanted["checkpoint"] != generation.fingerprint.get("checkpoint"):
+        from retrieval.model.checkpoint import load_checkpoint
+
+        load_checkpoint(stored.path)  # a damaged one says so
+    generation.require(wanted)
+
+
+def _torch_encoder(stored: Stored) -> Encoder:
+    """The towers in PyTorch, whose import takes longer than all the rest."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.model.encode import TorchEncoder
+
+    return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher)

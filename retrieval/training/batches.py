@@ -1,0 +1,185 @@
+"""From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp, ImageCache, PairBatch
+from retrieval.errors import DatasetError, Interrupted
+from retrieval.model.config import Config
+from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
+from retrieval.model.fusion import Matcher
+from retrieval.training import distributed
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A batch with what its features are made from: images, or the features themselves."""
+
+    batch: PairBatch
+    touches: Tensor
+    photos: Tensor
+
+
+class BatchImages:
+    """Loads the images of batches on threads of its own while the step before them is computed."""
+
+    def __init__(self, config: Config, device: torch.device, *, threads: int = 2, keep_bytes: int = 4 << 30) -> None:
+        self.config, self.device = config, device
+        self.uses_background = config.preprocessing.background != "none"
+        self._touch = ImageCache(config.preprocessing.load_touch, keep_bytes)
+        self._photo = ImageCache(config.preprocessing.load_photo, keep_bytes)
+        self._ahead = ThreadPoolExecutor(1)
+        self._threads = ThreadPoolExecutor(threads)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ahead.shutdown(cancel_futures=True)
+        self._threads.shutdown(cancel_futures=True)
+
+    def touch(self, grasp: Grasp) -> list[Image]:
+        """The finger images of a grasp, preprocessed. Raises DatasetError where a no-contact frame is missing."""
+        if not self.uses_background:
+            return [self._touch(path) for path in grasp.touches]
+        if len(grasp.backgrounds) != len(grasp.touches):
+            raise DatasetError(
+                f"the background policy needs a no-contact frame for each finger; {grasp.grasp_id} has "
+                f'{len(grasp.backgrounds)} for {len(grasp.touches)}; set background = "none" or record them'
+            )
+        return [self._touch(*pair) for pair in zip(grasp.touches, grasp.backgrounds, strict=True)]
+
+    def files(self, grasp: Grasp) -> tuple[Path, ...]:
+        """What the finger images of a grasp are read from."""
+        return grasp.touches + (grasp.backgrounds if self.uses_background else ())
+
+    def photo(self, path: Path) -> Image:
+        """A photo, preprocessed."""
+        return self._photo(path)
+
+
+class TrainedFeatures(BatchImages):
+    """Features of towers in training: this rank encodes its share of the images, and gathers the others'."""
+
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+        """Start loading this rank's share of the batch's images."""
+        return self._ahead.submit(self._load, batch)
+
+    def _load(self, batch: PairBatch) -> Loaded:
+        grasps = [batch.grasps[row] for row in distributed.share(len(batch.grasps))]
+        photos = [batch.photos[row] for row in distributed.share(len(batch.photos))]
+        touches = touch_batch(list(self._threads.map(self.touch, grasps)), self.device)
+        return Loaded(batch, touches, to_batch(list(self._threads.map(self.photo, photos)), self.device))
+
+    def stepping(self) -> AbstractContextManager[None]:
+        """What a step is computed in: towers use every core."""
+        return nullcontext()
+
+    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+        """Pass each distinct image through its tower once."""
+        touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
+        with autocast(self.device, self.config.training.precision):
+            with distributed.encoding(touches):
+                touch = matcher.touch_features(loaded.touches)
+            with distributed.encoding(photos):
+                photo = matcher.photo_features(loaded.photos)
+        return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
+
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """Encode the images of the pairs, each once."""
+        touch = touch_features(matcher, (self.touch(grasp) for grasp in pairs.grasps))
+        return touch, photo_features(matcher, (self.photo(path) for path in pairs.photos))
+
+
+class FrozenFeatures(BatchImages):
+    """Features of towers that stand still: each image is encoded the first time it is met, and never again.
+
+    known: features by grasp id (of the touch) and by photo file that need no encoding
+    (`retrieval.training.features.by_image`).
+    """
+
+    def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
+        super().__init__(config, device, keep_bytes=0)  # an image is read once: its features are kept
+        self._kept: dict[str | Path, Tensor] = dict(known)
+
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+        """Look up the features of a batch, encoding what is new; done when this returns.
+
+        Not on the thread ahead: PyTorch gives every thread that calls it a team of workers of its own, and two teams
+        on the same cores spend a hundred times a step's arithmetic waiting for each other.
+        """
+        done: Future[Loaded] = Future()
+        done.set_result(self._look_up(matcher, batch))
+        return done
+
+    @torch.inference_mode()
+    def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
+        new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._kept}
+        if new:
+            self._kept.update(zip(new, touch_features(matcher, map(self.touch, new.values())), strict=True))
+        photos = [path for path in batch.photos if path not in self._kept]
+        if photos:
+            self._kept.update(zip(photos, photo_features(matcher, map(self.photo, photos)), strict=True))
+        touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
+        return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
+
+    def stepping(self) -> AbstractContextManager[None]:
+        """What a step is computed in: the head's few small products gain nothing from a second core."""
+        return one_thread()
+
+    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+        """The features, as constants of the step."""
+        return loaded.touches.clone(), loaded.photos.clone()
+
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """The features of all pairs at once."""
+        loaded = self.prepare(matcher, pairs).result()
+        return loaded.touches, loaded.photos
+
+
+FeatureSource = TrainedFeatures | FrozenFeatures
+"""Where a training run gets the features of a batch from."""
+_CHUNK = 64
+
+
+@torch.inference_mode()
+def recorded_features(
+    matcher: Matcher,
+    source: FeatureSource,
+    grasps: Sequence[Grasp],
+    *,
+    what: str,
+    quiet: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+) -> tuple[Tensor, dict[Path, Tensor]]:
+    """Features of the touches of grasps (G, fingers * F), one grasp at least, and of each of their photo files (F,).
+
+    what: what they are for, in the bar and where it was stopped. Raises Interrupted.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    touches: list[Tensor] = []
+    photos: dict[Path, Tensor] = {}
+    with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
+        for start in range(0, len(grasps), _CHUNK):
+            if stopped():
+                raise Interrupted(f"stopped before the {what} was fitted")
+            part = list(grasps[start : start + _CHUNK])
+            files = list(dict.fromkeys(grasp.photo for grasp in part))
+            batch = PairBatch(part, files, none, none, np.zeros(0, dtype=np.float32), none, none)
+            touch, photo = source.eval_features(matcher, batch)
+            touches.append(touch)
+            photos |= zip(files, photo, strict=True)
+            bar.advance(len(part))
+    return torch.cat(touches), photos

@@ -1,0 +1,269 @@
+"""Features of towers that stand still, encoded once and kept on disk: what every method is fitted on and judged by."""
+
+import dataclasses
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp
+from retrieval.data.images import Preprocessing, read_rgb
+from retrieval.data.resize import RgbImage, resize
+from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
+from retrieval.model.checkpoint import read_tensors, tensors_digest, write_tensors
+from retrieval.model.config import Config
+from retrieval.model.encode import batches, default_device, photo_features, touch_features
+from retrieval.model.fusion import Matcher
+from retrieval.model.stored import file_digest
+from retrieval.training.batches import BatchImages
+
+T = TypeVar("T")
+log = logging.getLogger(__name__)
+
+VARIANTS = ("touch", "blurred", "before")
+"""What stands for a touch: the gel images; an 8 x 6 blur of each; the frames taken before the contact."""
+_PART, _FORMAT = 512, 1
+_BATCH = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Tower features of grasps: what every method is fitted on and judged by. One row per grasp.
+
+    grasp_ids, object_ids: of each row. touch (G, fingers, F_touch) and photo (G, F_photo), float32; the photo is the
+    one taken before that grasp. Raises BadInput for arrays of other shapes or types, NumericalError for a feature that
+    is not finite, its grasp named.
+    """
+
+    grasp_ids: tuple[str, ...]
+    object_ids: tuple[str, ...]
+    touch: NDArray[np.float32]
+    photo: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        rows = (len(self.grasp_ids), len(self.object_ids), len(self.touch), len(self.photo))
+        if self.touch.ndim != 3 or self.photo.ndim != 2 or len(set(rows)) != 1:
+            raise BadInput(
+                "features must be touch (G, fingers, F) and photo (G, F) with G grasp ids and G object ids; got "
+                f"touch {self.touch.shape}, photo {self.photo.shape}, {rows[0]} and {rows[1]} ids"
+            )
+        if self.touch.dtype != np.float32 or self.photo.dtype != np.float32:
+            raise BadInput(f"features must be float32; got touch {self.touch.dtype}, photo {self.photo.dtype}")
+        for what, part in (("touch", self.touch), ("photo", self.photo)):
+            bad = np.flatnonzero(~np.isfinite(part).reshape(len(part), -1).all(axis=1))
+            if len(bad):
+                raise NumericalError(
+                    f"{what} features must be finite; grasp {self.grasp_ids[bad[0]]} has a NaN or infinite one: the "
+                    "tower has diverged, or its weights are damaged"
+                )
+
+    def __len__(self) -> int:
+        return len(self.grasp_ids)
+
+    def select(self, rows: NDArray[np.int64]) -> "Features":
+        """The grasps at `rows`, in that order."""
+        return Features(
+            tuple(self.grasp_ids[row] for row in rows),
+            tuple(self.object_ids[row] for row in rows),
+            self.touch[rows],
+            self.photo[rows],
+        )
+
+    def of_objects(self, object_ids: Iterable[str]) -> "Features":
+        """The grasps of these objects."""
+        wanted = set(object_ids)
+        return self.select(np.array([row for row, name in enumerate(self.object_ids) if name in wanted], np.int64))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 over ids and features: equal exactly when the same is fitted on."""
+        ids = json.dumps([self.grasp_ids, self.object_ids, self.touch.shape, self.photo.shape])
+        digest = hashlib.sha256(ids.encode())
+        for part in (self.touch, self.photo):
+            digest.update(np.ascontiguousarray(part).data)
+        return digest.hexdigest()
+
+    @cached_property
+    def owner(self) -> NDArray[np.int64]:
+        """(G,) index of each row's object into `sorted(set(object_ids))`."""
+        return np.unique(np.array(self.object_ids, dtype=object), return_inverse=True)[1].astype(np.int64)
+
+
+def by_image(grasps: Iterable[Grasp], features: Features, device: torch.device) -> dict[str | Path, Tensor]:
+    """Features of grasps by grasp id (of the touch, finger after finger) and by photo file, on `device`."""
+    touch, photo = (torch.from_numpy(part).flatten(1).to(device) for part in (features.touch, features.photo))
+    row_of = {grasp_id: row for row, grasp_id in enumerate(features.grasp_ids)}
+    known: dict[str | Path, Tensor] = {}
+    for grasp in grasps:
+        row = row_of[grasp.grasp_id]
+        known |= {grasp.grasp_id: touch[row], grasp.photo: photo[row]}
+    return known
+
+
+def blurred(image: RgbImage) -> RgbImage:
+    """An image (H, W, 3) of which nothing is left but an 8 x 6 blur of its colours, at its old size.
+
+    Gaussian blur of a tenth of the width, then 8 x 6 pixels: lamps and gel drift of the capture stay, and coarse
+    shape; whatever a method still finds in it is no sense of touch.
+    """
+    import cv2
+
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), image.shape[1] / 10), dtype=np.float32)
+    return resize(resize(smooth, (6, 8)), image.shape[:2])
+
+
+class _Blurred(Preprocessing):
+    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
+        return self.touch(blurred(read_rgb(path)), None if reference is None else blurred(read_rgb(reference)))
+
+
+def encode_recording(
+    grasps: Sequence[Grasp],
+    matcher: Matcher,
+    config: Config,
+    cache: Path | None,
+    *,
+    variant: str = "touch",
+    photos_of: Features | None = None,
+    quiet: bool = False,
+) -> Features:
+    """Features of all grasps by the towers of `matcher`, which stand still; each photo file is encoded once.
+
+    cache: folder where they are kept in parts of 512, each under a digest of tower, preprocessing, variant and image
+    files: a run that was stopped goes on, a second one reads. None keeps nothing. variant: one of `VARIANTS`.
+    photos_of: features of these grasps and perhaps more, whose photos need no encoding again. Raises BadInput for
+    another variant, DatasetError where a no-contact frame is needed and missing.
+    """
+    shown = [_as_shown(grasp, variant) for grasp in grasps]
+    device = default_device()
+    matcher = deepcopy(matcher).to(device).eval()
+    settings = _as_variant(config, variant)
+    with BatchImages(settings, device, keep_bytes=0) as images:
+        touch_made_by = (variant, _digest_of(matcher.touch_tower), settings.preprocessing.digest())
+        touches = _Parts(cache, touch_made_by, images.touch, partial(touch_features, matcher), images.files, quiet)
+        touch = touches.rows(shown)
+        if photos_of is None:
+            photo = _photos(grasps, images, matcher, cache, quiet)
+        else:
+            row_of = {grasp_id: row for row, grasp_id in enumerate(photos_of.grasp_ids)}
+            photo = photos_of.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
+    return Features(
+        tuple(grasp.grasp_id for grasp in grasps),
+        tuple(grasp.object_id for grasp in grasps),
+        touch.reshape(len(touch), config.matcher.fingers, -1),
+        photo,
+    )
+
+
+def _photos(
+    grasps: Sequence[Grasp], images: BatchImages, matcher: Matcher, cache: Path | None, quiet: bool
+) -> NDArray[np.float32]:
+    """(G, F): the features of each grasp's photo."""
+    made_by = ("photo", _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
+    files = list(dict.fromkeys(grasp.photo for grasp in grasps))
+    encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), _itself, quiet).rows(files)
+    row_of = {path: row for row, path in enumerate(files)}
+    return np.asarray(encoded[[row_of[grasp.photo] for grasp in grasps]])
+
+
+def _as_variant(config: Config, variant: str) -> Config:
+    if variant not in VARIANTS:
+        raise BadInput(f"what stands for a touch must be one of {', '.join(VARIANTS)}; got {variant!r}")
+    if variant != "blurred":
+        return config
+    return dataclasses.replace(config, preprocessing=_Blurred(**config.preprocessing.to_dict()))
+
+
+def _as_shown(grasp: Grasp, variant: str) -> Grasp:
+    """The grasp with the files in place of its touch that are to be encoded as one."""
+    if variant != "before":
+        return grasp
+    if len(grasp.backgrounds) != len(grasp.touches):
+        raise DatasetError(
+            f"a frame before the contact is needed for each finger; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
+            f"{len(grasp.touches)}; record them, or leave this control out"
+        )
+    return dataclasses.replace(grasp, touches=grasp.backgrounds)
+
+
+def _itself(path: Path) -> tuple[Path, ...]:
+    return (path,)
+
+
+def _digest_of(tower: nn.Module) -> str:
+    return tensors_digest(tower.state_dict(), type(tower).__name__)
+
+
+@dataclass(frozen=True)
+class _Parts(Generic[T]):
+    """Features of images, part by part: read where a part is kept, else encoded and kept.
+
+    made_by: variant, tower and preprocessing. load gives the image (or images) of an item, encode the features (B, F)
+    of a list of these, files what an item is read from.
+    """
+
+    cache: Path | None
+    made_by: tuple[str, ...]
+    load: Callable[[T], Any]
+    encode: Callable[[list[Any]], Tensor]
+    files: Callable[[T], Iterable[Path]]
+    quiet: bool
+
+    def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
+        """(len(items), F)."""
+        shown = self.made_by[0]
+        unit = "photos" if shown == "photo" else "grasps"
+        with Bar(f"encode {shown}", len(items), unit, quiet=self.quiet) as bar, ThreadPoolExecutor(2) as pool:
+            return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
+
+    def _part(self, items: list[T], pool: ThreadPoolExecutor, bar: Bar) -> NDArray[np.float32]:
+        path = self._path(items)
+        if path and (kept := _read(path)) is not None and len(kept) == len(items):
+            bar.advance(len(items))
+            return kept.numpy()
+        encoded = []
+        for batch in batches(items, _BATCH):
+            encoded.append(self.encode(list(pool.map(self.load, batch))).cpu())
+            bar.advance(len(batch))
+        features = torch.cat(encoded)
+        if path:
+            write_tensors(path, {"features": features}, {"made_by": self.made_by})
+        return features.numpy()
+
+    def _path(self, items: list[T]) -> Path | None:
+        """Where the features of these very images, made in this very way, are kept."""
+        if self.cache is None:
+            return None
+        digests = [_file_digest(path) for item in items for path in self.files(item)]
+        key = hashlib.sha256(json.dumps([_FORMAT, len(items), self.made_by, digests]).encode()).hexdigest()
+        return self.cache / f"{self.made_by[0]}-{key[:32]}.safetensors"
+
+
+def _read(path: Path) -> Tensor | None:
+    """Features that are kept; None where there are none, or the file is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        return read_tensors(path)[0]["features"]
+    except CheckpointError as error:
+        log.warning("%s; its images are encoded again", error)
+        return None
+
+
+def _file_digest(path: Path) -> str:
+    try:
+        return file_digest(path)
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error

@@ -1,0 +1,355 @@
+"""Training a matcher: the step, validation, checkpoints, interruption and resumption.
+
+Every step depends on the seed, the step number and the state alone, so a run that was stopped and resumed on the same
+machine ends bit for bit where an unbroken run ends.
+"""
+
+import dataclasses
+import math
+import threading
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torch.autograd.graph import increment_version
+
+from retrieval.console.interruption import interruption
+from retrieval.console.progress import Bar
+from retrieval.data.check.recording import require_fit
+from retrieval.data.dataset import (
+    Grasp,
+    PairSampler,
+    Split,
+    data_digest,
+    finger_count,
+    load_grasps,
+    make_split,
+    recording_source,
+)
+from retrieval.errors import CheckpointError, Interrupted, NumericalError
+from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
+from retrieval.model.checkpoint import (
+    Checkpoint,
+    beside,
+    load_checkpoint,
+    read_tensors,
+    require_writable,
+    save_checkpoint,
+    store_checkpoint,
+    write_tensors,
+)
+from retrieval.model.config import Config, TrainingConfig
+from retrieval.model.encode import default_device
+from retrieval.model.fusion import Matcher
+from retrieval.model.towers.weights import initialise_tower
+from retrieval.training import distributed
+from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
+from retrieval.training.distil import add_pruner
+from retrieval.training.features import Features, by_image
+from retrieval.training.judgement import with_verdicts
+from retrieval.training.step import batch_loss, pair_logits, shuffle_fingers
+
+
+def state_path(out: Path) -> Path:
+    """Where an unfinished training of `out` keeps what it needs to go on."""
+    return beside(out, ".state.safetensors")
+
+
+def train(
+    recording: Path,
+    out: Path,
+    config: Config,
+    *,
+    split: Split | None = None,
+    resume: bool = False,
+    quiet: bool = False,
+) -> Checkpoint:
+    """Train on a recording and write the best checkpoint by validation objects to `out`.
+
+    split: drawn from the configuration where None. resume: go on from the state beside `out`. The number of fingers
+    is the recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
+    one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+    """
+    distributed.start()
+    grasps = load_grasps(recording)
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
+    settings = config.training
+    if split is None:
+        split = make_split(
+            grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed
+        )
+    else:
+        require_fit(split, grasps)
+    require_writable(out)
+    trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
+    if not resume and state_path(out).exists():
+        raise CheckpointError(
+            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
+        )
+    if resume:
+        trainer.resume()
+    trainer.run(quiet)
+    return load_checkpoint(out)
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one training step reports: loss, and the share of its pairs on the right side."""
+
+    loss: float
+    accuracy: float
+
+
+class Trainer:
+    """The state of one training run."""
+
+    def __init__(
+        self,
+        config: Config,
+        split: Split,
+        grasps: list[Grasp],
+        out: Path,
+        source: str,
+        known: Features | None = None,
+    ) -> None:
+        """known: features of all these grasps, for frozen towers; then they are the data, and no image is read."""
+        settings = config.training
+        self.config, self.split, self.out, self.source = config, split, out, source
+        self.data_digest = known.digest if known else data_digest(grasps)
+        self.device = default_device()
+        torch.manual_seed(settings.seed)
+        self.untaught = config.without_pruner()
+        self.has_images = known is None
+        self.matcher = build_matcher(self.untaught).to(self.device)
+        trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
+        # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
+        self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
+        self.sampler = self._sampler("train", grasps)
+        self.validation = self._sampler("validation", grasps).every_touch() if split.validation else None
+        self.features: FeatureSource = TrainedFeatures(config, self.device)
+        if settings.freeze_towers:
+            self.features = FrozenFeatures(config, self.device, by_image(grasps, known, self.device) if known else {})
+        set_training_mode(self.matcher, settings)
+        self.step, self.best = 0, -math.inf
+
+    def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
+        settings = self.config.training
+        chosen = self.split.select(grasps, part)
+        # Features that are kept cost nothing to draw from all objects.
+        shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
+        return PairSampler(
+            chosen,
+            seed=settings.seed,
+            positives=settings.positives_per_touch,
+            negatives=settings.negatives_per_touch,
+            share_photos=shared,
+        )
+
+    def run(self, quiet: bool = False) -> None:
+        """Train from the current step to the last."""
+        total = self.config.training.iterations
+        quiet = quiet or distributed.rank() > 0
+        with interruption() as stop, self.features:
+            if self.step < total:
+                self._steps(stop, quiet)
+            self._finish(stop, quiet)
+
+    def _steps(self, stop: threading.Event, quiet: bool) -> None:
+        total = self.config.training.iterations
+        with Bar("train", total, "steps", done=self.step, quiet=quiet) as bar:
+            upcoming: Future[Loaded] | None = self._prepare(self.step)
+            while upcoming is not None:
+                loaded = upcoming.result()
+                upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
+                with self.features.stepping():
+                    result = self.train_step(loaded)
+                bar.advance(note=f"loss {result.loss:.3f}  accuracy {result.accuracy:.2f}{self._best_note()}")
+                # All ranks stop after the same step: one that went on would wait for the others for ever.
+                stopped = distributed.any_rank(stop.is_set(), self.device)
+                if stopped or self.step % self.config.training.validate_every == 0 or self.step == total:
+                    self._validate_and_save()
+                if stopped and self.step < total:
+                    raise Interrupted(
+                        f"stopped at step {self.step} of {total}; {self.out} is usable, --resume goes on from here"
+                    )
+
+    def _finish(self, stop: threading.Event, quiet: bool) -> None:
+        """Complete the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
+        stopped = False
+        if not distributed.rank():
+            try:
+                self._complete(stop, quiet)
+                state_path(self.out).unlink(missing_ok=True)
+            except Interrupted:
+                stopped = True
+        if distributed.any_rank(stopped, self.device):  # and no rank leaves before the files are there
+            raise Interrupted(
+                f"stopped before the checkpoint was complete; {self.out} ranks photos, --resume adds the rest"
+            )
+
+    def _complete(self, stop: threading.Event, quiet: bool) -> None:
+        """Add to the best checkpoint what is fitted when all is learned: the pruner, the posterior, the gel check."""
+        train = [grasp for part in self.sampler.grasps for grasp in part]
+        held_out = self.validation.grasps if self.validation else []
+        made = load_checkpoint(self.out)
+        made.matcher.to(self.device)
+        if self.config.matcher.pruner_width:
+            made = add_pruner(made, self.config, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        if self.has_images:
+            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        store_checkpoint(made, self.out)
+
+    def _best_note(self) -> str:
+        return "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
+
+    def _prepare(self, step: int) -> "Future[Loaded]":
+        batch = self.sampler.batch(step, self.config.training.touches_per_batch)
+        return self.features.prepare(self.matcher, batch)
+
+    def train_step(self, loaded: Loaded) -> StepResult:
+        """One optimiser step on a prepared batch."""
+        settings, batch = self.config.training, loaded.batch
+        torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
+        self._set_learning_rate()
+        self.optimizer.zero_grad(set_to_none=True)
+        touch, photo = self.features.train_features(self.matcher, loaded)
+        if settings.shuffle_fingers:
+            touch = shuffle_fingers(touch, self.matcher.config.fingers)
+        loss, logits = batch_loss(self.matcher, settings, batch, touch, photo)
+        if not math.isfinite(loss.item()):
+            raise NumericalError(f"the loss must stay finite; step {self.step} gave {loss.item()}; lower learning_rate")
+        loss.backward()  # type: ignore[no-untyped-call]
+        distributed.average_gradients(self.matcher)
+        self.optimizer.step()
+        # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
+        increment_version(list(self.matcher.parameters()))
+        self.matcher.clamp_scale()
+        self.step += 1
+        return StepResult(loss.item(), pair_accuracy(logits.detach().cpu().numpy(), batch.labels))
+
+    def _set_learning_rate(self) -> None:
+        settings = self.config.training
+        factor = 1.0
+        if settings.schedule == "cosine":
+            factor = 0.5 * (1 + math.cos(math.pi * self.step / settings.iterations))
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.learning_rate * factor
+
+    def _validate_and_save(self) -> None:
+        metrics = self.validate()
+        better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
+        self.best = max(self.best, metrics.get("validation_auc", -math.inf))
+        if not distributed.rank():
+            if better:
+                self._save_best(metrics)
+            self._save_state()
+        distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
+
+    def validate(self) -> dict[str, float]:
+        """Judge the fixed validation pairs; nothing where the split has no validation objects."""
+        if self.validation is None:
+            return {}
+        logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
+        set_training_mode(self.matcher, self.config.training)
+        return {
+            "validation_auc": pair_auc(logits, labels),
+            "validation_pair_accuracy": pair_accuracy(logits, labels),
+            "validation_nll": fit_calibration(logits, labels).nll_before,
+        }
+
+    def _save_best(self, metrics: dict[str, float]) -> None:
+        provenance = {
+            "step": self.step,
+            "source": self.source,
+            "data_digest": self.data_digest,
+            "metrics": metrics,
+        }
+        save_checkpoint(
+            self.out,
+            self.matcher,
+            self.untaught,
+            split=self.split,
+            provenance=provenance,
+        )
+
+    def _identity(self) -> dict[str, Any]:
+        """What must be the same for a run to be resumed."""
+        return {
+            "config": self.config.to_dict(),
+            "split": self.split.to_dict(),
+            "data_digest": self.data_digest,
+        }
+
+    def _save_state(self) -> None:
+        frozen = FROZEN if self.config.training.freeze_towers else ()  # these stand in the checkpoint beside it
+        state = {name: tensor for name, tensor in self.matcher.state_dict().items() if not name.startswith(frozen)}
+        tensors = {f"model.{name}": tensor.cpu().contiguous() for name, tensor in state.items()}
+        for name, parameter in self.matcher.named_parameters():
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"optimizer.{name}.{key}"] = value.cpu().contiguous()
+        best = self.best if self.validation is not None else None
+        write_tensors(state_path(self.out), tensors, {"step": self.step, "best": best, **self._identity()})
+
+    def resume(self) -> None:
+        """Take over the state beside `out`. Raises CheckpointError where it belongs to another run."""
+        path = state_path(self.out)
+        tensors, header = read_tensors(path)
+        for name, value in self._identity().items():
+            if header.get(name) != value:
+                raise CheckpointError(
+                    f"{path} was made with another {name.replace('_', ' ')}; resume with the same recording and "
+                    "configuration, or delete the file to start afresh"
+                )
+        kept = self._own_checkpoint().matcher.state_dict()
+        self.matcher.load_state_dict(
+            {name: tensors.get(f"model.{name}", kept[name]) for name in self.matcher.state_dict()}
+        )
+        for name, parameter in self.matcher.named_parameters():
+            prefix = f"optimizer.{name}."
+            kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+            if kept:
+                self.optimizer.state[parameter] = {
+                    key: value if key == "step" else value.to(self.device) for key, value in kept.items()
+                }
+        self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
+
+    def _own_checkpoint(self) -> Checkpoint:
+        """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
+        two writes): the steps since then are repeated to the same end."""
+        kept = load_checkpoint(self.out)
+        mine = (kept.split, kept.provenance.get("data_digest")) == (self.split, self.data_digest)
+        if not mine or kept.config not in (self.untaught, self.config):  # before and after its pruner is taught
+            raise CheckpointError(
+                f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
+            )
+        return kept
+
+
+FROZEN = ("touch_tower.", "photo_tower.")
+"""How the names of weights begin that stand still where towers are frozen."""
+
+
+def build_matcher(config: Config) -> Matcher:
+    """A matcher with the configured first weights in both towers."""
+    matcher = Matcher(config.matcher)
+    for tower in (matcher.touch_tower, matcher.photo_tower):
+        initialise_tower(tower, config.matcher.tower, config.training.init)
+        tower.requires_grad_(not config.training.freeze_towers)
+        distributed.share_batch_statistics(tower)
+    return matcher
+
+
+def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
+    """Training mode; what is frozen stays in evaluation mode, so that its running statistics stand still.
+
+    Frozen towers are never switched, not even for a moment: another thread may be encoding with them.
+    """
+    towers = (matcher.touch_tower, matcher.photo_tower)
+    for part in matcher.children():
+        part.train(not (settings.freeze_towers and part in towers))
+    for module in matcher.modules():
+        if settings.freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
+            module.eval()

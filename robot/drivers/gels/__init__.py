@@ -1,0 +1,1 @@
+"""Gel sensors."""

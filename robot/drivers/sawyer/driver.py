@@ -1,0 +1,392 @@
+"""A Sawyer behind rosbridge: straight lines by the robot's own inverse kinematics, watched at every step.
+
+A motion is planned whole before it begins: way-points on the line, joint angles of each from IKService, seeded with
+those of the one before, a bounded number of tries each. Then joint commands in position mode go out `rate_hz` times a
+second, along a schedule that keeps the hand at the asked speed at most and every joint at `joint_speed_rad_s`; a
+program put to sleep goes on from where it was. Above that stands the robot's own speed ratio. Position mode passes by
+the robot's collision avoidance (not detection): the workspace must be free.
+
+At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
+near its commands; else the arm holds where it is. /robot/state and the collision state come more slowly: they may be as
+old as that, or 2 s. A robot that reports no collision state when it is connected can be used, and `refused` says that
+its collisions are not seen; one that has reported it must go on. When no more commands come (the program or the network
+died) the robot itself ends the motion after `command_timeout_s`. An emergency stop is never reset here.
+"""
+
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robot.devices import Arm, Clock
+from robot.drivers.sawyer import messages, straight_line
+from robot.drivers.sawyer.messages import Joints, Mount
+from robot.drivers.sawyer.rosbridge import Arrival, RosbridgeLink
+from robot.drivers.sawyer.state import newest_joints, stands
+from robot.drivers.sawyer.straight_line import Schedule, way_points
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import Box, Pose
+from robot.settings import check_range
+
+_LOG = logging.getLogger(__name__)
+_READ = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
+_SLOW_STATE_AGE_S = 2.0
+"""/robot/state and the collision state are slower than the joints; they must still come."""
+_COLLISIONS = "collision state"
+_MOST_LAG_RAD = 0.35
+"""An arm this far behind its commands is blocked; half a second of lag at 0.5 rad/s is 0.25."""
+_MOST_TURN_RAD = 0.5
+"""Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
+_STOP_S = 2.0
+"""An arm that was told to hold must stand after so long."""
+_BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
+"""First and longest wait between two tries to connect again; it doubles, and twenty tries would take days."""
+_MARGIN_MM = 20.0
+"""So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
+
+
+class Sawyer(Arm):
+    """Sawyer's right arm through rosbridge at host:port.
+
+    base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: from the origin of `tip` along its z
+    axis to the point between the fingertips; tool_yaw_deg: from the tip's x axis about z to where finger a closes to.
+    enable: whether the motors may be enabled from here (never while an emergency stop holds). max_state_age_s: joint
+    states older than this stop the arm; the robot's and the collision state where older than this and than 2 s.
+    """
+
+    def __init__(
+        self,
+        *,
+        workspace: Box,
+        host: str,
+        base_xyz_mm: Sequence[float],
+        tool_mm: float,
+        port: int = 9090,
+        tip: str = "right_hand",
+        base_yaw_deg: float = 0.0,
+        tool_yaw_deg: float = 0.0,
+        speed_ratio: float = 0.3,
+        joint_speed_rad_s: float = 0.5,
+        rate_hz: float = 100.0,
+        ramp_s: float = 0.3,
+        arrival_rad: float = 0.01,
+        settle_s: float = 5.0,
+        command_timeout_s: float = 0.2,
+        timeout_s: float = 2.0,
+        ik_retries: int = 2,
+        reconnect_tries: int = 5,
+        enable: bool = False,
+        max_speed_mm_s: float = 200.0,
+        max_state_age_s: float = 0.5,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        super().__init__("sawyer", workspace, max_speed_mm_s=max_speed_mm_s, clock=clock)
+        for name, value, low, high in (
+            ("port", port, 1, 65535),
+            ("tool_mm", tool_mm, 0, 1000),
+            ("base_yaw_deg", base_yaw_deg, -360, 360),
+            ("tool_yaw_deg", tool_yaw_deg, -360, 360),
+            ("speed_ratio", speed_ratio, 0.01, 1),
+            ("joint_speed_rad_s", joint_speed_rad_s, 0.01, 1.5),
+            ("rate_hz", rate_hz, 20, 1000),
+            ("ramp_s", ramp_s, 0, 5),
+            ("arrival_rad", arrival_rad, 1e-3, 0.1),
+            ("settle_s", settle_s, 0.1, 60),
+            ("command_timeout_s", command_timeout_s, 0.05, 1),
+            ("timeout_s", timeout_s, 0.05, 60),
+            ("ik_retries", ik_retries, 0, 20),
+            ("reconnect_tries", reconnect_tries, 1, 20),
+            ("max_state_age_s", max_state_age_s, 0.02, 5),
+        ):
+            check_range(name, value, low, high)
+        if len(base_xyz_mm) != 3 or not all(abs(value) <= 1e4 for value in base_xyz_mm):
+            raise RobotConfigError(f"base_xyz_mm must be x, y and z in mm, each within 10 m, got {base_xyz_mm}")
+        x, y, z = (float(value) for value in base_xyz_mm)
+        self._mount = Mount((x, y, z), math.radians(base_yaw_deg), tool_mm, math.radians(tool_yaw_deg))
+        self._url = f"ws://{host}:{port}"
+        self._tip, self._enable, self._max_state_age_s = tip, enable, max_state_age_s
+        self._speed_ratio, self._joint_speed_rad_s = speed_ratio, joint_speed_rad_s
+        self._tick_s, self._ramp_s = 1.0 / rate_hz, ramp_s
+        self._arrival_rad, self._settle_s = arrival_rad, settle_s
+        self._command_timeout_s, self._timeout_s = command_timeout_s, timeout_s
+        self._ik_retries, self._reconnect_tries = ik_retries, reconnect_tries
+        self._under_way = self._sees_collisions = False
+        self._link = self._new_link()
+
+    def _new_link(self) -> RosbridgeLink:
+        return RosbridgeLink(self._url, timeout_s=self._timeout_s, clock=self.clock)
+
+    def _connect(self) -> None:
+        self._sees_collisions = False
+        self._join()
+        self._look_for_collisions()
+        self._make_ready()
+
+    def _look_for_collisions(self) -> None:
+        """Note it where nothing comes that would report one: a person may do without, and must know."""
+        self.refused.pop(_COLLISIONS, None)
+        try:
+            self._link.wait_for(messages.COLLISION[0])
+            self._sees_collisions = True
+        except DeviceError:
+            self._link.check()
+            self.refused[_COLLISIONS] = "nothing comes: collisions are not seen"
+            _LOG.warning("%s: nothing comes on %s: collisions are not seen", self.name, messages.COLLISION[0])
+
+    def _join(self) -> None:
+        """A new link on which every state has come once; that of collisions, where it came when connecting."""
+        self._link = self._new_link()
+        self._link.open()
+        for topic, kind in (*_READ, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
+            self._link.subscribe(topic, kind)
+        self._link.advertise(*messages.JOINT_COMMAND)
+        for topic, _ in _READ if self._sees_collisions else _READ[:-1]:
+            self._link.wait_for(topic)
+        self._set("speed_ratio", messages.SPEED_RATIO, self._speed_ratio)
+        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._command_timeout_s)
+
+    def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
+        """Publish a setting and read it back as the topic shows it; what differs is noted in `refused`."""
+        since = self.clock()
+        self._link.advertise(*topic, latch=True)
+        self._link.publish(topic[0], {"data": value})
+        self.refused.pop(name, None)
+        try:
+            found = messages.number_of(self._link.wait_for(topic[0], since_s=since).message)
+        except DeviceError:
+            self._link.check()
+            self.refused[name] = f"asked {value:g}, nothing can be read back"
+            return
+        if abs(found - value) > 1e-6:
+            self.refused[name] = f"asked {value:g}, has {found:g}"
+
+    def _make_ready(self) -> None:
+        """Enable the motors where that is all that is missing and allowed. Raises DeviceError."""
+        state = self._robot_state()
+        if self._enable and self.may_move and not (state.enabled or state.stopped or state.error):
+            _LOG.warning("%s: the motors are being enabled", self.name)
+            self._link.advertise(*messages.ENABLE)
+            self._link.publish(messages.ENABLE[0], {"data": True})
+            deadline = self.clock() + self._timeout_s
+            while not self._robot_state().enabled and self.clock() < deadline:
+                time.sleep(self._tick_s)
+        self._check_free()
+
+    def _close(self) -> None:
+        """Hold the arm where another thread still moves it; one that nobody moves from here is left alone."""
+        try:
+            if self._under_way:
+                with contextlib.suppress(DeviceError):
+                    self._command(self._fresh_joints())
+        finally:
+            self._link.close()
+
+    def _settings(self) -> dict[str, Any]:
+        return {
+            "url": self._url,
+            "tip": self._tip,
+            "speed_ratio": self._read_back(messages.SPEED_RATIO),
+            "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
+        }
+
+    def _read_back(self, topic: tuple[str, str]) -> float | None:
+        arrivals = self._link.history(topic[0])
+        return messages.number_of(arrivals[-1].message) if arrivals else None
+
+    def _recover(self) -> None:
+        """Connect again with back-off where the link or the state is gone; what a person must see to, raises."""
+        try:
+            self._link.check()
+            self._fresh_joints()
+            self._robot_state()
+            self._collisions()
+        except DeviceError as error:
+            _LOG.warning("%s: %s; connecting again", self.name, error)
+            self._rejoin()
+        if self._collided_since(-math.inf, newest=True):
+            raise DeviceError(f"{self.name}: recovery is refused: {messages.COLLIDED}")
+        self._make_ready()
+
+    def _rejoin(self) -> None:
+        for trial in range(self._reconnect_tries):
+            self._link.close()
+            try:
+                return self._join()
+            except DeviceError as error:
+                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._reconnect_tries, error)
+                if trial + 1 == self._reconnect_tries:
+                    raise
+            time.sleep(min(_BACK_OFF_S * 2**trial, _LONGEST_BACK_OFF_S))
+        raise AssertionError("the loop returns or raises")
+
+    def _pose(self) -> Pose:
+        return self._pose_since(self.clock() - self._max_state_age_s)
+
+    def _pose_since(self, since_s: float) -> Pose:
+        arrival = self._link.wait_for(messages.TIP_STATES[0], since_s=since_s)
+        return self._mount.pose_of(messages.tip_of(arrival.message, self._tip))
+
+    def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
+        began = self.clock()
+        self._check_free()
+        if self._collided_since(began, newest=True):
+            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
+        start = self._fresh_joints()
+        poses = way_points(self._inside(self._pose()), pose)
+        joints = self._solve(poses, start)
+        schedule = Schedule.of(poses, joints, speed_mm_s, self._joint_speed_rad_s, self._ramp_s)
+        self._under_way = True
+        try:
+            self._follow(schedule, began)
+            self._settle(joints[-1], began)
+        finally:
+            self._under_way = False
+        return self._pose_since(self.clock())
+
+    def _inside(self, pose: Pose) -> Pose:
+        """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
+        if not straight_line.is_near(self.workspace, pose, _MARGIN_MM):
+            lower, upper = self.workspace.lower, self.workspace.upper
+            raise DeviceError(
+                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; "
+                "bring it there by hand, or check base_xyz_mm and tool_mm"
+            )
+        return pose
+
+    def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
+        """Joint angles (N, 7) of way-points, the first of them where the arm is."""
+        found = [start]
+        for pose in poses[1:]:
+            found.append(self._solve_one(pose, found[-1], start))
+        return np.array(found)
+
+    def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
+        """Ask with other seeds when one fails, at most `ik_retries` times more."""
+        tip, seeds = self._mount.tip_of(pose), (before, start, None)
+        for trial in range(self._ik_retries + 1):
+            request = messages.ik_request(tip, self._tip, seeds[trial % len(seeds)])
+            try:
+                found = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
+            except DeviceError as error:
+                self._link.check()
+                problem = str(error)
+                continue
+            turn = float(np.abs(found - before).max())
+            if turn <= _MOST_TURN_RAD:
+                return found
+            problem = f"its solution turns a joint by {turn:.2f} rad at once"
+        raise DeviceError(
+            f"{self.name}: the hand must reach {pose}, but after {self._ik_retries + 1} tries: {problem}; nothing has "
+            "moved. Choose a smaller workspace or check base_xyz_mm and tool_mm"
+        )
+
+    def _follow(self, schedule: Schedule, began: float) -> None:
+        """Command the schedule. Its time goes on by two ticks at most, however long this program was put to sleep."""
+        at, last = 0.0, self.clock()
+        while True:
+            commanded = schedule.at(at)
+            self._watch(commanded, began)
+            self._command(commanded)
+            if at >= schedule.duration_s:
+                return
+            time.sleep(max(0.0, last + self._tick_s - self.clock()))
+            now = self.clock()
+            at, last = at + min(now - last, 2 * self._tick_s), now
+
+    def _settle(self, goal: Joints, began: float) -> None:
+        """Wait until every joint is within `arrival_rad` and stands. Raises DeviceError for one that does not arrive
+        in `settle_s`; one that trembles where it should be is let be."""
+        deadline = self.clock() + self._settle_s
+        while True:
+            off = float(np.abs(self._watch(goal, began) - goal).max())
+            late = self.clock() > deadline
+            if off <= self._arrival_rad and (late or self._stands(began)):
+                return
+            if late:
+                raise DeviceError(
+                    f"{self.name}: every joint must come within {self._arrival_rad:g} rad of its goal, after "
+                    f"{self._settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
+                )
+            self._command(goal)
+            time.sleep(self._tick_s)
+
+    def _stands(self, since_s: float) -> bool:
+        return stands(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
+
+    def _watch(self, commanded: Joints, began: float) -> Joints:
+        """The joints now. Raises DeviceError where anything says that the arm must not go on."""
+        self._link.check()
+        joints = self._fresh_joints()
+        self._check_free()
+        if self._collided_since(began):
+            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
+        if (lag := float(np.abs(joints - commanded).max())) > _MOST_LAG_RAD:
+            raise DeviceError(
+                f"{self.name}: the arm must follow within {_MOST_LAG_RAD} rad, a joint is {lag:.2f} behind; look what "
+                "holds it, and whether another program commands it"
+            )
+        return joints
+
+    def _stop(self) -> None:
+        """Hold the joints where they are now and wait until they stand."""
+        self._link.check()
+        hold, began = self._fresh_joints(), self.clock()
+        while not self._stands(began):
+            if self.clock() - began > _STOP_S:
+                raise DeviceError(f"{self.name}: the arm was told to hold and still moves; press the emergency stop")
+            self._fresh_joints()
+            self._command(hold)
+            time.sleep(self._tick_s)
+
+    def _command(self, joints: Joints) -> None:
+        self._link.publish(messages.JOINT_COMMAND[0], messages.joint_command(joints))
+
+    def _fresh_joints(self) -> Joints:
+        """The newest joints. Raises DeviceError for what is too old, a message repeated with its old stamp too."""
+        found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
+        if found is not None:
+            joints, since_s = found
+            if (age_s := self.clock() - since_s) <= self._max_state_age_s:
+                return joints
+        self._link.check()
+        age = "never came" if found is None else f"is {age_s:.2f} s old"
+        raise DeviceError(
+            f"{self.name}: the joint state must be at most {self._max_state_age_s:g} s old, it {age}; without new "
+            f"commands the robot ends its motion after {self._command_timeout_s:g} s by itself"
+        )
+
+    def _robot_state(self) -> messages.RobotState:
+        arrivals = self._link.history(messages.ROBOT_STATE[0])
+        self._check_comes(messages.ROBOT_STATE[0], arrivals, "an emergency stop")
+        return messages.robot_state(arrivals[-1].message)
+
+    def _collisions(self) -> Sequence[Arrival]:
+        """What came of the collision state; nothing only where nothing came when connecting either."""
+        arrivals = self._link.history(messages.COLLISION[0])
+        if arrivals or self._sees_collisions:
+            self._check_comes(messages.COLLISION[0], arrivals, "a collision")
+        return arrivals
+
+    def _check_comes(self, topic: str, arrivals: Sequence[Arrival], unseen: str) -> None:
+        limit_s = max(self._max_state_age_s, _SLOW_STATE_AGE_S)
+        if not arrivals or self.clock() - arrivals[-1].time_s > limit_s:
+            self._link.check()
+            raise DeviceError(
+                f"{self.name}: {topic} must be at most {limit_s:g} s old, no newer one came; without it {unseen} would "
+                "not be seen"
+            )
+
+    def _check_free(self) -> None:
+        if obstacle := self._robot_state().obstacle:
+            raise DeviceError(f"{self.name}: {obstacle}")
+
+    def _collided_since(self, began: float, *, newest: bool = False) -> bool:
+        """Whether any message after `began`, or with `newest` the last one, reports a collision."""
+        arrivals = self._collisions()
+        asked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
+        return any(messages.collided(arrival.message) for arrival in asked)

@@ -1,0 +1,1 @@
+"""Cameras that never wait, and what is cut out of their pictures."""

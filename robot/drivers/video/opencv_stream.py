@@ -1,0 +1,296 @@
+"""A camera opened through OpenCV and Video4Linux: settings written, read back, and pictures with their times.
+
+Facts used (OpenCV's cap_v4l.cpp; the kernel's uvcvideo): a change of format, size or buffers starts the stream anew, so
+these are set first, width and height one after the other; a control that a camera lacks reads -1; automatic exposure is
+a menu with 1 = manual and 3 = automatic; exposure counts in 0.1 ms; CAP_PROP_POS_MSEC is when a picture's buffer was
+filled, on the clock of time.monotonic; grab() gives up after OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT seconds, 10 unless set.
+"""
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from robot.devices import Clock, Device
+from robot.drivers import discover
+from robot.drivers.video.frames import FrameReader, ReaderSettings
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import Frame
+
+_GRAB_LIMIT_S = 1
+_DAMAGED_IN_A_ROW = 10
+"""So many pictures that cannot be decoded are passed over before the stream counts as lost."""
+
+_STAMP_S = (-0.05, 1.0)
+"""A picture's own time is believed where it is so much older than now; else it is on another clock."""
+
+_NUMBERED = re.compile(r"/dev/video\d+")
+LEAVE = math.nan
+"""For a number: leave it as the camera has it."""
+
+_MAY_BE_LEFT = ("exposure_ms", "white_balance_k", "gain")
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What is asked of a camera; 0, "", () and nan leave a setting as the camera has it.
+
+    width, height in pixels; fps; fourcc as "MJPG"; exposure_ms and white_balance_k count where they are not automatic;
+    gain in the camera's own unit; buffer: pictures that the system keeps back (1 to 10); led: red, green, blue of a
+    DIGIT, each 0 to 15.
+    """
+
+    width: int = 0
+    height: int = 0
+    fps: float = 0.0
+    fourcc: str = ""
+    auto_exposure: bool = False
+    exposure_ms: float = LEAVE
+    auto_white_balance: bool = False
+    white_balance_k: float = LEAVE
+    gain: float = LEAVE
+    buffer: int = 0
+    led: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        size, led = (self.width, self.height), self.led
+        _require("width and height must be given together, up to 20000 pixels", size, _is_size(size))
+        _require("fps must be from 0 to 1000", self.fps, 0 <= self.fps <= 1000)
+        text = self.fourcc
+        _require('fourcc must be four letters, as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
+        for name in _MAY_BE_LEFT:
+            value = getattr(self, name)
+            _require(f"{name} must be 0 or more", value, math.isnan(value) or 0 <= value < math.inf)
+        for name, automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
+            value = getattr(self, name)
+            _require(f"{name} must be left out where it is automatic", value, not automatic or math.isnan(value))
+        _require("buffer must be from 0 to 10 pictures", self.buffer, 0 <= self.buffer <= 10)
+        _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3) and all(0 <= each <= 15 for each in led))
+
+    def asked(self) -> dict[str, Any]:
+        """Settings to write, in the order in which to write them."""
+        values = {name: getattr(self, name) for name in _PROPERTIES}
+        return {name: value for name, value in values.items() if _is_asked(name, value)}
+
+
+def _require(what: str, got: object, holds: bool) -> None:
+    if not holds:
+        raise RobotConfigError(f"a camera's {what}, got {got}")
+
+
+def _is_size(size: tuple[int, int]) -> bool:
+    return size == (0, 0) or 1 <= min(size) <= max(size) <= 20000
+
+
+def _is_asked(name: str, value: Any) -> bool:
+    if name in _MAY_BE_LEFT:
+        return not math.isnan(value)
+    return isinstance(value, bool) or bool(value)
+
+
+@dataclass(frozen=True)
+class _Property:
+    """One setting: OpenCV's number of it, our value to the camera's and back, and how far off still counts as taken."""
+
+    number: int
+    to_camera: Callable[[Any], float] = float
+    from_camera: Callable[[float], Any] = float
+    slack: float = 0.0
+
+    def is_taken(self, asked: Any, has: Any) -> bool:
+        if isinstance(asked, str | bool | Sequence):
+            return bool(has == (list(asked) if isinstance(asked, tuple) else asked))
+        return has is not None and abs(float(has) - float(asked)) <= self.slack
+
+
+def _fourcc_text(number: float) -> str:
+    return (int(number) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
+
+
+def _whole(value: float) -> int:
+    return round(value)
+
+
+_PROPERTIES: Mapping[str, _Property] = {
+    "fourcc": _Property(
+        cv2.CAP_PROP_FOURCC, lambda text: float(int.from_bytes(text.encode("ascii"), "little")), _fourcc_text
+    ),
+    "width": _Property(cv2.CAP_PROP_FRAME_WIDTH, from_camera=_whole),
+    "height": _Property(cv2.CAP_PROP_FRAME_HEIGHT, from_camera=_whole),
+    "fps": _Property(cv2.CAP_PROP_FPS, slack=0.5),
+    "buffer": _Property(cv2.CAP_PROP_BUFFERSIZE, from_camera=_whole),
+    "auto_exposure": _Property(cv2.CAP_PROP_AUTO_EXPOSURE, lambda on: 3.0 if on else 1.0, lambda value: value != 1),
+    "exposure_ms": _Property(cv2.CAP_PROP_EXPOSURE, lambda ms: 10.0 * ms, lambda value: value / 10, slack=0.05),
+    "auto_white_balance": _Property(cv2.CAP_PROP_AUTO_WB, from_camera=bool),
+    "white_balance_k": _Property(cv2.CAP_PROP_WB_TEMPERATURE, slack=50.0),
+    "gain": _Property(cv2.CAP_PROP_GAIN, slack=0.5),
+    "led": _Property(
+        cv2.CAP_PROP_ZOOM,
+        lambda led: float(led[0] << 8 | led[1] << 4 | led[2]),
+        lambda value: [int(value) >> shift & 15 for shift in (8, 4, 0)],
+    ),
+}
+"""In the order of writing. The DIGIT takes the brightness of its LEDs through the zoom control."""
+
+
+class CaptureStream:
+    """One opened camera. settings: read back from it after all were written. refused: those that it did not take."""
+
+    def __init__(self, device: str, settings: CaptureSettings, clock: Clock) -> None:
+        """Open and set up the camera at the path `device`. Raises DeviceError."""
+        self.device, self.clock = device, clock
+        self.refused: dict[str, str] = {}
+        self._damaged = 0
+        with self._errors():
+            self._capture = open_capture(device)
+        try:
+            if not self._capture.isOpened():
+                raise DeviceError(f"{device} cannot be opened; is it used by another program, or not yours to read?")
+            with self._errors():
+                self.settings = self._write(settings)
+        except BaseException:
+            self.close()
+            raise
+
+    def next(self) -> Frame:
+        """The next picture, (H, W, 3) uint8 BGR, and when it was taken. Raises DeviceError."""
+        while True:
+            with self._errors():
+                grabbed = self._capture.grab()
+                time_s = self._time()
+                whole, pixels = self._capture.retrieve() if grabbed else (False, None)
+            if whole and pixels is not None and pixels.size:
+                self._damaged = 0
+                return Frame(pixels, time_s)
+            self._damaged += 1
+            if not grabbed or self._damaged > _DAMAGED_IN_A_ROW:
+                raise DeviceError(f"{self.device} gives no more pictures")
+
+    def close(self) -> None:
+        """Let go of the camera; twice does nothing."""
+        with contextlib.suppress(cv2.error):
+            self._capture.release()
+
+    def _time(self) -> float:
+        """The picture's own time where it has one on our clock, else now."""
+        now = self.clock()
+        stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        return stamp if _STAMP_S[0] <= now - stamp <= _STAMP_S[1] else now
+
+    def _write(self, settings: CaptureSettings) -> dict[str, Any]:
+        asked = settings.asked()
+        for name, value in asked.items():
+            self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
+        has = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in asked}
+        for name, value in asked.items():
+            if not _PROPERTIES[name].is_taken(value, has[name]):
+                said = "no such setting" if has[name] is None else _words(has[name])
+                self.refused[name] = f"asked {_words(value)}, has {said}"
+        return has
+
+    def _read(self, each: _Property) -> Any:
+        value = self._capture.get(each.number)
+        return None if value == -1 or not math.isfinite(value) else each.from_camera(value)
+
+    @contextlib.contextmanager
+    def _errors(self) -> Any:
+        try:
+            yield
+        except cv2.error as error:
+            raise DeviceError(f"{self.device}: OpenCV failed: {error.err or error}") from error
+
+
+class CaptureReader(FrameReader):
+    """The thread that reads one camera. settings and `refused` are as of when its stream was opened last.
+
+    `refused` is the owner's dictionary, kept up to date.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: str,
+        asked: CaptureSettings,
+        reading: ReaderSettings,
+        *,
+        allow_index: bool,
+        refused: dict[str, str],
+        clock: Clock,
+    ) -> None:
+        """Raises RobotConfigError for a `device` that may be another camera tomorrow; opens nothing."""
+        super().__init__(name, self._open_camera, reading, clock=clock)
+        self.device, self.asked, self.refused = device, asked, refused
+        self._path = stable_path(device, allow_index)
+        self.camera: dict[str, Any] = {}
+
+    def _open_camera(self) -> CaptureStream:
+        """Also called by the thread, when the stream was lost: settings are written and read back again."""
+        stream = CaptureStream(self._path, self.asked, self.clock)
+        self.refused.clear()
+        self.refused.update(stream.refused)
+        self.camera = {"device": self.device, **stream.settings}
+        return stream
+
+    def recover(self) -> None:
+        """A lost stream is opened again without being asked: have it be now, and wait for a picture."""
+        self.hurry()
+        self.after(self.clock())
+
+
+def reader_maker(
+    owner: Device, device: str, asked: CaptureSettings, reading: ReaderSettings, *, allow_index: bool
+) -> Callable[[], CaptureReader]:
+    """Makes readers of one camera for its `owner`, who needs a new one for each connection."""
+    return partial(
+        CaptureReader,
+        owner.name,
+        device,
+        asked,
+        reading,
+        allow_index=allow_index,
+        refused=owner.refused,
+        clock=owner.clock,
+    )
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def open_capture(device: str) -> Any:
+    """OpenCV's capture of the camera at a path: the number behind a stable name changes when it is plugged in again."""
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_GRAB_LIMIT_S))
+    if not Path(device).exists():
+        raise DeviceError(f"{device} must be there, but is not; is the camera plugged in?{_known()}")
+    return cv2.VideoCapture(os.path.realpath(device), cv2.CAP_V4L2)
+
+
+def stable_path(device: str, allow_index: bool) -> str:
+    """The path to open for a `device` from a rig's file. Raises RobotConfigError for one that is no path, or that may
+    be another camera tomorrow, unless `allow_index`."""
+    path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
+    if not os.path.isabs(path):
+        raise RobotConfigError(f"a camera must be named by its whole path, got {device!r}.{_known()}")
+    if allow_index or not _NUMBERED.fullmatch(os.path.normpath(path)):
+        return path
+    known = _known() or " This system makes no such names: set allow_index = true if only one camera is ever plugged in"
+    raise RobotConfigError(
+        "a camera must be named by what stays the same, a path in /dev/v4l/by-id, "
+        f"got {device!r}, a number that another camera may have tomorrow.{known}"
+    )
+
+
+def _known() -> str:
+    names = discover.camera_names(discover.DEV)
+    note = discover.note_on(names)
+    return f" Connected: {', '.join(names)}{note and f' ({note})'}" if names else ""

@@ -1,0 +1,1 @@
+"""The WSG-50 parallel gripper (Weiss Robotics, SCHUNK)."""

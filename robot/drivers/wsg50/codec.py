@@ -1,0 +1,136 @@
+"""Bytes of the WSG-50's command interface: frames, their check sum, and how they are found in a stream. No I/O.
+
+A frame is AA AA AA | id u8 | length u16 | payload | check sum u16, all little-endian. What payloads mean stands in
+robot.drivers.wsg50.commands. Facts: command set reference of the gripper (firmware 4.0) and public drivers for it.
+"""
+
+import functools
+import operator
+import struct
+from dataclasses import dataclass
+
+from robot.errors import DeviceError
+
+PREAMBLE = b"\xaa\xaa\xaa"
+MAX_PAYLOAD = 256
+"""More than any command of the table needs; a length above it is noise. Bounds what a damaged length can swallow."""
+
+_HEADER = 6  # preamble, id, length
+_CHECK = 2
+_NO_ID = 0xAA
+"""No command has this id, so that in a run of more than three AA the preamble is the last three."""
+
+
+class WireError(DeviceError):
+    """Bytes do not mean what they must: a payload of the wrong length, a number that is none, an unknown status."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A command or a reply. id: 0 to 255 without AA. Raises WireError for what cannot be sent."""
+
+    id: int
+    payload: bytes = b""
+
+    def __post_init__(self) -> None:
+        """Check what the bytes can hold."""
+        if not 0 <= self.id <= 255 or self.id == _NO_ID:
+            raise WireError(f"a frame's id must be from 0 to 255 and not {_NO_ID}, got {self.id}")
+        if len(self.payload) > MAX_PAYLOAD:
+            raise WireError(f"a payload must be at most {MAX_PAYLOAD} bytes, got {len(self.payload)}")
+
+
+def _table_row(index: int) -> int:
+    """Remainder of a byte by the polynomial 0x1021, most significant bit first."""
+    row = index << 8
+    for _ in range(8):
+        row = (row << 1) ^ (0x1021 if row & 0x8000 else 0)
+    return row & 0xFFFF
+
+
+_TABLE = tuple(map(_table_row, range(256)))
+
+
+def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
+    """Check sum of `data`; over a frame and its own check sum it is 0. Not CCITT: the register moves the other way."""
+    value = start
+    for byte in data:
+        value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
+    return value
+
+
+class _Sums:
+    """Check sums of many stretches of one buffer, going through each of its bytes once.
+
+    A stream of frames that break off claims every byte up to 44 times. The sum is linear: that of a stretch follows
+    from the sums, begun at 0, up to its two ends.
+    """
+
+    def __init__(self, buffer: bytes | bytearray, first: int) -> None:
+        self._buffer, self._first, self._up_to = buffer, first, [0]
+
+    def of(self, start: int, stop: int) -> int:
+        """As `checksum` of buffer[start:stop]; no byte before `first`."""
+        value = self._up_to[-1]
+        for byte in self._buffer[self._first + len(self._up_to) - 1 : stop]:
+            value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
+            self._up_to.append(value)
+        begun = 0xFFFF ^ self._up_to[start - self._first]
+        return self._up_to[stop - self._first] ^ _after_zeros(begun, stop - start)
+
+
+def _after_zeros(value: int, count: int) -> int:
+    """What `count` bytes of 0 make of a sum."""
+    column = _ZEROS[count]
+    return functools.reduce(operator.xor, (column[bit] for bit in range(16) if value >> bit & 1), 0)
+
+
+def _zeros(most: int) -> tuple[tuple[int, ...], ...]:
+    """Of each number of zeros up to `most`: what they make of each bit of a sum."""
+    columns = [tuple(1 << bit for bit in range(16))]
+    for _ in range(most):
+        columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))
+    return tuple(columns)
+
+
+_ZEROS = _zeros(_HEADER + MAX_PAYLOAD + _CHECK)
+
+
+def encode(frame: Frame) -> bytes:
+    """The bytes of a frame."""
+    body = PREAMBLE + struct.pack("<BH", frame.id, len(frame.payload)) + frame.payload
+    return body + struct.pack("<H", checksum(body))
+
+
+def decode(buffer: bytes | bytearray) -> tuple[int, Frame | None]:
+    """The first whole, undamaged frame, and how many bytes to drop from the front; (n, None) where more must come.
+
+    Whatever is no frame is skipped byte by byte, so that a frame which began inside a damaged one is found. While a
+    frame that has begun is not yet whole, its bytes stay: where none come any more, drop one and decode again.
+    """
+    at = buffer.find(PREAMBLE)
+    sums = _Sums(buffer, at)
+    while at >= 0:
+        size = _claimed(buffer, at)
+        if size is None or (size and len(buffer) < at + size):
+            return at, None
+        if size and sums.of(at, at + size) == 0:
+            payload = bytes(buffer[at + _HEADER : at + size - _CHECK])
+            return at + size, Frame(buffer[at + 3], payload)
+        at = buffer.find(PREAMBLE, at + 1)
+    return len(buffer) - _preamble_begun(buffer), None
+
+
+def _claimed(buffer: bytes | bytearray, at: int) -> int | None:
+    """Bytes of the frame that begins here, 0 if it can be none, None where that is not yet known."""
+    if len(buffer) > at + 3 and buffer[at + 3] == _NO_ID:
+        return 0
+    if len(buffer) < at + _HEADER:
+        return None
+    length = buffer[at + 4] | buffer[at + 5] << 8
+    return 0 if length > MAX_PAYLOAD else _HEADER + length + _CHECK
+
+
+def _preamble_begun(buffer: bytes | bytearray) -> int:
+    """How many bytes at the end may be the beginning of a preamble."""
+    return next(size for size in (2, 1, 0) if size == 0 or buffer[-size:] == PREAMBLE[:size])

@@ -1,0 +1,346 @@
+"""What the WSG-50's commands and replies mean: builders of commands, parsers of replies. No I/O.
+
+A reply bears the id of its command, and its payload begins with a status u16; parameters follow only where the status
+is SUCCESS. A command that moves is answered by PENDING first, and by a second frame of the same id when it has ended.
+An automatic update is a reply that nobody asked for.
+
+Facts: as in robot.drivers.wsg50.codec; the commands of fingers (60h to 63h) and of scripts (B0h to B2h) are left out.
+Lengths in mm, forces in N as the gripper counts them (robot.drivers.wsg50.force says what they are), speeds in mm/s,
+accelerations in mm/s^2. Whatever cannot be raises WireError.
+"""
+
+import enum
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from robot.drivers.wsg50.codec import Frame, WireError
+
+
+class Command(enum.IntEnum):
+    """Commands by id."""
+
+    LOOP = 0x06
+    DISCONNECT = 0x07
+    HOME = 0x20
+    MOVE = 0x21
+    STOP = 0x22
+    FAST_STOP = 0x23
+    ACKNOWLEDGE = 0x24
+    GRASP = 0x25
+    RELEASE = 0x26
+    SET_ACCELERATION = 0x30
+    GET_ACCELERATION = 0x31
+    SET_FORCE_LIMIT = 0x32
+    GET_FORCE_LIMIT = 0x33
+    SET_SOFT_LIMITS = 0x34
+    GET_SOFT_LIMITS = 0x35
+    CLEAR_SOFT_LIMITS = 0x36
+    OVERDRIVE = 0x37
+    TARE = 0x38
+    SYSTEM_STATE = 0x40
+    GRASPING_STATE = 0x41
+    STATISTICS = 0x42
+    OPENING = 0x43
+    SPEED = 0x44
+    FORCE = 0x45
+    TEMPERATURE = 0x46
+    INFO = 0x50
+    SET_TAG = 0x51
+    GET_TAG = 0x52
+    LIMITS = 0x53
+
+
+UPDATING = frozenset(
+    {Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.SPEED, Command.FORCE},
+)
+"""Commands whose reply the gripper can be told to send again and again."""
+
+
+class Status(enum.IntEnum):
+    """What became of a command."""
+
+    SUCCESS = 0
+    NOT_AVAILABLE = 1
+    NO_SENSOR = 2
+    NOT_INITIALIZED = 3
+    ALREADY_RUNNING = 4
+    FEATURE_NOT_SUPPORTED = 5
+    INCONSISTENT_DATA = 6
+    TIMEOUT = 7
+    READ_ERROR = 8
+    WRITE_ERROR = 9
+    INSUFFICIENT_RESOURCES = 10
+    CHECKSUM_ERROR = 11
+    NO_PARAM_EXPECTED = 12
+    NOT_ENOUGH_PARAMS = 13
+    CMD_UNKNOWN = 14
+    CMD_FORMAT_ERROR = 15
+    ACCESS_DENIED = 16
+    ALREADY_OPEN = 17
+    CMD_FAILED = 18
+    CMD_ABORTED = 19
+    INVALID_HANDLE = 20
+    NOT_FOUND = 21
+    NOT_OPEN = 22
+    IO_ERROR = 23
+    INVALID_PARAMETER = 24
+    INDEX_OUT_OF_BOUNDS = 25
+    CMD_PENDING = 26
+    OVERRUN = 27
+    RANGE_ERROR = 28
+    AXIS_BLOCKED = 29
+    FILE_EXISTS = 30
+
+
+class SystemState(enum.IntFlag):
+    """Bits of the system state; unknown ones are kept."""
+
+    REFERENCED = 1 << 0
+    MOVING = 1 << 1
+    BLOCKED_MINUS = 1 << 2
+    BLOCKED_PLUS = 1 << 3
+    SOFT_LIMIT_MINUS = 1 << 4
+    SOFT_LIMIT_PLUS = 1 << 5
+    AXIS_STOPPED = 1 << 6
+    TARGET_REACHED = 1 << 7
+    OVERDRIVE = 1 << 8
+    FORCE_CONTROL = 1 << 9
+    FAST_STOP = 1 << 12
+    TEMPERATURE_WARNING = 1 << 13
+    TEMPERATURE_FAULT = 1 << 14
+    POWER_FAULT = 1 << 15
+    CURRENT_FAULT = 1 << 16
+    FINGER_FAULT = 1 << 17
+    COMMAND_FAILURE = 1 << 18
+    SCRIPT_RUNNING = 1 << 19
+    SCRIPT_FAILURE = 1 << 20
+
+
+class GraspingState(enum.IntEnum):
+    """What the gripper makes of the grasp."""
+
+    IDLE = 0
+    GRASPING = 1
+    NO_PART = 2
+    PART_LOST = 3
+    HOLDING = 4
+    RELEASING = 5
+    POSITIONING = 6
+    ERROR = 7
+
+
+@dataclass(frozen=True)
+class Info:
+    """What the gripper is. kind: the vendor's number of the type. firmware: as sent, a nibble a digit."""
+
+    kind: int
+    hardware: int
+    firmware: int
+    serial: int
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the gripper can do."""
+
+    stroke_mm: float
+    min_speed_mm_s: float
+    max_speed_mm_s: float
+    min_acceleration_mm_s2: float
+    max_acceleration_mm_s2: float
+    min_force_n: float
+    max_force_n: float
+    overdrive_force_n: float
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Grasps since the counts were last reset."""
+
+    grasps: int
+    no_part: int
+    lost: int
+
+
+def loop(token: bytes) -> Frame:
+    """Echoes the token."""
+    return Frame(Command.LOOP, token)
+
+
+def home(direction: int = 0) -> Frame:
+    """Find the reference. direction: 0 as configured, 1 outward, 2 inward."""
+    if direction not in (0, 1, 2):
+        raise WireError(f"the direction of homing must be 0, 1 or 2, got {direction}")
+    return Frame(Command.HOME, bytes([direction]))
+
+
+def move(width_mm: float, speed_mm_s: float, *, relative: bool = False, stop_on_block: bool = True) -> Frame:
+    """Pre-position the fingers: bit 0 relative, bit 1 stop (rather than clamp) when blocked."""
+    return Frame(Command.MOVE, bytes([relative | stop_on_block << 1]) + _floats(width_mm, speed_mm_s))
+
+
+def stop() -> Frame:
+    """Stop, and stay usable."""
+    return Frame(Command.STOP)
+
+
+def fast_stop() -> Frame:
+    """Stop at once; nothing moves again before it is acknowledged."""
+    return Frame(Command.FAST_STOP)
+
+
+def acknowledge() -> Frame:
+    """End a FAST STOP."""
+    return Frame(Command.ACKNOWLEDGE, b"ack")
+
+
+def disconnect() -> Frame:
+    """Announce the end of the connection, which else raises a FAST STOP."""
+    return Frame(Command.DISCONNECT)
+
+
+def grasp(width_mm: float, speed_mm_s: float) -> Frame:
+    """Grasp a part of this nominal width."""
+    return Frame(Command.GRASP, _floats(width_mm, speed_mm_s))
+
+
+def release(width_mm: float, speed_mm_s: float) -> Frame:
+    """Let go of the part by opening to this width."""
+    return Frame(Command.RELEASE, _floats(width_mm, speed_mm_s))
+
+
+def set_acceleration(acceleration_mm_s2: float) -> Frame:
+    """Acceleration of all motions but stops."""
+    return Frame(Command.SET_ACCELERATION, _floats(acceleration_mm_s2))
+
+
+def set_force_limit(force_n: float) -> Frame:
+    """Force limit, as the gripper counts forces."""
+    return Frame(Command.SET_FORCE_LIMIT, _floats(force_n))
+
+
+def set_soft_limits(minus_mm: float, plus_mm: float) -> Frame:
+    """Openings that no motion may leave."""
+    return Frame(Command.SET_SOFT_LIMITS, _floats(minus_mm, plus_mm))
+
+
+def overdrive(on: bool) -> Frame:
+    """Allow forces up to the overdrive force."""
+    return Frame(Command.OVERDRIVE, bytes([on]))
+
+
+def statistics(reset: bool = False) -> Frame:
+    """Ask for the counts of grasps, and set them to 0."""
+    return Frame(Command.STATISTICS, bytes([reset]))
+
+
+def set_tag(tag: bytes) -> Frame:
+    """Name of the device."""
+    return Frame(Command.SET_TAG, tag)
+
+
+def ask(command: Command) -> Frame:
+    """Ask for a value; of an UPDATING one this also ends its automatic updates."""
+    return Frame(command, struct.pack("<BH", 0, 0) if command in UPDATING else b"")
+
+
+def update(command: Command, period_ms: int, *, on_change: bool = False) -> Frame:
+    """Ask for a value every `period_ms` (1 to 65535) from now on, or only when it has changed."""
+    if command not in UPDATING:
+        raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} update themselves, not {command!r}")
+    if not 1 <= period_ms <= 0xFFFF:
+        raise WireError(f"a period must be from 1 to 65535 ms, got {period_ms}")
+    return Frame(command, struct.pack("<BH", 1 | on_change << 1, period_ms))
+
+
+def reply(frame: Frame) -> tuple[Status, bytes]:
+    """Status and parameters of a reply. Raises WireError."""
+    if len(frame.payload) < 2:
+        raise WireError(f"the reply {name_of(frame.id)} must hold a status of 2 bytes, got {len(frame.payload)}")
+    number = int.from_bytes(frame.payload[:2], "little")
+    try:
+        return Status(number), frame.payload[2:]
+    except ValueError as error:
+        raise WireError(f"the reply {name_of(frame.id)} has the unknown status {number}") from error
+
+
+def number(parameters: bytes) -> float:
+    """A length, speed, force or acceleration. Raises WireError, also for one that is not finite."""
+    return _numbers("<f", parameters)[0]
+
+
+def soft_limits(parameters: bytes) -> tuple[float, float]:
+    """Lower and upper opening (mm)."""
+    minus, plus = _numbers("<2f", parameters)
+    return minus, plus
+
+
+def limits(parameters: bytes) -> Limits:
+    """What the gripper can do."""
+    return Limits(*_numbers("<8f", parameters))
+
+
+def info(parameters: bytes) -> Info:
+    """What the gripper is."""
+    return Info(*_unpack("<BBHI", parameters))
+
+
+def statistics_of(parameters: bytes) -> Statistics:
+    """Counts of grasps."""
+    return Statistics(*_unpack("<IHH", parameters))
+
+
+def system_state(parameters: bytes) -> SystemState:
+    """Bits of the system state."""
+    return SystemState(_unpack("<I", parameters)[0])
+
+
+def grasping_state(parameters: bytes) -> GraspingState:
+    """State of the grasp."""
+    return _member(GraspingState, _unpack("<B", parameters)[0])
+
+
+def temperature(parameters: bytes) -> float:
+    """Degrees Celsius, read as i16 tenths; other notes read a whole number: compare with a thermometer first."""
+    return float(_unpack("<h", parameters)[0]) / 10
+
+
+def name_of(command_id: int) -> str:
+    """Words for an id, as in "GRASP (25h)"."""
+    name = Command(command_id).name if command_id in list(Command) else "to an unknown command"
+    return f"{name} ({command_id:02X}h)"
+
+
+_Number = TypeVar("_Number", bound=enum.IntEnum)
+
+
+def _member(kind: type[_Number], value: int) -> _Number:
+    try:
+        return kind(value)
+    except ValueError as error:
+        raise WireError(f"{kind.__name__} must be from 0 to {max(kind)}, got {value}") from error
+
+
+def _floats(*values: float) -> bytes:
+    try:
+        packed = struct.pack(f"<{len(values)}f", *values)
+    except (struct.error, OverflowError) as error:
+        raise WireError(f"numbers must fit 32 bits, got {values}") from error
+    if not all(map(math.isfinite, values)):
+        raise WireError(f"numbers must be finite, got {values}")
+    return packed
+
+
+def _unpack(form: str, parameters: bytes) -> tuple[Any, ...]:
+    if len(parameters) != struct.calcsize(form):
+        raise WireError(f"parameters must be {struct.calcsize(form)} bytes, got {len(parameters)}")
+    return struct.unpack(form, parameters)
+
+
+def _numbers(form: str, parameters: bytes) -> tuple[float, ...]:
+    values = _unpack(form, parameters)
+    if not all(map(math.isfinite, values)):
+        raise WireError(f"numbers must be finite, got {values}")
+    return values

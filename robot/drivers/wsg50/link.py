@@ -1,0 +1,259 @@
+"""The line to a WSG-50: commands out, replies and updates in, each wait with a deadline.
+
+Replies, results of motions and automatic updates come interleaved, and only their ids tell them apart; a reply that
+comes late bears the same id as the one that is waited for. So after anything has gone wrong the line is in doubt, and
+before the next command is sent the gripper is made to echo a token that nobody has used: it answers in the order in
+which it is asked, so whatever comes before the echo is old and is dropped.
+
+Reading is done by whoever waits: updates are only wanted while something is waited for. A wait ends at its deadline
+whatever still comes.
+"""
+
+import itertools
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50.codec import MAX_PAYLOAD, Frame, WireError, decode, encode
+from robot.drivers.wsg50.commands import Command, Status, name_of
+from robot.drivers.wsg50.port import LinkLost, Port
+from robot.errors import DeviceError
+
+_T = TypeVar("_T")
+_TRIES = 3
+_GAP_SHARE = 0.25
+"""Share of the time-out after which a frame that has begun is given up: the rest of it is not coming."""
+
+_PADDING = bytes(MAX_PAYLOAD + 8)
+"""Ends any frame that the gripper may still be waiting for the rest of, and can begin none."""
+
+_MOST_LOOKS = 6
+"""So often, 4096 bytes at a time, is taken in what has come by the end of a wait: more than gathers in ten seconds in
+which this program is held up. A peer that sends without end, if byte by byte, must not hold it up for longer."""
+
+_PATIENCE = 3.0
+"""So many time-outs after a question was first asked it is not asked again."""
+
+
+class NoReply(DeviceError):
+    """The gripper did not answer in time, or heard a damaged command; whether it heard it is not known."""
+
+
+class NoEcho(NoReply):
+    """Nobody is there: asking again is of no use."""
+
+
+class CommandFailed(DeviceError):
+    """The gripper answered with another status than SUCCESS."""
+
+    def __init__(self, command_id: int, status: Status) -> None:
+        super().__init__(f"the gripper answered {name_of(command_id)} with {status.name} (status {int(status)})")
+        self.status = status
+
+
+class Link:
+    """A line to one gripper. port, baud, stop_bits: as Port takes them. timeout_s: of each answer, an echo's too.
+    Raises LinkLost, NoReply, CommandFailed, WireError, all of them DeviceError.
+
+    Whatever comes or does not come, `poll` and `pump` end when told to, `urgent` after one time-out, `sync` after 3,
+    `call` after 4, and `tell` and `ask`, which may ask three times, after 7 at the latest.
+
+    counts: what went wrong, by kind. updates: of each command that updates itself, its parameters and when they came
+    (s of time.monotonic).
+    """
+
+    def __init__(self, port: str, *, baud: int = 115200, stop_bits: int = 1, timeout_s: float = 1.0) -> None:
+        self.name, self.baud, self.stop_bits, self.timeout_s = port, baud, stop_bits, timeout_s
+        self.counts: Counter[str] = Counter()
+        self.updates: dict[int, tuple[bytes, float]] = {}
+        self.has_echoed = False
+        """Whether a gripper has answered over the port that is open now."""
+        self._port: Port | None = None
+        self._buffer = bytearray()
+        self._last_byte_s = 0.0
+        self._in_doubt = True
+        self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open, as far as is known."""
+        return self._port is not None
+
+    def open(self) -> None:
+        """Open the port, if it is not open. Sends nothing."""
+        if self._port is None:
+            self._port = Port(self.name, baud=self.baud, stop_bits=self.stop_bits, write_timeout_s=self.timeout_s)
+            self._buffer.clear()
+            self.updates.clear()
+            self._in_doubt = True
+
+    def close(self) -> None:
+        """Close the port, if it is open; never raises."""
+        port, self._port, self.has_echoed = self._port, None, False
+        if port is not None:
+            port.close()
+
+    def call(self, frame: Frame) -> bytes:
+        """Send a command once; returns the parameters of its reply."""
+        self.begin(frame)
+        return self._result(frame.id)
+
+    def tell(self, frame: Frame) -> None:
+        """Send a command that may be said twice: it is said again where no sound reply comes."""
+        self.ask(frame, bytes)
+
+    def ask(self, frame: Frame, parse: Callable[[bytes], _T]) -> _T:
+        """As `tell`; returns what its reply holds. A reply that cannot be parsed is not sound."""
+        until = time.monotonic() + _PATIENCE * self.timeout_s
+        for left in reversed(range(_TRIES)):
+            try:
+                return parse(self.call(frame))
+            except NoEcho:
+                raise
+            except (NoReply, WireError):
+                if not left or time.monotonic() > until:
+                    raise
+                self.counts["asked again"] += 1
+                self._in_doubt = True
+        raise AssertionError("the loop returns or raises")
+
+    def begin(self, frame: Frame) -> None:
+        """Send a command whose replies `poll` fetches; clears the line first if it is in doubt."""
+        self.pump(0.0)
+        if self._in_doubt:
+            self.sync()
+        self._in_doubt = True
+        self._write(frame)
+
+    def poll(self, command_id: int, timeout_s: float) -> Status | None:
+        """Status of the next reply to this command, PENDING too, or None after `timeout_s`. Notes updates."""
+        for frame in self._frames(timeout_s):
+            if self._note(frame, command_id) and (reply := self._reply(frame)):
+                return reply[0]
+        return None
+
+    def urgent(self, frame: Frame) -> None:
+        """Send at once, whatever is under way, and wait for a reply: for stops, of which an older reply does."""
+        try:
+            self._write(frame)
+            self._result(frame.id)
+        finally:
+            self._in_doubt = True
+
+    def sync(self) -> None:
+        """Have a fresh token echoed, and drop whatever comes before it."""
+        for number in range(_TRIES):
+            if number:
+                self.pad()
+            token = next(self._tokens).to_bytes(8, "little")
+            self._write(commands.loop(token))
+            if self._echoed(Frame(Command.LOOP, bytes(2) + token)):
+                self._in_doubt, self.has_echoed = False, True
+                return
+            self.counts["no echo"] += 1
+        raise NoEcho(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
+
+    def pad(self) -> None:
+        """Free the gripper of a frame whose damaged length swallows what it is told next: before saying it again."""
+        self._guarded(lambda port: port.write(_PADDING))
+
+    def doubt(self) -> None:
+        """Have the line cleared before the next command."""
+        self._in_doubt = True
+
+    def pump(self, seconds: float) -> None:
+        """Note what comes within `seconds`; 0 for what has come."""
+        for frame in self._frames(seconds):
+            self._note(frame, None)
+
+    def _echoed(self, echo: Frame) -> bool:
+        for frame in self._frames(self.timeout_s):
+            if frame == echo:
+                return True
+            self._note(frame, None)
+        return False
+
+    def _result(self, command_id: int) -> bytes:
+        """Parameters of the last reply to the command begun last."""
+        for frame in self._frames(self.timeout_s):
+            reply = self._reply(frame) if self._note(frame, command_id) else None
+            if reply is None or reply[0] is Status.CMD_PENDING:
+                continue
+            self._in_doubt = False
+            if reply[0] is Status.CHECKSUM_ERROR:
+                raise NoReply(f"the gripper must hear {name_of(command_id)} undamaged, and did not (CHECKSUM_ERROR)")
+            if reply[0] is not Status.SUCCESS:
+                raise CommandFailed(command_id, reply[0])
+            return reply[1]
+        raise NoReply(f"the gripper must answer {name_of(command_id)} within {self.timeout_s:g} s, and did not")
+
+    def _note(self, frame: Frame, command_id: int | None) -> bool:
+        """Keep an update; says whether the frame is of the command that is waited for. Any other raises doubt."""
+        if frame.id in commands.UPDATING:
+            if frame.payload[:2] == bytes(2):
+                self.updates[frame.id] = (frame.payload[2:], time.monotonic())
+        elif frame.id != command_id:
+            self.counts["unexpected"] += 1
+            self._in_doubt = True
+        return frame.id == command_id
+
+    def _reply(self, frame: Frame) -> tuple[Status, bytes] | None:
+        try:
+            return commands.reply(frame)
+        except WireError:
+            self.counts["no status"] += 1
+            return None
+
+    def _frames(self, seconds: float) -> Iterator[Frame]:
+        """What comes within `seconds`, and then what has come by then. A frame that stops half-way is given up."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            if frame := self._decoded():
+                yield frame
+            else:
+                self._wait(deadline)
+        for _ in range(_MOST_LOOKS):
+            if not self._fill(0.0):
+                break
+        while frame := self._decoded():
+            yield frame
+
+    def _decoded(self) -> Frame | None:
+        used, frame = decode(self._buffer)
+        del self._buffer[:used]
+        return frame
+
+    def _wait(self, deadline: float) -> None:
+        """Take in bytes as soon as they come, or give up a frame whose rest does not."""
+        given_up_s = self._last_byte_s + _GAP_SHARE * self.timeout_s if self._buffer else deadline
+        came = self._fill(min(deadline, given_up_s) - time.monotonic())
+        if not came and self._buffer and time.monotonic() >= given_up_s:
+            self.counts["given up"] += 1
+            del self._buffer[:1]
+
+    def _fill(self, seconds: float) -> bool:
+        """Take in bytes; False where none come within `seconds`."""
+        data = self._guarded(lambda port: port.read(seconds))
+        if data:
+            self._buffer += data
+            self._last_byte_s = time.monotonic()
+        return bool(data)
+
+    def _write(self, frame: Frame) -> None:
+        self._guarded(lambda port: port.write(encode(frame)))
+
+    def _guarded(self, use: Callable[[Port], _T]) -> _T:
+        """Use the port, and close it where it is gone."""
+        if self._port is None:
+            raise LinkLost(
+                f"the gripper's port {self.name} must be open, and was lost; see to its cable and power, "
+                "recover() opens it again"
+            )
+        try:
+            return use(self._port)
+        except LinkLost:
+            self.close()
+            raise

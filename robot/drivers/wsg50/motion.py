@@ -1,0 +1,215 @@
+"""Motions of a WSG-50, watched: what it says of itself decides, its replies only tell when to look.
+
+A reply can be lost, late or doubled, and a motion that is sent twice may be done twice. So a motion has ended when the
+gripper says that it stands and is in a state that the motion can end in; it is sent again, once, only after the gripper
+has said that it stands and has not done it. While it moves, its state comes by itself every few milliseconds; where it
+does not, the motion is stopped.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50.codec import Frame, WireError
+from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState, name_of
+from robot.drivers.wsg50.link import CommandFailed, Link, NoReply
+from robot.errors import DeviceError
+
+_log = logging.getLogger(__name__)
+_WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE)
+UPDATE_BYTES = 25
+"""Of an update of each: 10 around a payload, and status and value, 6 and 3."""
+
+_MOVING = {GraspingState.GRASPING, GraspingState.RELEASING, GraspingState.POSITIONING}
+_FAULTS = (
+    SystemState.TEMPERATURE_WARNING
+    | SystemState.TEMPERATURE_FAULT
+    | SystemState.POWER_FAULT
+    | SystemState.CURRENT_FAULT
+    | SystemState.FINGER_FAULT
+    | SystemState.COMMAND_FAILURE
+    | SystemState.SCRIPT_FAILURE
+)
+_MAY_BE_SENT_AGAIN = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
+"""Answers to a motion that the gripper, standing, has not done: it was not heard."""
+
+_POLL_S = 0.01
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the gripper says of itself; force_n as the gripper counts it."""
+
+    system: SystemState
+    grasping: GraspingState
+    opening_mm: float
+    force_n: float
+
+    @property
+    def moves(self) -> bool:
+        """Whether the jaws move, or are about to."""
+        return bool(self.system & SystemState.MOVING) or self.grasping in _MOVING
+
+
+Done = Callable[[Reading, Status | None], bool]
+"""Told what the gripper says, and its last answer or None: whether the motion has been done."""
+
+
+def read(link: Link) -> Reading:
+    """Ask for all of a Reading. Raises DeviceError."""
+    return Reading(
+        link.ask(commands.ask(Command.SYSTEM_STATE), commands.system_state),
+        link.ask(commands.ask(Command.GRASPING_STATE), commands.grasping_state),
+        link.ask(commands.ask(Command.OPENING), commands.number),
+        link.ask(commands.ask(Command.FORCE), commands.number),
+    )
+
+
+def causes(system: SystemState) -> str:
+    """Words for the faults in a system state."""
+    named = [bit.name or "" for bit in SystemState if bit & system & _FAULTS]
+    return ", ".join(named).lower().replace("_", " ") or "no fault flag is set: a stop on the gripper, or a lost line"
+
+
+def check_ready(reading: Reading) -> None:
+    """Raise DeviceError unless the gripper can be told to move."""
+    if reading.system & SystemState.FAST_STOP or reading.grasping is GraspingState.ERROR:
+        raise DeviceError(f"the gripper is in FAST STOP ({causes(reading.system)}); look why, then call recover()")
+    if not reading.system & SystemState.REFERENCED:
+        raise DeviceError("the gripper must know its reference, and has lost it; call recover(), which homes it")
+    if reading.moves:
+        raise DeviceError("the gripper must stand before it is told to move, and is moving; call stop()")
+
+
+class Motions:
+    """Runs motions over a link. max_age_s: how old its state may grow while it moves. period_ms: of the updates."""
+
+    def __init__(self, link: Link, *, max_age_s: float, period_ms: int) -> None:
+        self.link, self.max_age_s, self.period_ms = link, max_age_s, period_ms
+        self.unsettled = False
+        """Whether a motion was begun after which the jaws were not yet seen to stand."""
+        self.kept = SystemState(0)
+        """What all updates of the last motion had in common."""
+
+    def read(self) -> Reading:
+        """Ask for all of a Reading, and note whether the jaws stand. Raises DeviceError."""
+        reading = read(self.link)
+        self.unsettled = self.unsettled and reading.moves
+        return reading
+
+    def run(self, frame: Frame, seconds: float, done: Done) -> Reading:
+        """Send a motion, wait until it has ended, for `seconds` at most, and return what the gripper says then.
+
+        Raises DeviceError, and then it may still be moving.
+        """
+        deadline = time.monotonic() + seconds
+        for last_try in (False, True):
+            status = self._watch(frame, deadline)
+            reading = self._standing(deadline)
+            if done(reading, status):
+                return reading
+            if reading.system & SystemState.FAST_STOP or status not in _MAY_BE_SENT_AGAIN or last_try:
+                break
+            self.link.counts["sent again"] += 1
+        answer = "nothing" if status is None else status.name
+        stop = f", FAST STOP: {causes(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
+        raise DeviceError(
+            f"the gripper answered {answer} to {name_of(frame.id)} and stands at {reading.opening_mm:.1f} mm, "
+            f"{reading.grasping.name.lower()}{stop}; look at it, then call recover()"
+        )
+
+    def stop(self) -> None:
+        """Stop the jaws, by FAST STOP if nothing else helps, and see that they stand. Raises DeviceError."""
+        patience_s = self.max_age_s + self.link.timeout_s
+        self._say((commands.stop(), commands.stop(), commands.fast_stop(), commands.fast_stop()))
+        if self._last_reading(time.monotonic() + patience_s).moves:
+            self._say((commands.fast_stop(), commands.fast_stop()))
+            self._standing(time.monotonic() + patience_s)
+        self.quiet()
+
+    def quiet(self) -> None:
+        """End the updates. Raises DeviceError."""
+        for command in _WATCHED:
+            self.link.tell(commands.ask(command))
+
+    def _say(self, frames: Sequence[Frame]) -> None:
+        """One after the other, until one is answered."""
+        for number, frame in enumerate(frames, start=1):
+            if frame.id == Command.FAST_STOP:
+                _log.warning("the gripper does not stop when told to: telling it to FAST STOP")
+            try:
+                self.link.urgent(frame)
+                return
+            except CommandFailed:
+                return  # heard, and of no use: where it stands is read next
+            except NoReply:
+                if number == len(frames):
+                    raise
+                self.link.pad()
+
+    def _watch(self, frame: Frame, deadline: float) -> Status | None:
+        """Send the motion and return its last answer, or None where the gripper stands and has not answered."""
+        link = self.link
+        for command in _WATCHED:
+            link.tell(commands.update(command, self.period_ms))
+        self.unsettled, self.kept = True, ~SystemState(0)
+        link.begin(frame)
+        stands_since = time.monotonic()
+        while True:
+            status = link.poll(frame.id, _POLL_S)
+            now = time.monotonic()
+            if status not in (None, Status.CMD_PENDING):
+                break
+            self._check_age(now)
+            if self._moves() or status is Status.CMD_PENDING:
+                stands_since = now
+            if now - stands_since > link.timeout_s:
+                break
+            if now > deadline:
+                raise DeviceError(f"the gripper must end {name_of(frame.id)} in time, and still moves")
+        link.doubt()
+        self.quiet()
+        return status
+
+    def _check_age(self, now: float) -> None:
+        """The watchdog: FAST STOP and DeviceError where the gripper has gone silent."""
+        if now - self.link.updates[Command.SYSTEM_STATE][1] <= self.max_age_s:
+            return
+        self.link.pump(0.0)  # it may be this program that was held up: what has come meanwhile counts
+        age = time.monotonic() - self.link.updates[Command.SYSTEM_STATE][1]
+        if age <= self.max_age_s:
+            return
+        error = DeviceError(
+            f"the state of the moving gripper must be at most {self.max_age_s:g} s old, it is {age:.2g} s: told it to "
+            "FAST STOP; is the line overloaded?"
+        )
+        try:
+            self.link.urgent(commands.fast_stop())
+        except DeviceError as second:
+            error.add_note(str(second))
+        raise error
+
+    def _moves(self) -> bool:
+        """Whether the last updates say that it moves. Notes them in `kept`."""
+        try:
+            system = commands.system_state(self.link.updates[Command.SYSTEM_STATE][0])
+            grasping = commands.grasping_state(self.link.updates[Command.GRASPING_STATE][0])
+        except WireError:
+            return True  # not known: look again
+        self.kept &= system
+        return bool(system & SystemState.MOVING) or grasping in _MOVING
+
+    def _standing(self, deadline: float) -> Reading:
+        """What the gripper says when it stands."""
+        reading = self._last_reading(deadline)
+        if reading.moves:
+            raise DeviceError(f"the gripper must stand, and still moves at {reading.opening_mm:.1f} mm: stop its power")
+        return reading
+
+    def _last_reading(self, deadline: float) -> Reading:
+        """What the gripper says when it stands, or at the deadline."""
+        while (reading := self.read()).moves and time.monotonic() < deadline:
+            self.link.pump(_POLL_S)
+        return reading

@@ -1,0 +1,1 @@
+"""A made-up arm behind a rosbridge server."""

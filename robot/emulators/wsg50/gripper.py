@@ -1,0 +1,400 @@
+"""What an emulated WSG-50 does with commands, in time. No I/O: robot.emulators.wsg50.server gives it ports.
+
+Written from the protocol's facts (robot.drivers.wsg50.codec names them) with its own packing and numbers, so that it
+and the driver cannot share a misreading; they share framing and check sum, which are tested against printed frames.
+Where the facts are silent it does the least convenient thing that they allow: it denies what it is not known to allow.
+"""
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from robot.drivers.wsg50.codec import MAX_PAYLOAD, Frame
+from robot.emulators.wsg50 import numbers as facts
+from robot.emulators.wsg50.mechanics import STROKE_MM, Mechanics
+from robot.emulators.wsg50.updates import Updates
+
+_MOST_HEARD = 100_000
+_HOMING_MM_S = 100.0
+_CLAMPING_MM = 3.0
+"""Clamping travel: how far beyond the nominal width the fingers look for a part."""
+
+Answer = int | bytes
+"""A status alone, or the parameters of a success."""
+
+
+class Emulator:
+    """A WSG-50. `receive` takes a command, `tick` lets time pass; both return what it says, in order.
+
+    object_mm: width of the rigid object between the jaws, or None; may be set at any time, and a held part is lost by
+    it. speed_up: its time runs so many times faster than `clock`. referenced: False needs homing first. Switches:
+    has_force_fingers (else it cannot be tared), keeps_force_n (the force limit it has whatever it is told), jammed (the
+    jaws move and no motion ends), silent (hears, and says nothing), mute_updates (says nothing unasked),
+    answers_bad_checksum (says so when a command is damaged, else nothing). next_status: by id, what the next command
+    of this id is answered with instead of being done. heard: ids of the last commands. Safe in several threads.
+    """
+
+    def __init__(
+        self,
+        *,
+        object_mm: float | None = None,
+        opening_mm: float = 50.0,
+        referenced: bool = False,
+        speed_up: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._lock = threading.RLock()
+        self._jaws = Mechanics(opening_mm, object_mm)
+        self.speed_up, self._clock = speed_up, clock
+        self.has_force_fingers = self.jammed = self.silent = self.mute_updates = False
+        self.answers_bad_checksum, self.error_on_disconnect = False, True
+        self.next_status: dict[int, int] = {}
+        self.keeps_force_n: float | None = None
+        self.heard: list[int] = []
+        self.grasping, self._bits = facts.IDLE, {facts.REFERENCED_BIT} if referenced else set()
+        self.force_limit_n = 40.0
+        self.soft_limits: tuple[float, float] | None = None
+        self._tag, self._counts = b"emulated", [0, 0, 0]
+        self._running: tuple[int, Callable[[], int | None]] | None = None
+        self._updates = Updates(self._value)
+        self._owed: list[Frame] = []
+        self._announced = False
+        self._now = clock()
+
+    @property
+    def object_mm(self) -> float | None:
+        """Width of what is between the jaws, or None."""
+        return self._jaws.object_mm
+
+    @object_mm.setter
+    def object_mm(self, width: float | None) -> None:
+        with self._lock:
+            self._jaws.object_mm = width
+
+    @property
+    def opening_mm(self) -> float:
+        """Where the jaws are now."""
+        with self._lock:
+            self._advance()
+            return self._jaws.opening_mm
+
+    @property
+    def moves(self) -> bool:
+        """Whether the jaws are on their way."""
+        with self._lock:
+            self._advance()
+            return self._jaws.moves
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether the jaws are on their way to close on something."""
+        return self.moves and self.grasping == facts.GRASPING
+
+    @property
+    def in_fast_stop(self) -> bool:
+        """Whether it waits for an acknowledgement."""
+        return facts.FAST_STOP_BIT in self._bits
+
+    def warn(self, fault: str) -> None:
+        """Raise the flag of a fault of FAULT_BITS, and no more."""
+        with self._lock:
+            self._bits.add(facts.FAULT_BITS[fault])
+
+    def fail(self, fault: str | None = None) -> None:
+        """Raise a FAST STOP, with the flag of a fault of FAULT_BITS."""
+        with self._lock:
+            self._bits |= {facts.FAST_STOP_BIT} | ({facts.FAULT_BITS[fault]} if fault else set())
+            self._stand()
+            self.grasping = facts.ERROR
+
+    def lose_reference(self) -> None:
+        """As after a loss of power."""
+        with self._lock:
+            self._bits.discard(facts.REFERENCED_BIT)
+
+    def connected(self) -> None:
+        """A client has come."""
+        with self._lock:
+            self._announced = False
+            self._updates.clear()
+
+    def disconnected(self) -> None:
+        """The client has gone: a FAST STOP, unless it said so before."""
+        with self._lock:
+            self._updates.clear()
+            if self.error_on_disconnect and not self._announced:
+                self.fail()
+            self._owed.clear()
+
+    def receive(self, frame: Frame) -> list[Frame]:
+        """Do a command; returns what it answers at once."""
+        with self._lock:
+            self._advance()
+            self.heard.append(frame.id)
+            del self.heard[:-_MOST_HEARD]
+            forced = self.next_status.pop(frame.id, None)
+            answer = self._answer(frame.id, frame.payload) if forced is None else forced
+            if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:
+                answer = facts.RANGE  # no room for it beside the status
+            self._owed.append(
+                Frame(frame.id, _status(answer) if isinstance(answer, int) else _status(facts.OK) + answer)
+            )
+            return self._say()
+
+    def receive_damaged(self, command: int) -> list[Frame]:
+        """What it says to a command whose check sum does not hold."""
+        with self._lock:
+            if self.answers_bad_checksum:
+                self._owed.append(Frame(command, _status(facts.DAMAGED)))
+            return self._say()
+
+    def tick(self) -> list[Frame]:
+        """Let time pass up to now; returns results of motions, and automatic updates."""
+        with self._lock:
+            self._advance()
+            self._owed += self._ended()
+            due = list(self._updates.due(self._now))
+            self._owed += [] if self.mute_updates else [Frame(each, _status(facts.OK) + value) for each, value in due]
+            return self._say()
+
+    def _say(self) -> list[Frame]:
+        said, self._owed = self._owed, []
+        return [] if self.silent else said
+
+    def _stand(self) -> None:
+        """Stop dead; a motion that was running is answered as aborted."""
+        self._jaws.stand()
+        self._bits.discard(facts.FORCE_BIT)
+        if self._running:
+            self._owed.append(Frame(self._running[0], _status(facts.ABORTED)))
+            self._running = None
+
+    def _advance(self) -> None:
+        now = self._clock()
+        passed, self._now = now - self._now, now
+        if not self.jammed:
+            self._jaws.advance(passed * self.speed_up)
+
+    def _ended(self) -> Iterator[Frame]:
+        """The result of a motion that has ended; a held part that is gone."""
+        if self._running and (status := self._running[1]()) is not None:
+            command, self._running = self._running[0], None
+            yield Frame(command, _status(status))
+        if self.grasping == facts.HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
+            self.grasping = facts.PART_LOST
+            self._bits.discard(facts.FORCE_BIT)
+            self._counts[2] += 1
+
+    def _answer(self, command: int, payload: bytes) -> Answer:
+        if command not in _ACTIONS and command not in facts.UPDATES:
+            return facts.UNKNOWN
+        want = 3 if command in facts.UPDATES else facts.LENGTHS.get(command, 0)
+        if command not in facts.ANY_LENGTH and len(payload) != want:
+            return facts.FEW_PARAMS if len(payload) < want else facts.FORMAT if want else facts.NO_PARAM
+        return self._update(command, payload) if command in facts.UPDATES else _ACTIONS[command](self, payload)
+
+    def _update(self, command: int, payload: bytes) -> Answer:
+        return self._value(command) if self._updates.order(command, payload, self._now) else facts.RANGE
+
+    def _value(self, command: int) -> bytes:
+        if command == 0x40:
+            return struct.pack("<I", sum(1 << bit for bit in self._flags()))
+        if command == 0x41:
+            return bytes([self.grasping])
+        force = self.force_limit_n if self.grasping == facts.HOLDING else 0.0
+        value = {0x43: self._jaws.opening_mm, 0x44: self._jaws.speed_mm_s, 0x45: force}[command]
+        return struct.pack("<f", value)
+
+    def _flags(self) -> set[int]:
+        now = {
+            facts.MOVING_BIT: self._jaws.moves,
+            facts.MINUS_BIT: self._jaws.blocked < 0,
+            facts.PLUS_BIT: self._jaws.blocked > 0,
+        }
+        return self._bits | {bit for bit, on in now.items() if on}
+
+    def _begin(self, command: int, state: int, to_mm: float, speed: float, ended: Callable[[], int | None]) -> int:
+        self._bits -= {facts.STOPPED_BIT, facts.REACHED_BIT, facts.FORCE_BIT}
+        self.grasping, self._running = state, (command, ended)
+        self._jaws.go(to_mm, speed)
+        return facts.PENDING
+
+    def _refusal(self, states: Sequence[int], width: float, speed: float) -> int | None:
+        """Why a motion cannot be begun now."""
+        if facts.FAST_STOP_BIT in self._bits:
+            return facts.DENIED
+        if self._running:
+            return facts.RUNNING
+        if facts.REFERENCED_BIT not in self._bits:
+            return facts.NOT_INITIALIZED
+        if self.grasping not in states:
+            return facts.DENIED
+        low, high = self.soft_limits or (0.0, STROKE_MM)
+        return None if low <= width <= high and facts.SPEEDS[0] <= speed <= facts.SPEEDS[1] else facts.RANGE
+
+    def _home(self, payload: bytes) -> Answer:
+        if payload[0] > 2:
+            return facts.INVALID
+        if facts.FAST_STOP_BIT in self._bits or self._running:
+            return facts.DENIED if facts.FAST_STOP_BIT in self._bits else facts.RUNNING
+        self._bits.discard(facts.REFERENCED_BIT)
+
+        def ended() -> int | None:
+            if self._jaws.moves:
+                return None
+            self.grasping = facts.IDLE
+            if self._jaws.blocked:
+                return facts.BLOCKED
+            self._bits |= {facts.REFERENCED_BIT, facts.REACHED_BIT}
+            return facts.OK
+
+        return self._begin(0x20, facts.POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
+
+    def _move(self, payload: bytes) -> Answer:
+        flags, width, speed = struct.unpack("<Bff", payload)
+        width += self._jaws.opening_mm if flags & 1 else 0.0
+        if (refused := self._refusal((facts.IDLE,), width, speed)) is not None:
+            return refused
+        return self._begin(0x21, facts.POSITIONING, width, speed, self._arrived)
+
+    def _arrived(self) -> int | None:
+        if self._jaws.moves:
+            return None
+        self.grasping = facts.IDLE
+        if self._jaws.blocked:
+            return facts.BLOCKED
+        self._bits.add(facts.REACHED_BIT)
+        return facts.OK
+
+    def _release(self, payload: bytes) -> Answer:
+        width, speed = struct.unpack("<ff", payload)
+        if (refused := self._refusal((facts.NO_PART, facts.PART_LOST, facts.HOLDING), width, speed)) is not None:
+            return refused
+        return self._begin(0x26, facts.RELEASING, width, speed, self._arrived)
+
+    def _grasp(self, payload: bytes) -> Answer:
+        width, speed = struct.unpack("<ff", payload)
+        if (refused := self._refusal((facts.IDLE,), width, speed)) is not None:
+            return refused
+        self._counts[0] += 1
+        return self._begin(0x25, facts.GRASPING, max(0.0, width - _CLAMPING_MM), speed, self._grasped)
+
+    def _grasped(self) -> int | None:
+        if self._jaws.moves:
+            return None
+        if self._jaws.blocked < 0:
+            self.grasping = facts.HOLDING
+            self._bits.add(facts.FORCE_BIT)
+            return facts.OK
+        self.grasping = facts.NO_PART
+        self._counts[1] += 1
+        return facts.FAILED
+
+    def _stop(self, _: bytes) -> Answer:
+        self._stand()
+        self._bits.add(facts.STOPPED_BIT)
+        self.grasping = self.grasping if self.grasping == facts.ERROR else facts.IDLE
+        return facts.OK
+
+    def _fast_stop(self, _: bytes) -> Answer:
+        self.fail()
+        return facts.OK
+
+    def _acknowledge(self, payload: bytes) -> Answer:
+        if payload != b"\x61\x63\x6b":
+            return facts.INVALID
+        if facts.FAST_STOP_BIT not in self._bits:
+            return facts.DENIED
+        self._bits -= {facts.FAST_STOP_BIT, *facts.FAULT_BITS.values()}
+        self.grasping = facts.IDLE
+        return facts.OK
+
+    def _announce(self, _: bytes) -> Answer:
+        self._announced = True
+        return facts.OK
+
+    def _set_acceleration(self, payload: bytes) -> Answer:
+        (value,) = struct.unpack("<f", payload)
+        if refused := self._unsettable(facts.ACCELERATIONS[0] <= value <= facts.ACCELERATIONS[1]):
+            return refused
+        self._jaws.acceleration_mm_s2 = value
+        return facts.OK
+
+    def _set_force(self, payload: bytes) -> Answer:
+        (value,) = struct.unpack("<f", payload)
+        if refused := self._unsettable(facts.FORCES[0] <= value <= facts.FORCES[1]):
+            return refused
+        self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
+        return facts.OK
+
+    def _set_soft_limits(self, payload: bytes) -> Answer:
+        low, high = struct.unpack("<ff", payload)
+        if refused := self._unsettable(0 <= low < high <= STROKE_MM):
+            return refused
+        self.soft_limits = low, high
+        return facts.OK
+
+    def _clear_soft_limits(self, _: bytes) -> Answer:
+        self.soft_limits = None
+        return facts.OK
+
+    def _unsettable(self, in_range: bool) -> int:
+        """Changing parameters while it moves raises a FAST STOP."""
+        if self._jaws.moves:
+            self.fail()
+            return facts.DENIED
+        return facts.OK if in_range else facts.RANGE
+
+    def _tare(self, _: bytes) -> Answer:
+        if not self.has_force_fingers:
+            return facts.NOT_AVAILABLE
+        return facts.DENIED if self.grasping == facts.HOLDING else facts.OK
+
+    def _statistics(self, payload: bytes) -> Answer:
+        grasps, *others = self._counts
+        counts = struct.pack("<IHH", grasps, *(min(count, 0xFFFF) for count in others))
+        if payload[0]:
+            self._counts = [0, 0, 0]
+        return counts
+
+    def _set_tag(self, payload: bytes) -> Answer:
+        self._tag = payload
+        return facts.OK
+
+    def _get_soft_limits(self, _: bytes) -> Answer:
+        return facts.NOT_AVAILABLE if self.soft_limits is None else struct.pack("<ff", *self.soft_limits)
+
+
+def _status(number: int) -> bytes:
+    return struct.pack("<H", number)
+
+
+_ACTIONS: dict[int, Callable[[Emulator, bytes], Answer]] = {
+    0x06: lambda _, payload: payload,
+    0x07: Emulator._announce,
+    0x20: Emulator._home,
+    0x21: Emulator._move,
+    0x22: Emulator._stop,
+    0x23: Emulator._fast_stop,
+    0x24: Emulator._acknowledge,
+    0x25: Emulator._grasp,
+    0x26: Emulator._release,
+    0x30: Emulator._set_acceleration,
+    0x31: lambda own, _: struct.pack("<f", own._jaws.acceleration_mm_s2),
+    0x32: Emulator._set_force,
+    0x33: lambda own, _: struct.pack("<f", own.force_limit_n),
+    0x34: Emulator._set_soft_limits,
+    0x35: Emulator._get_soft_limits,
+    0x36: Emulator._clear_soft_limits,
+    0x37: lambda _, payload: facts.OK if payload[0] < 2 else facts.INVALID,
+    0x38: Emulator._tare,
+    0x42: Emulator._statistics,
+    0x46: lambda _, payload: struct.pack("<h", 253),
+    0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
+    0x51: Emulator._set_tag,
+    0x52: lambda own, _: own._tag,
+    0x53: lambda _, payload: struct.pack(
+        "<8f", STROKE_MM, *facts.SPEEDS, *facts.ACCELERATIONS, *facts.FORCES, facts.OVERDRIVE_N
+    ),
+}

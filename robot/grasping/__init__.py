@@ -1,0 +1,1 @@
+"""One attempt at a grasp, over the contract of devices alone."""

@@ -1,0 +1,221 @@
+"""One attempt at a grasp, over the contract alone: look, fit, plan, close, lift, put down.
+
+Every random number of an attempt comes from (seed, object, number). With a rig that prepares its objects from the same
+three, an attempt is a pure function of them: it can be done again, in another process or after a crash.
+"""
+
+import contextlib
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import MAX_AGE_S, read_together
+from robot.errors import DeviceError, PlanError
+from robot.grasping.plan import GraspPlan, plan_grasp
+from robot.grasping.settings import AttemptSettings
+from robot.readings import RGBD, Box, Pose
+from robot.rig import Rig, check_seed
+from robot.sight.cylinder import CylinderFit, fit_cylinder
+from robot.storage import file_content
+
+_OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
+_SIGHT_MM = 150.0
+"""An object may stand so far outside the workspace and still be looked for."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
+
+    outcome: "held", "missed", "slipped" by the gripper after the lift, or "no_plan" for the `reason` given, and then
+    there are no images. at_s, lasted_s: from the photo to the picture of the closed jaws, and to the end.
+    """
+
+    object_id: str
+    number: int
+    outcome: str
+    images: Mapping[str, bytes] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    reason: str | None = None
+    at_s: float = 0.0
+    lasted_s: float = 0.0
+
+
+class Attempter:
+    """Makes attempts with a connected rig."""
+
+    def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
+        check_seed(seed)
+        settings.grasp.check(rig.arm, rig.gripper)
+        self.rig, self.seed, self.settings = rig, seed, settings
+        lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper
+        self._sight = Box(
+            (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
+        )
+
+    def run(self, object_id: str, number: int) -> Attempt:
+        """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
+
+        Whatever happens, Ctrl-C included, the jaws are opened, or the error says that they could not be.
+        """
+        for trial in range(self.settings.retries + 1):
+            try:
+                if trial:
+                    self.rig.recover()
+                return self._once(object_id, number)
+            except DeviceError as error:
+                left = self._let_go()
+                if trial == self.settings.retries:
+                    raise DeviceError(
+                        f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}{left}"
+                    ) from error
+            except BaseException as error:
+                if left := self._let_go():
+                    error.add_note(left)
+                raise
+        raise AssertionError("the loop returns or raises")
+
+    def _let_go(self) -> str:
+        """Open the jaws, of a gripper that is brought back first where it must be; returns what to add to the error at
+        hand where that fails too."""
+        gripper = self.rig.gripper
+        try:
+            with contextlib.suppress(DeviceError):
+                gripper.open(gripper.stroke_mm)
+                return ""
+            gripper.recover()
+            gripper.open(gripper.stroke_mm)
+        except Exception as second:
+            return f"; and the jaws could not be opened: {second}"
+        return ""
+
+    def _once(self, object_id: str, number: int) -> Attempt:
+        rig = self.rig
+        rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
+        rig.gripper.open(rig.gripper.stroke_mm)
+        self._rise()
+        rig.arm.move_to(rig.home, self.settings.travel_mm_s)
+        rig.prepare(object_id, number)
+        start = rig.clock()
+        image = rig.camera.read(depth=self._needs_depth)
+        try:
+            fit = self._fit(image)
+            plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
+        except PlanError as error:
+            lasted = round(rig.clock() - start, 3)
+            return Attempt(object_id, number, "no_plan", reason=str(error), lasted_s=lasted)
+        images = self._pictures(image)
+        touches, fields, at = self._grasp(plan)
+        outcome = self._outcome()
+        if "after" in self.settings.outputs:
+            touches |= self._feel("_after", self.settings.hold_s)
+        self._put_down(plan, outcome == "held", rng)
+        return Attempt(
+            object_id,
+            number,
+            outcome,
+            {**images, **touches},
+            fields,
+            fit.to_dict(),
+            at_s=round(at - start, 3),
+            lasted_s=round(rig.clock() - start, 3),
+        )
+
+    def _rise(self) -> None:
+        """Straight up from wherever the hand is: on a slant, open jaws would sweep over what stands between them."""
+        arm = self.rig.arm
+        if arm.by_hand:
+            return
+        here, top = arm.pose(), arm.workspace.upper[2]
+        if here.z_mm < top and arm.workspace.contains(here):
+            arm.move_to(replace(here, z_mm=top), self.settings.approach_mm_s)
+
+    @property
+    def _needs_depth(self) -> bool:
+        """Whether a grasp is planned from depth, or depth is to be recorded and there is any."""
+        return self.rig.given is None or (self.rig.camera.has_depth and "depth" in self.settings.outputs)
+
+    def _fit(self, image: RGBD) -> CylinderFit:
+        """The object as it was given, or as the camera sees it."""
+        return self.rig.given or fit_cylinder(image, self.rig.camera.extrinsics, self._sight)
+
+    def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
+        """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
+        rig, settings = self.rig, self.settings
+        rig.arm.move_to(plan.above, settings.travel_mm_s)
+        rig.gripper.open(plan.opening_mm)
+        reached = rig.arm.move_to(plan.pose, settings.approach_mm_s)
+        touches = self._feel("_before", MAX_AGE_S) if "before" in settings.outputs else {}
+        closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
+        rig.sleep(settings.settle_s)
+        at = rig.clock()
+        during, skew_s = self._feel_at_once("", settings.settle_s)
+        rig.arm.move_to(plan.above, settings.approach_mm_s)
+        rig.sleep(settings.hold_s)
+        fields = {
+            "force_n": plan.force_n,
+            "opening_mm": closed.opening_mm,
+            "pose": reached.as_tuple(),
+            "touch_skew_s": round(skew_s, 6),
+        }
+        return touches | during, fields, at
+
+    def _feel(self, moment: str, since_s: float) -> dict[str, bytes]:
+        """Gel images by column; none older than what has just been waited for, which may have been before it."""
+        return self._feel_at_once(moment, since_s)[0]
+
+    def _feel_at_once(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
+        """Gel images by column, and how far apart in time they were taken (s)."""
+        frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
+        return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
+
+    def _outcome(self) -> str:
+        status = self.rig.gripper.state().status
+        if status not in _OUTCOME_OF:
+            raise DeviceError(
+                f"{self.rig.gripper.name} must be holding, no_part or part_lost after a lift; it says {status}"
+            )
+        return _OUTCOME_OF[status]
+
+    def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
+        """Let go: of a held object on the table, at a random place and turned at random, or where it was given."""
+        rig, settings = self.rig, self.settings
+        low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
+        x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
+        yaw = float(rng.uniform(0.0, math.pi))
+        if rig.given is not None:
+            x, y, yaw = plan.pose.x_mm, plan.pose.y_mm, plan.pose.yaw_rad
+        if held:
+            z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))
+            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.travel_mm_s)
+            rig.arm.move_to(Pose(float(x), float(y), z, yaw), settings.approach_mm_s)
+        rig.gripper.open(rig.gripper.stroke_mm)
+        if held:
+            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.approach_mm_s)
+
+    def _pictures(self, image: RGBD) -> dict[str, bytes]:
+        pictures = {"photo": self._jpeg(image.colour)}
+        if "depth" in self.settings.outputs and image.depth_m is not None:
+            pictures["depth"], _ = file_content("depth", depth_in_mm(image.depth_m))
+        return pictures
+
+    def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
+        done, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), quality)
+        if not done:
+            raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as JPG")
+        return bytes(data.tobytes())
+
+
+def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
+    """Whole millimetres as a recording keeps them, 0 where unknown or beyond 65 m."""
+    depth = np.rint(depth_m.astype(np.float64) * 1000)
+    known = np.isfinite(depth) & (depth > 0) & (depth < 65536)
+    return np.where(known, depth, 0).astype(np.uint16)

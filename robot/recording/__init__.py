@@ -1,0 +1,1 @@
+"""The recording: a folder of grasps, and the log of every attempt."""

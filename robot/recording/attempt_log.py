@@ -1,0 +1,200 @@
+"""attempts.jsonl: what came of every attempt at a grasp, those without a grasp included, and acceptance by object.
+
+It lies beside the recording, a line for each attempt: object_id, number, outcome, accepted, ended_s (second since the
+recording began, while the rig worked), and where there was a grasp its grasp_id, the gate's score and fit (method and
+error of the cylinder), else the reason. A line is written before its grasp is appended to the recording: after a crash
+at most the last line is half or has no grasp, and then it does not count.
+"""
+
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from io import FileIO
+from pathlib import Path
+from typing import Any, Self
+
+from robot.errors import RecordingError
+from robot.recording.folder import Recording, parse_object
+from robot.recording.grasp import OUTCOMES
+from robot.storage import append_line, read_regular, storage_errors
+
+ATTEMPTS_FILE = "attempts.jsonl"
+
+
+@dataclass(frozen=True)
+class LoggedAttempt:
+    """One line."""
+
+    object_id: str
+    number: int
+    outcome: str
+    accepted: bool
+    ended_s: float
+    grasp_id: str | None = None
+    score: float | None = None
+    fit: Mapping[str, Any] | None = None
+    reason: str | None = None
+
+    def to_row(self) -> dict[str, Any]:
+        """The JSON object; what there is not is left out."""
+        return {key: value for key, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> Self:
+        """Raises RecordingError for what `to_row` never writes."""
+        try:
+            attempt = cls(**row)
+        except TypeError as error:
+            raise RecordingError(f"is no attempt: {error}") from error
+        wrong = [name for name, types in _TYPES.items() if not isinstance(getattr(attempt, name), types)]
+        if wrong or attempt.outcome not in OUTCOMES or not math.isfinite(attempt.ended_s):
+            raise RecordingError(f"is no attempt: {(wrong or ['outcome or ended_s'])[0]} is wrong in {row!r}")
+        return attempt
+
+
+_TYPES: Mapping[str, Any] = {
+    "object_id": str,
+    "number": int,
+    "outcome": str,
+    "accepted": bool,
+    "ended_s": int | float,
+    "grasp_id": str | None,
+}
+
+
+def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
+    """The attempts whose grasps, if any, are in the recording. Raises RecordingError for a damaged file."""
+    return [attempt for attempt, _ in _read(folder / ATTEMPTS_FILE, grasp_ids)]
+
+
+def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
+    """Attempts that count, each with where its line ends in the file."""
+    try:
+        lines = read_regular(path).splitlines(keepends=True)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    found: list[tuple[LoggedAttempt, int]] = []
+    made: Counter[str] = Counter()
+    end = 0
+    for number, line in enumerate(lines, start=1):
+        last = number == len(lines)
+        if last and not line.endswith(b"\n"):
+            break
+        attempt = _parsed(path, number, line)
+        if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
+            if last:
+                break
+            raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
+        if attempt.number != made[attempt.object_id]:
+            raise RecordingError(
+                f"{path}, line {number}: attempts must be in order and there once, so that number "
+                f"{made[attempt.object_id]} is next for {attempt.object_id}, got {attempt.number}; restore the file"
+            )
+        made[attempt.object_id] += 1
+        end += len(line)
+        found.append((attempt, end))
+    return found
+
+
+def _parsed(path: Path, number: int, line: bytes) -> LoggedAttempt:
+    try:
+        return LoggedAttempt.from_row(parse_object(line))
+    except RecordingError as error:
+        raise RecordingError(f"{path}, line {number}: {error}") from error
+
+
+class AttemptLog:
+    """Appends to attempts.jsonl, of which only what counts is kept. The recording's writer holds the folder's lock."""
+
+    def __init__(self, folder: Path, grasp_ids: Set[str]) -> None:
+        self.folder = folder
+        read = _read(folder / ATTEMPTS_FILE, grasp_ids)
+        self.attempts = [attempt for attempt, _ in read]
+        self._end = read[-1][1] if read else 0
+        with storage_errors(folder):
+            descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+            self._file = FileIO(descriptor, "r+b")
+            self._file.truncate(self._end)
+
+    def append(self, attempt: LoggedAttempt) -> None:
+        """Write one line to the disk; whatever fails, no half of it stays. Raises StorageError."""
+        data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        with storage_errors(self.folder):
+            self._end = append_line(self._file, self._end, data)
+        self.attempts.append(attempt)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+# Acceptance ------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Tally:
+    """What came of the attempts at one object."""
+
+    object_id: str
+    attempts: int = 0
+    accepted: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def add(self, attempt: LoggedAttempt) -> None:
+        """Count one more."""
+        self.attempts += 1
+        self.accepted += attempt.accepted
+        self.outcomes[attempt.outcome] += 1
+        if attempt.reason:
+            self.reasons[attempt.reason] += 1
+
+
+def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
+    """By object, in order of first appearance."""
+    tallies: dict[str, Tally] = {}
+    for attempt in attempts:
+        tallies.setdefault(attempt.object_id, Tally(attempt.object_id)).add(attempt)
+    return tallies
+
+
+def acceptance(recording: Recording) -> list[Tally]:
+    """Attempts, accepted ones and outcomes by object; of the grasps alone where the attempts were not logged."""
+    logged = read_attempts(recording.folder, {grasp.grasp_id for grasp in recording.grasps})
+    if logged:
+        return list(tally(logged).values())
+    tallies: dict[str, Tally] = {}
+    for grasp in recording.grasps:
+        each = tallies.setdefault(grasp.object_id, Tally(grasp.object_id))
+        each.attempts += 1
+        each.accepted += grasp.grasped is not False
+        each.outcomes.update([grasp.outcome] if grasp.outcome else [])
+    return list(tallies.values())
+
+
+def acceptance_table(tallies: Sequence[Tally], wanted: int | None = None) -> str:
+    """Plain text, a line an object and one for all; objects that have fewer than `wanted` are marked."""
+    width = max([len(each.object_id) for each in tallies] + [6])
+    lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
+    total = Tally("all")
+    for each in tallies:
+        lines.append(_line(each, width) + ("  gave up" if wanted is not None and each.accepted < wanted else ""))
+        total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
+        total.outcomes += each.outcomes
+    return "\n".join([*lines, _line(total, width)])
+
+
+def _line(each: Tally, width: int) -> str:
+    outcomes = "  ".join(f"{each.outcomes[name]:>{len(name)}}" for name in OUTCOMES)
+    return f"{each.object_id:{width}}  {each.accepted:>8}  {each.attempts:>2}  {outcomes}"

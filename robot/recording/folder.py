@@ -1,0 +1,324 @@
+"""The recording: a folder of grasps, appended one at a time and read by training.
+
+    recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, gels (for each
+                      pair that served: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and what else
+                      the writer wants to say
+    metadata.jsonl    one JSON object a line for each grasp
+    images/           PNG or JPEG files
+    attempts.jsonl    where a rig collected it: every attempt, those without a grasp included
+    (robot.recording.attempt_log)
+
+A line holds grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (what the success gate
+decided; training leaves out false), outcome (what the gripper felt: held, missed, slipped), sequence_id, time_s.
+Its images are paths relative to the folder: photo_file_name, depth_file_name and for each finger (a, b, ...)
+touch_a_file_name, touch_a_before_file_name (the untouched gel) and touch_a_after_file_name. What was not
+recorded is left out. The folder opens as it is with Hugging Face datasets ("imagefolder").
+
+A line is written when its images are on the disk: a crash leaves whole grasps; half a last line is dropped.
+"""
+
+import fcntl
+import json
+import os
+import re
+from collections.abc import Mapping, Set
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, Self
+
+from robot.errors import RecordingError
+from robot.gel_settings import UNKNOWN
+from robot.recording.grasp import RecordedGrasp as RecordedGrasp
+from robot.recording.grasp import check_name, unknown_keys
+from robot.storage import (
+    PART,
+    ImageSource,
+    append_line,
+    file_content,
+    read_regular,
+    storage_errors,
+    sync_folder,
+    write_file,
+)
+
+SCHEMA_VERSION = 1
+KNOWN_VERSIONS = (1,)
+INFO_FILE = "recording.json"
+METADATA_FILE = "metadata.jsonl"
+IMAGES_FOLDER = "images"
+UNITS = {
+    "force_n": "newton",
+    "opening_mm": "millimetre between the fingers",
+    "pose": "x, y, z in millimetre and yaw in radian of the gripper, in the rig's frame",
+    "time_s": "second since the recording began",
+    "touch_skew_s": "second between the fingers' images",
+    "depth": "millimetre, uint16, 0 where unknown",
+}
+_MUST_AGREE = ("source", "sensor", "units", "background")
+_GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording as read: `info` is recording.json, `notes` are remarks for the user.
+
+    >>> recording = robot.read_recording("recording")
+    >>> len({grasp.object_id for grasp in recording.grasps})
+    2
+    >>> (recording.folder / recording.grasps[0].photo).is_file()
+    True
+    """
+
+    folder: Path
+    info: dict[str, Any]
+    grasps: tuple[RecordedGrasp, ...]
+    notes: tuple[str, ...] = ()
+
+
+# Reading ---------------------------------------------------------------------------------------------------
+
+
+def read_recording(folder: str | Path) -> Recording:
+    """Read and check a recording; images are not opened.
+
+    Raises RecordingError with the file and line; half a last line, left by a crash, is dropped with a note.
+
+    >>> [grasp.object_id for grasp in robot.read_recording("recording").grasps]
+    ['mug', 'mug', 'tin', 'tin']
+    >>> robot.read_recording("catalog")
+    Traceback (most recent call last):
+    robot.errors.RecordingError: catalog must be a recording, but has no recording.json; ...
+    """
+    root = Path(folder)
+    info = read_info(root)
+    path = root / METADATA_FILE
+    lines, torn = _whole_lines(_read(path))
+    grasps: dict[str, RecordedGrasp] = {}
+    ignored: set[str] = set()
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            row = parse_object(line)
+            grasp = RecordedGrasp.from_row(row)
+            if grasp.grasp_id in grasps:
+                raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
+        except RecordingError as error:
+            raise RecordingError(f"{path}, line {number}: {error}") from error
+        grasps[grasp.grasp_id] = grasp
+        ignored |= unknown_keys(row)
+    notes = [f"{path}: dropped a half-written last line ({len(torn)} bytes) that a crash left"] if torn else []
+    if ignored:
+        notes.append(f"{path}: passed over keys that are not of the format: {', '.join(sorted(ignored))}")
+    return Recording(root, info, tuple(grasps.values()), tuple(notes))
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """Read and check recording.json alone. Raises RecordingError."""
+    path = root / INFO_FILE
+    if not os.path.exists(path):  # False, and no error, for a name that no disk takes
+        raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
+    try:
+        info = parse_object(_read(path))
+        _check_info(info)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    return info
+
+
+def _check_info(info: Mapping[str, Any]) -> None:
+    version = info.get("schema_version")
+    if type(version) is not int or version not in KNOWN_VERSIONS:
+        known = ", ".join(map(str, KNOWN_VERSIONS))
+        raise RecordingError(f"schema_version must be one this software knows ({known}), got {version!r}")
+    for key in ("source", "sensor"):
+        check_name(key, info.get(key))
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return read_regular(path)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _whole_lines(data: bytes) -> tuple[list[bytes], bytes]:
+    """Split into (lines, what a crash left of a last one); one that only lacks its newline is whole."""
+    *lines, last = data.split(b"\n")
+    try:
+        json.loads(last)
+    except (ValueError, RecursionError):
+        return lines, last
+    return [*lines, last], b""
+
+
+def parse_object(text: bytes) -> dict[str, Any]:
+    """The JSON object of a line or file. Raises RecordingError for anything else, NaN and infinity too."""
+    try:
+        value = json.loads(text.decode(), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"must be JSON in UTF-8: {error}") from error
+    if not isinstance(value, dict):
+        raise RecordingError("must be one JSON object in braces")
+    return value
+
+
+def _refuse_constant(text: str) -> NoReturn:
+    raise RecordingError(f"numbers must be finite, got {text}")
+
+
+# Writing ---------------------------------------------------------------------------------------------------
+
+
+class RecordingWriter:
+    """Appends grasps to a recording that it creates or continues; one writer at a time.
+
+        with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
+            writer.append("000001", "mug", {"photo": photo, "touch_a": touch}, force_n=12.0)
+
+    `info` must name source and sensor; rig, units, seed, gels and background have defaults, other keys are kept. A
+    recording that exists is continued if its source, sensor, units and background agree (its recording.json
+    stays); half a last line is cut off. Raises RecordingError for wrong input, StorageError when the disk
+    refuses or another writer has the folder; what was appended before stays whole, and appending may go on.
+
+    >>> from pathlib import Path
+    >>> photo, a, b = (Path(name) for name in ("catalog/mug/1.jpg", "a.png", "b.png"))
+    >>> with robot.RecordingWriter("mine", {"source": "bench 3", "sensor": "GelSight Mini"}) as writer:
+    ...     grasp = writer.append("000001", "mug", {"photo": photo, "touch_a": a, "touch_b": b}, force_n=12.0)
+    >>> len(robot.read_recording("mine").grasps), grasp.force_n
+    (1, 12.0)
+    """
+
+    def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
+        self.folder = Path(folder)
+        wanted = _full_info(info)
+        _check_is_ours(self.folder)
+        with storage_errors(self.folder):
+            (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+            self._file = os.fdopen(descriptor, "r+b", buffering=0)
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._start(wanted)
+            except BaseException:
+                self._file.close()
+                raise
+
+    def _start(self, wanted: dict[str, Any]) -> None:
+        """Create recording.json unless it is there, and cut metadata.jsonl after its last whole line."""
+        if not (self.folder / INFO_FILE).exists():
+            write_file(self.folder / INFO_FILE, json.dumps(wanted, indent=2).encode() + b"\n")
+            sync_folder(self.folder)
+        recording = read_recording(self.folder)
+        self.info = recording.info
+        _check_agrees(self.folder, self.info, wanted)
+        self._grasp_ids = {grasp.grasp_id: None for grasp in recording.grasps}
+        data = self._file.read()
+        lines, torn = _whole_lines(data)
+        self._end = len(data) - len(torn)
+        self._file.truncate(self._end)
+        if lines and not torn and not data.endswith(b"\n"):
+            self._end -= len(lines[-1])
+            self._write_line(lines[-1])
+
+    @property
+    def grasp_ids(self) -> Set[str]:
+        """The grasps that the recording holds so far, in order."""
+        return self._grasp_ids.keys()
+
+    def append(self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource], **fields: Any) -> RecordedGrasp:
+        """Add one grasp: first its images, then its line; when it returns, both are on the disk.
+
+        `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to ImageSource.
+        `fields`: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
+        Raises RecordingError, StorageError.
+        """
+        if self._file.closed:
+            raise RecordingError(f"the writer of {self.folder} is closed; open another")
+        if not isinstance(grasp_id, str) or not _GRASP_ID.fullmatch(grasp_id):
+            raise RecordingError(f"grasp_id must be letters, digits and ._- (at most 128), got {grasp_id!r}")
+        if grasp_id in self._grasp_ids:
+            raise RecordingError(f"the recording has grasp {grasp_id} already; see grasp_ids")
+        contents = {column: file_content(column, source) for column, source in images.items()}
+        paths = {
+            f"{column}_file_name": f"{IMAGES_FOLDER}/{grasp_id}_{column}{suffix}"
+            for column, (_, suffix) in contents.items()
+        }
+        row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
+        if unknown := sorted(unknown_keys(row)):
+            raise RecordingError(f"unknown key {unknown[0]!r}; see robot.recording.folder for the known ones")
+        grasp = RecordedGrasp.from_row(row)
+        with storage_errors(self.folder):
+            for column, (data, _) in contents.items():
+                write_file(self.folder / paths[f"{column}_file_name"], data)
+            sync_folder(self.folder / IMAGES_FOLDER)
+            self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
+        self._grasp_ids[grasp_id] = None
+        return grasp
+
+    def _write_line(self, line: bytes) -> None:
+        """Write after the last whole line and sync; whatever fails, no half of it stays."""
+        self._end = append_line(self._file, self._end, line + b"\n")
+
+    def close(self) -> None:
+        """Let go of the folder; a second call does nothing."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
+    """`info` with its defaults, as JSON reads it back. Raises RecordingError."""
+    defaults = {
+        "schema_version": SCHEMA_VERSION,
+        "source": None,
+        "sensor": None,
+        "rig": None,
+        "units": UNITS,
+        "seed": None,
+        "software_version": software_version(),
+        "background": "none",
+        "gels": UNKNOWN,
+    }
+    try:
+        full: dict[str, Any] = json.loads(json.dumps({**defaults, **info}, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{INFO_FILE} must hold plain JSON: {error}") from error
+    _check_info(full)
+    return full
+
+
+def software_version() -> str:
+    """Version of this project as installed."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("touch-retrieval")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _check_is_ours(folder: Path) -> None:
+    """Refuse to mix a new recording into a folder of other files."""
+    if (folder / INFO_FILE).is_file() or not folder.exists():
+        return
+    if not folder.is_dir():
+        raise RecordingError(f"a recording must be a folder, and {folder} is a file")
+    with storage_errors(folder):
+        names = sorted(path.name for path in folder.iterdir())
+        grasps = METADATA_FILE in names and (folder / METADATA_FILE).stat().st_size > 0
+    if others := [name for name in names if name not in (METADATA_FILE, IMAGES_FOLDER, INFO_FILE + PART)]:
+        raise RecordingError(f"{folder} holds other files, such as {others[0]}; give a new or an empty folder")
+    if grasps:
+        raise RecordingError(f"{folder} has a {METADATA_FILE} but no {INFO_FILE}; restore it or give a new folder")
+
+
+def _check_agrees(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    for key in _MUST_AGREE:
+        old, new = found.get(key), wanted.get(key)
+        if old != new:
+            raise RecordingError(f"{folder} was recorded with {key} {old!r}, not {new!r}; give another folder")

@@ -1,0 +1,1 @@
+"""From a picture with depth to where the object stands."""

@@ -1,0 +1,280 @@
+"""The cylinder that stands for the object on the table: where it is, how high and how wide, and how sure that is.
+
+One depth picture shows one side of the object. The points above the table (robot.sight.cloud) are explained by an
+upright cylinder, a box or a lying cylinder (robot.sight.solids), whichever has the least misfit (BIC). Where that
+cannot be told, a cruder method takes over, and `method` and `notes` say so:
+
+    circle              robust circle through the visible side of an upright cylinder
+    box                 the cylinder inscribed in a box, as for a packet
+    lying               a cylinder on its side
+    enclosing circle    smallest circle round all points: too few side points, or too short an arc of them
+    silhouette          outline in the colour picture, where depth shows nothing, as of glass
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import PlanError, RobotConfigError
+from robot.readings import RGBD, Box
+from robot.sight.cloud import Depth, Rays, Table, Thing, find_table, find_thing
+from robot.sight.silhouette import fit_silhouette
+from robot.sight.solids import (
+    CUT,
+    Array,
+    Block,
+    Circle,
+    Solid,
+    Upright,
+    fit_block,
+    fit_circle,
+    fit_lying,
+    refine_circle,
+)
+
+LEAST_SIDE_POINTS = 10
+LEAST_ARC_DEG = 60.0
+_SECTOR_DEG = 10.0
+_MUCH_MISSING = 0.5
+_ARC_WHEN_CUT_OFF_DEG = 90.0
+_MANY_OFF = 0.3
+_LEAST_TOP = 0.05
+_POOR, _OUTLIER_MM = 0.35, 2.0
+_CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
+"""Standard error of the centre from methods that guess the hidden side: of a simple solid, of any, of one unseen."""
+
+
+@dataclass(frozen=True)
+class CylinderFit:
+    """An upright cylinder in the rig's frame (mm), and the footprint of what it stands for.
+
+    error_mm: standard error of the centre, camera calibration left out. half_mm: half sizes of the footprint along
+    `yaw_rad` and across, the radius twice for what is round. round: whether turning about the vertical changes nothing.
+    """
+
+    x_mm: float
+    y_mm: float
+    height_mm: float
+    radius_mm: float
+    error_mm: float
+    method: str
+    half_mm: tuple[float, float]
+    yaw_rad: float = 0.0
+    points: int = 0
+    arc_deg: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def orientation(self) -> str:
+        """upright or lying."""
+        return "lying" if self.method == "lying" else "upright"
+
+    @property
+    def is_round(self) -> bool:
+        """Whether its width is the same from all sides."""
+        return self.method not in ("box", "lying")
+
+    def width_mm(self, yaw_rad: float, finger_mm: float) -> float:
+        """How far apart fingers `finger_mm` wide must be to pass the object on both sides of its centre.
+
+        For a rectangular footprint this is its extent along the closing direction within the strip that a finger
+        sweeps, in closed form.
+        """
+        if self.is_round:
+            return 2 * self.radius_mm
+        (a, b), turn, strip = self.half_mm, yaw_rad - self.yaw_rad, finger_mm / 2
+        c, s = abs(math.cos(turn)), abs(math.sin(turn))
+        if c * b - s * a > strip:  # the corner lies outside the strip, which leaves through the end of length a
+            return 2 * (a + s * strip) / c
+        if s * a - c * b > strip:
+            return 2 * (b + c * strip) / s
+        return 2 * (c * a + s * b)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, in whole micrometres."""
+        sizes = ("x_mm", "y_mm", "height_mm", "radius_mm", "error_mm")
+        return {name: round(getattr(self, name), 3) for name in sizes} | {"method": self.method}
+
+
+def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = None) -> CylinderFit:
+    """Fit the cylinder of the largest thing on the table, inside `region` of the rig's frame where given.
+
+    extrinsics (4, 4): camera frame to rig frame, mm. Raises PlanError where nothing is seen, or too little to say,
+    RobotConfigError for extrinsics that are not finite.
+    """
+    if image.depth_m is None:
+        raise PlanError("a cylinder needs a picture with depth; read the camera with depth=True")
+    if not np.isfinite(extrinsics).all():
+        numbers = np.asarray(extrinsics).tolist()
+        raise RobotConfigError(f"extrinsics must be finite, got {numbers}; calibrate the camera again")
+    depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
+    rays = Rays.of(image, np.asarray(extrinsics, np.float64))
+    table = find_table(depth, rays)
+    try:
+        thing = find_thing(depth, rays, table, region)
+    except PlanError:
+        return _from_colour(image, depth, rays, table, region)
+    if thing.missing > _MUCH_MISSING:
+        try:
+            return _from_colour(image, depth, rays, table, region)
+        except PlanError:
+            pass  # what depth there is has to do
+    return _fit(thing, rays)
+
+
+def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: Table, region: Box | None) -> CylinderFit:
+    """See robot.sight.silhouette."""
+    found = fit_silhouette(image.colour, depth_mm, rays, table, region)
+    return CylinderFit(
+        found.x_mm,
+        found.y_mm,
+        found.height_mm,
+        found.radius_mm,
+        found.error_mm,
+        "silhouette",
+        (found.radius_mm, found.radius_mm),
+        notes=(*table.notes, "depth shows nothing here: fitted to the outline in the colour picture"),
+    )
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A solid that may explain the points, by which method it was found, and the centre's standard error in mm."""
+
+    solid: Solid
+    method: str
+    error_mm: float
+    arc_deg: float = 0.0
+    note: str = ""
+
+
+def _fit(thing: Thing, rays: Rays) -> CylinderFit:
+    noise = max(1.0, thing.table.noise_mm)
+    top = _top(thing.points, noise)
+    points = thing.points[thing.points[:, 2] < top + CUT * noise]
+    eye = rays.pose[:2, 3]
+    box = fit_block(points, top, eye)
+    lying = (fit_lying(points, box, along, eye) for along in (True, False))
+    candidates = [
+        _upright(points, top, noise, rays, box),
+        _boxed(points, box, top, noise),
+        *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
+    ]
+    best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
+    if best.method != "circle" and _loss(best.solid, points, noise) > _POOR:
+        best = _enclosing(points, top, "no simple solid explains what is seen", _ROUGH_MM)
+    if thing.cut_off and best.arc_deg < _ARC_WHEN_CUT_OFF_DEG:
+        raise PlanError("the object touches the border of the picture, and too little of it is seen to place it")
+    return _described(best, points, noise, _notes(thing, best, points, noise))
+
+
+def _loss(solid: Solid, points: Array, noise: float) -> float:
+    """0 to 1: mean squared distance of the points from the surface, cut off where they count as outliers."""
+    return float((np.minimum(solid.distance(points) / (CUT * noise), 1.0) ** 2).mean())
+
+
+def _boxed(points: Array, box: Block, top: float, noise: float) -> _Candidate:
+    """A box, whose far side is where its top ends: without a top in sight it is a guess."""
+    if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _LEAST_TOP:
+        return _Candidate(box, "box", _CRUDE_MM)
+    return _Candidate(box, "box", _GUESS_MM, note="its top is not seen, and so not how far it reaches back")
+
+
+def _described(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
+    """The candidate as an upright cylinder with the footprint of its solid."""
+    solid = best.solid
+    stray = CUT * noise * math.sqrt(_loss(solid, points, noise))
+    return CylinderFit(
+        solid.x,
+        solid.y,
+        solid.height,
+        min(solid.half),
+        max(best.error_mm, 0.5 * stray),
+        best.method,
+        solid.half,
+        solid.yaw_rad,
+        len(points),
+        best.arc_deg,
+        notes,
+    )
+
+
+def _notes(thing: Thing, best: _Candidate, points: Array, noise: float) -> tuple[str, ...]:
+    notes = [*thing.table.notes, best.note]
+    if thing.cut_off:
+        notes.append("it touches the border of the picture: a part of it is not seen")
+    if (best.solid.distance(points) > CUT * noise).mean() > _MANY_OFF:
+        notes.append("it is no simple solid: many points lie off the fitted surface")
+    return tuple(note for note in notes if note)
+
+
+def _top(points: Array, noise: float) -> float:
+    """Height of the uppermost layer that is not thin: outliers reach higher, but there are few in any layer."""
+    width = max(4.0, noise)
+    z = points[:, 2]
+    layer = (z / width).astype(int)
+    count = np.bincount(layer)
+    usual = float(np.median(count[layer]))
+    last = int(np.nonzero(count >= 0.2 * usual)[0][-1])
+    fullest = int(count.argmax())
+    lower = count[1 : max(fullest - 1, 1)]
+    if fullest >= last - 3 and (
+        len(lower) == 0 or count[fullest] > 2 * np.median(lower)
+    ):  # a level top, seen from above
+        return float(np.median(z[np.abs(layer - fullest) <= 1]))
+    return float(np.quantile(z[layer <= last], 0.99))
+
+
+def _upright(points: Array, top: float, noise: float, rays: Rays, box: Block) -> _Candidate:
+    """An upright cylinder from its visible side; where that says too little, from all points."""
+    side = points[points[:, 2] < top - max(4.0, noise), :2]
+    if len(side) < LEAST_SIDE_POINTS:
+        return _enclosing(points, top, f"only {len(side)} points on its side")
+    sight = side.mean(0) - rays.pose[:2, 3]
+    largest = 2 * math.hypot(*box.half)
+    away = sight / max(float(np.hypot(*sight)), 1e-9)
+    circle = fit_circle(side, noise, away, largest)
+    if circle is None:
+        return _enclosing(points, top, "no circle of its size fits its side")
+    arc = _arc_deg(circle, side)
+    start = np.array([circle.x, circle.y]), circle.radius
+    whole = refine_circle(points[:, :2], *start, noise, largest, away, top - points[:, 2])
+    if whole is not None:
+        circle, side = whole, points[:, :2]
+    if arc < LEAST_ARC_DEG or circle.used.sum() < LEAST_SIDE_POINTS:
+        return _enclosing(points, top, f"its side shows an arc of only {arc:.0f} degrees")
+    solid = Upright(circle.x, circle.y, circle.radius, top)
+    return _Candidate(solid, "circle", _circle_error(circle, side, arc), arc)
+
+
+def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
+    """Standard error of the centre by the least-squares covariance.
+
+    Residuals of neighbouring points are alike (relief, a body that is not quite round), so that each sector of the arc
+    counts as one measurement.
+    """
+    off = np.hypot(*(side[circle.used] - [circle.x, circle.y]).T) - circle.radius
+    alike = circle.used.sum() / (arc_deg / _SECTOR_DEG)
+    return float(np.sqrt(np.trace(circle.covariance[:2, :2]) * np.mean(off**2) * alike))
+
+
+def _arc_deg(circle: Circle, side: Array) -> float:
+    """Degrees of the circle that points lie on, counted in sectors."""
+    on = side[circle.used] - [circle.x, circle.y]
+    sector = np.degrees(np.arctan2(on[:, 1], on[:, 0])) // _SECTOR_DEG
+    count = np.bincount(sector.astype(int) + 18, minlength=37)
+    return float((count >= 2).sum() * _SECTOR_DEG)
+
+
+def _enclosing(points: Array, top: float, why: str, error_mm: float = _CRUDE_MM) -> _Candidate:
+    """The smallest circle round the plan, without the farthest points on each side, which may be outliers."""
+    plan = points[:, :2]
+    low, high = np.quantile(plan, [0.02, 0.98], axis=0)
+    inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
+    (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
+    note = f"{why}: the smallest circle round all its points was taken"
+    return _Candidate(Upright(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)

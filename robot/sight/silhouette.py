@@ -1,0 +1,92 @@
+"""A cylinder from its outline in the colour picture: what is left where depth shows nothing, as of glass.
+
+The outline is what differs in colour from the table and has no depth. Seen from a camera whose foot on the table is F,
+the vertical sides are tangents that open by an angle 2 alpha, and the lowest pixel looks at the nearest point of the
+base, at distance n from F: the centre lies at distance D with n = D - r and r = D sin(alpha), so D = n / (1 - sin
+alpha). The highest pixel looks at the far rim of the top, at distance D + r, which gives the height.
+"""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import PlanError
+from robot.readings import Box
+from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, Table, height_above, largest_patch
+
+_COLOUR_LEVELS = 12.0
+_LEAST_PX = 60
+_ERROR_SHARE = 0.15
+"""Standard error as a share of the radius: measured on cylinders, where the base is hidden by nothing."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """An upright cylinder (mm, rig frame) that has this outline."""
+
+    x_mm: float
+    y_mm: float
+    radius_mm: float
+    height_mm: float
+    error_mm: float
+
+
+def fit_silhouette(
+    colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table, region: Box | None = None
+) -> Outline:
+    """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
+    patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
+    rows, columns = (at + part.start for at, part in zip(patch.mask.nonzero(), patch.window, strict=True))
+    directions = rays.points(np.ones(depth_mm.shape, np.float32), rows, columns) - rays.pose[:3, 3]
+    return _cylinder(directions, rows, rays.pose[:3, 3] - [0.0, 0.0, table.c], region)
+
+
+def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table) -> Mask:
+    """Pixels whose colour is far from that of the pixels that depth puts on the table."""
+    flat = np.abs(height_above(depth_mm, rays, table)) < max(5.0, 3 * table.noise_mm)
+    if flat.sum() < 100:
+        raise PlanError("neither depth nor colour shows the table; look at camera and light")
+    smooth = cv2.GaussianBlur(colour, (5, 5), 0).astype(np.float32)
+    middle = np.median(smooth[flat], axis=0)
+    spread = 1.4826 * np.median(np.abs(smooth[flat] - middle), axis=0)
+    return np.asarray((np.abs(smooth - middle) > np.maximum(_COLOUR_LEVELS, 5 * spread)).any(2))
+
+
+def _patch(candidates: Mask) -> Patch:
+    """The largest connected patch, small gaps closed and single pixels left out."""
+    kernel = np.ones((5, 5), np.uint8)
+    closed = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel)
+    patch = largest_patch(opened, _LEAST_PX)
+    if patch is None:
+        raise PlanError("nothing stands on the table, by depth and by colour; put the object there, or light it better")
+    if patch.cut_off:
+        raise PlanError("depth shows nothing, and the outline touches the border of the picture")
+    return patch
+
+
+def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Box | None) -> Outline:
+    """Closed form, see the top of the file. directions: (N, 3) of sight; eye: (3,) above the table's plane."""
+    turn = np.arctan2(directions[:, 1], directions[:, 0])
+    middle = math.atan2(float(np.sin(turn).mean()), float(np.cos(turn).mean()))
+    aside = (turn - middle + math.pi) % (2 * math.pi) - math.pi
+    low, high = (float(value) for value in np.quantile(aside, [0.001, 0.999]))
+    alpha = (high - low) / 2
+    slope = -directions[:, 2] / np.hypot(directions[:, 0], directions[:, 1])
+    if alpha <= 0 or slope.max() <= 0:
+        raise PlanError("the outline in the colour picture is of nothing that stands on the table")
+    near = float(eye[2] / slope.max())
+    far = near / (1 - math.sin(alpha))
+    radius = far * math.sin(alpha)
+    height = float(eye[2] - (far + radius) * slope.min())
+    yaw = middle + (low + high) / 2
+    x, y = float(eye[0] + far * math.cos(yaw)), float(eye[1] + far * math.sin(yaw))
+    outside = region is not None and not (
+        region.lower[0] <= x <= region.upper[0] and region.lower[1] <= y <= region.upper[1]
+    )
+    if outside or height <= 0:
+        raise PlanError("the outline in the colour picture is of nothing that stands on the table")
+    return Outline(x, y, radius, height, max(3.0, _ERROR_SHARE * radius))

@@ -1,0 +1,1 @@
+"""Contact of a gel with a height map."""

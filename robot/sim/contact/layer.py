@@ -1,0 +1,214 @@
+"""Frictionless normal contact of an elastic layer on a rigid base with a height map, for small strains.
+
+Find p >= 0 and the approach d with   s = u(p) + gap - d >= 0,   p s = 0,   and either sum p dA = force or d = depth.
+
+u is the inward displacement of the gel, by robot.sim.contact.kernels; an elastic object adds a half-space's (composite
+modulus 1/E* = (1-v1^2)/E1 + (1-v2^2)/E2, where only the gel's share is a layer's). Lengths are scaled by the pixel,
+pressures by E* and both by the load inside, so the units do not matter as long as they agree: mm, N and MPa do.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import RobotConfigError, SceneError
+from robot.sim.contact.constrained_cg import Solution
+from robot.sim.contact.kernels import Floats
+from robot.sim.contact.scaled_problem import Surface, Task
+
+STRAIN_LIMIT = 0.5  # of displacement over thickness, and of slope, that linear elasticity may claim
+_SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Elastic gel bonded to a rigid base (a half-space if infinitely thick), in MPa and mm. Raises RobotConfigError."""
+
+    modulus_mpa: float
+    poisson: float = 0.48
+    thickness_mm: float = math.inf
+
+    def __post_init__(self) -> None:
+        _check_elastic("a layer's", self.modulus_mpa, self.poisson)
+        if math.isinf(self.modulus_mpa):
+            raise RobotConfigError("a layer's modulus must be finite, got inf: a rigid gel shows nothing; give its MPa")
+        if not self.thickness_mm > 0.0:
+            raise RobotConfigError(f"a layer's thickness must be above 0 mm, got {self.thickness_mm}; inf: half-space")
+
+    @property
+    def plane_modulus_mpa(self) -> float:
+        """E* = E / (1 - nu^2)."""
+        return self.modulus_mpa / (1.0 - self.poisson**2)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A solved press. `flags` name what must be known before it is trusted; none is good.
+
+    pressure_mpa      (rows, cols) >= 0
+    displacement_mm   (rows, cols) inward displacement of the gel alone; the object's own deformation is left out
+    approach_mm       of the undeformed object, from gap = 0
+    residual          of robot.sim.contact.constrained_cg.Solution; at most the tolerance when converged
+
+    no_contact        nothing is touched; not converged if there was a force to carry
+    unresolved        the contact is under three pixels wide: trust force and place, not pressure and depth
+    at_border         the contact reaches the border of the map, and nothing presses beyond
+    large_strain      a displacement over half the thickness: linear elasticity does not hold
+    steep             a slope over one half: linear elasticity does not hold
+    iteration_cap     stopped short of the tolerance; not converged
+    rigid_volume      a periodic surface cannot lose the volume that the depth asks for; not converged, nothing solved
+    """
+
+    pressure_mpa: Floats
+    displacement_mm: Floats
+    approach_mm: float
+    force_n: float
+    area_mm2: float
+    iterations: int
+    residual: float
+    converged: bool
+    flags: tuple[str, ...]
+
+
+def press(
+    gap_mm: npt.ArrayLike,
+    pixel_mm: float,
+    layer: Layer,
+    *,
+    force_n: float | None = None,
+    depth_mm: float | None = None,
+    object_modulus_mpa: float = math.inf,
+    object_poisson: float = 0.3,
+    tolerance: float = 1e-3,
+    max_iterations: int = 1000,
+    padded: bool = True,
+) -> Contact:
+    """Press an object into the gel with a force, or to a depth.
+
+    gap_mm (rows, cols): distance of the undeformed object from the flat gel, +inf where there is no object.
+    depth_mm: approach of the undeformed object, from gap = 0. `padded=False` makes the surface periodic (a half-
+    space's mean displacement is then 0). Raises SceneError for an impossible gap, force or depth, RobotConfigError
+    for the settings.
+    """
+    _check_settings(pixel_mm, tolerance, max_iterations)
+    _check_elastic("an object's", object_modulus_mpa, object_poisson)
+    gap = _checked_gap(gap_mm)
+    _check_load(force_n, depth_mm)
+    lowest = float(gap.min())
+    if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
+        return _untouched(gap, force_n or 0.0, depth_mm, ())
+    softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
+    surface = Surface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded)
+    if depth_mm is not None and not surface.loses_volume() and depth_mm > gap.mean():
+        return _untouched(gap, math.inf, depth_mm, ("rigid_volume",))
+    scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
+    with np.errstate(over="ignore"):  # what is that far away is not there
+        scaled = (gap - lowest) / pixel_mm / scale
+    load = None if force_n is None else 1.0
+    solution = Task(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
+    return _contact(solution, surface, layer, pixel_mm, scale, lowest)
+
+
+def _scale(pixel_mm: float, modulus_mpa: float, force_n: float | None, depth_mm: float) -> float:
+    """What load or depth is, in pixels and E*. Raises SceneError if that is no number to compute with."""
+    scale = depth_mm / pixel_mm if force_n is None else force_n / modulus_mpa / pixel_mm / pixel_mm
+    if not _SCALED_RANGE[0] < scale < _SCALED_RANGE[1]:
+        raise SceneError(
+            f"force / (E* pixel^2) or depth / pixel must be between {_SCALED_RANGE[0]} and {_SCALED_RANGE[1]}, "
+            f"got {scale}; give force, modulus and lengths in units that agree"
+        )
+    return scale
+
+
+def _untouched(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
+    """No pressure anywhere; not converged if a force was to be carried."""
+    lowest = float(gap.min())
+    approach = depth_mm if depth_mm is not None else lowest if math.isfinite(lowest) else 0.0
+    nothing = np.zeros(gap.shape)
+    flags = flags or ("no_contact",)
+    return Contact(nothing, nothing.copy(), approach, 0.0, 0.0, 0, 0.0, force_n == 0.0, flags)
+
+
+def _contact(
+    solution: Solution, surface: Surface, layer: Layer, pixel_mm: float, scale: float, lowest_mm: float
+) -> Contact:
+    """Back in the caller's units, with flags."""
+    pressure, displacement = solution.pressure, solution.displacement
+    if surface.softness > 0.0:
+        displacement = surface.gel(pressure.shape, pressure.shape)(pressure)
+    touching = pressure > 0.0
+    displacement_mm = displacement * (scale * pixel_mm)
+    flags = {
+        "no_contact": not touching.any(),
+        "unresolved": _is_narrow(touching),
+        "at_border": bool(touching[[0, -1]].any() or touching[:, [0, -1]].any()),
+        "large_strain": float(displacement_mm.max()) > STRAIN_LIMIT * layer.thickness_mm,
+        "steep": _steepest(displacement * scale) > STRAIN_LIMIT,
+        "iteration_cap": not solution.converged,
+    }
+    return Contact(
+        pressure_mpa=pressure * (scale * layer.plane_modulus_mpa),
+        displacement_mm=displacement_mm,
+        approach_mm=solution.approach * scale * pixel_mm + lowest_mm,
+        force_n=float(pressure.sum()) * scale * layer.plane_modulus_mpa * pixel_mm * pixel_mm,
+        area_mm2=int(touching.sum()) * pixel_mm * pixel_mm,
+        iterations=solution.iterations,
+        residual=solution.residual,
+        converged=solution.converged,
+        flags=tuple(name for name, raised in flags.items() if raised),
+    )
+
+
+def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
+    """Whether no pixel in contact has all its four neighbours in contact; beyond the border counts as contact."""
+    padded = np.pad(touching, 1, mode="edge")
+    around = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return bool(touching.any()) and not bool((touching & around).any())
+
+
+def _steepest(height: Floats) -> float:
+    """Largest slope by central differences, both in pixels."""
+    slopes = [np.gradient(height, axis=axis) for axis in (0, 1) if height.shape[axis] > 1]
+    return float(np.sqrt(sum((slope**2 for slope in slopes), np.zeros(1))).max())
+
+
+# Checks ----------------------------------------------------------------------------------------------------
+
+
+def _check_elastic(whose: str, modulus_mpa: float, poisson: float) -> None:
+    if not modulus_mpa > 0.0:
+        raise RobotConfigError(f"{whose} modulus must be above 0 MPa, got {modulus_mpa}; soft rubber has about 0.3")
+    if not -1.0 < poisson <= 0.5:
+        raise RobotConfigError(f"{whose} Poisson's ratio must be in (-1, 0.5], got {poisson}; rubber has about 0.48")
+
+
+def _check_settings(pixel_mm: float, tolerance: float, max_iterations: int) -> None:
+    if not 0.0 < pixel_mm < math.inf:
+        raise RobotConfigError(f"pixel_mm must be above 0 and finite, got {pixel_mm}; give a pixel's side")
+    if not 0.0 < tolerance < 1.0:
+        raise RobotConfigError(f"tolerance must be between 0 and 1, got {tolerance}; 1e-2 to 1e-4 is usual")
+    if max_iterations < 1:
+        raise RobotConfigError(f"max_iterations must be at least 1, got {max_iterations}; a press takes 10 to 100")
+
+
+def _checked_gap(gap_mm: npt.ArrayLike) -> Floats:
+    try:
+        gap = np.asarray(gap_mm, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"a gap must be rows x cols of numbers: {error}; give a height map") from error
+    if gap.ndim != 2 or gap.size == 0:
+        raise SceneError(f"a gap must be rows x cols with at least one pixel, got shape {gap.shape}; give a height map")
+    if np.isnan(gap).any() or (gap == -np.inf).any():
+        raise SceneError("a gap must be a number or +inf in each pixel, got NaN or -inf; give +inf where nothing is")
+    return gap
+
+
+def _check_load(force_n: float | None, depth_mm: float | None) -> None:
+    if (force_n is None) == (depth_mm is None):
+        raise SceneError(f"a press must have a force or a depth, got {force_n} N and {depth_mm} mm; give one of them")
+    if force_n is not None and not 0.0 <= force_n < math.inf:
+        raise SceneError(f"a force must be finite and not negative, got {force_n} N; a gel does not pull")
+    if depth_mm is not None and not math.isfinite(depth_mm):
+        raise SceneError(f"a depth must be finite, got {depth_mm} mm; give the approach from gap = 0")

@@ -1,0 +1,1 @@
+"""The simulated gel sensor: a displacement map in, its camera's picture out."""

@@ -1,0 +1,229 @@
+"""Optics fitted to real presses: the change of colour is a low-order polynomial of the normal and the place.
+
+    I_c(p) = backdrop_c(p) + sum_k sum_j  w_kjc  place_j(p)  feature_k(p)
+
+Features are the products nx^i ny^j of 1 <= i + j <= degree, and for each reach the displacement smoothed over that
+reach and its two slopes: light that the gel sends on, and soft shadows, come from the wider neighbourhood. Places
+are 1, x, y, xy, x^2, y^2 (x, y from -1 to 1 over the field), or the first of them. A flat gel has no feature, so
+it shows the backdrop: a polynomial in x and y.
+
+Outside what the presses showed (steeper normals, deeper neighbourhoods, places where nobody pressed) a polynomial
+runs away; there every quantity is held at the limits that the fit noted.
+"""
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import BadRobotInput, UnknownName
+from robot.sim.gel.optics import Optics
+from robot.sim.gel.surface import Array, Field, Surface, resized
+
+FORMAT = 1
+CHANNELS = 3
+PLACES = 6
+_COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach is many pixels
+
+Matrix = NDArray[np.float64]
+
+
+class Limits(NamedTuple):
+    """What the fitted presses showed; everything is held inside."""
+
+    steepest: float  # of |n|, the sine of the tilt
+    left: float
+    right: float
+    top: float
+    bottom: float
+    lowest: tuple[float, ...]  # of each smoothed map
+    highest: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FittedOptics(Optics):
+    """A fitted sensor. `weights`: (features x places, 3) row by row; `flat`: (terms, 3) of the backdrop.
+
+    Raises BadRobotInput where the sizes do not belong together, or a number is not finite.
+    """
+
+    degree: int
+    places: int
+    reaches_mm: tuple[float, ...]
+    weights: tuple[tuple[float, ...], ...]
+    flat_degree: int
+    flat: tuple[tuple[float, ...], ...]
+    limits: Limits
+
+    def __post_init__(self) -> None:
+        wanted = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
+        flat = (len(place_powers(self.flat_degree)), CHANNELS)
+        if np.shape(self.weights) != wanted or np.shape(self.flat) != flat:
+            raise BadRobotInput(
+                f"weights and flat must be {wanted} and {flat} numbers for this degree, "
+                f"got {np.shape(self.weights)} and {np.shape(self.flat)}; fit again"
+            )
+        limits = np.hstack(self.limits)
+        for name, numbers in (("weights", self.weights), ("flat", self.flat), ("limits", limits)):
+            if not np.isfinite(numbers).all():
+                raise BadRobotInput(f"{name} of fitted optics must be finite, got a NaN or infinite one; fit again")
+
+    def backdrop(self, field: Field) -> Array:
+        return _maps(self, field)[0].copy()
+
+    def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
+        backdrop, weights = _maps(self, surface.field)
+        features = normal_features(*self._tilts(slopes), self.degree)
+        if self.reaches_mm and surface.displacement_mm.any():
+            features += self._neighbourhood(surface)
+        out = backdrop.copy()
+        part = np.empty_like(features[0])
+        for channel in range(CHANNELS):
+            total = np.zeros_like(part)
+            for feature, weight in zip(features, weights, strict=False):
+                np.multiply(feature, weight[channel], out=part)
+                total += part
+            out[..., channel] += total
+        return out
+
+    def _tilts(self, slopes: tuple[Array, Array]) -> tuple[Array, Array]:
+        """nx and ny, no steeper than the limit."""
+        slope_x, slope_y = slopes
+        square = slope_x * slope_x + slope_y * slope_y
+        steepest = np.float32(min(self.limits.steepest, 1))
+        shrink = steepest / np.maximum(np.sqrt(square / (1 + square)), steepest)
+        shrink /= -np.sqrt(1 + square)
+        return slope_x * shrink, slope_y * shrink
+
+    def _neighbourhood(self, surface: Surface) -> list[Array]:
+        """For each reach: smoothed displacement and its slopes, at the pixels."""
+        field = surface.field
+        heights = surface.coarse(_COARSE)
+        steps = [size / count for size, count in zip(field.size_mm, heights.shape, strict=True)]
+        maps = []
+        for reach in self.reaches_mm:
+            smooth = cv2.GaussianBlur(heights, (0, 0), reach / steps[1], sigmaY=reach / steps[0])
+            maps += [smooth, _slope(smooth, 1, steps[1]), _slope(smooth, 0, steps[0])]
+        limits = zip(maps, self.limits.lowest, self.limits.highest, strict=True)
+        return [resized(np.clip(one, low, high), (field.rows, field.cols)) for one, low, high in limits]
+
+
+def _slope(heights: Array, axis: int, step_mm: float) -> Array:
+    if heights.shape[axis] < 2:
+        return np.zeros_like(heights)
+    return np.asarray(np.gradient(heights, np.float32(step_mm), axis=axis), np.float32)
+
+
+def feature_count(degree: int, reaches: int) -> int:
+    """How many features a model of this degree in the normal and this number of reaches has."""
+    return degree * (degree + 3) // 2 + 3 * reaches
+
+
+def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
+    """nx^i ny^j for i + j = 1, 2, ... degree."""
+    powers_x, powers_y = [np.ones_like(nx)], [np.ones_like(ny)]
+    for _ in range(degree):
+        powers_x.append(powers_x[-1] * nx)
+        powers_y.append(powers_y[-1] * ny)
+    return [powers_x[total - j] * powers_y[j] for total in range(1, degree + 1) for j in range(total + 1)]
+
+
+def place_powers(degree: int) -> list[tuple[int, int]]:
+    """Powers of x and y up to a total degree: of degree 2, in order, 1, x, y, x^2, xy, y^2."""
+    return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
+
+
+def place_terms(x: Any, y: Any, count: int) -> list[Any]:
+    """The first `count` of 1, x, y, xy, x^2, y^2."""
+    return [np.ones_like(x * y), x, y, x * y, x * x, y * y][:count]
+
+
+@lru_cache(maxsize=4)
+def _maps(optics: FittedOptics, field: Field) -> tuple[Array, list[Array]]:
+    """The backdrop, and for each feature its weight at every pixel (3, rows, cols): made once per sensor."""
+    x, y = field.unit_positions()
+    flat = np.array(optics.flat, np.float32)
+    powers = place_powers(optics.flat_degree)
+    backdrop = sum(x[..., None] ** i * y[..., None] ** j * row for (i, j), row in zip(powers, flat, strict=True))
+    limits = optics.limits
+    held = np.clip(x, limits.left, limits.right), np.clip(y, limits.top, limits.bottom)
+    places = [np.broadcast_to(term, (field.rows, field.cols)) for term in place_terms(*held, optics.places)]
+    weights = np.array(optics.weights, np.float32).reshape(-1, optics.places, CHANNELS)
+    maps = [np.tensordot(row.T, np.stack(places), axes=1) for row in weights]
+    return np.maximum(np.asarray(backdrop, np.float32), 1), maps
+
+
+# On the disk -----------------------------------------------------------------------------------------------
+
+
+def fitted_names() -> list[str]:
+    """The sensors whose fits are shipped."""
+    folder = resources.files("robot.sim.gel") / "fitted"
+    return sorted(item.name.removesuffix(".json") for item in folder.iterdir() if item.name.endswith(".json"))
+
+
+def fitted_document(name: str) -> dict[str, Any]:
+    """The shipped file of this sensor: source, setting, held-out figures, model. Raises UnknownName."""
+    if name not in (known := fitted_names()):
+        raise UnknownName(f"no sensor called {name!r} was fitted; known are {', '.join(known)}")
+    content: dict[str, Any] = json.loads((resources.files("robot.sim.gel") / "fitted" / f"{name}.json").read_text())
+    return content
+
+
+@lru_cache(maxsize=8)
+def load_fitted(name: str) -> FittedOptics:
+    """The shipped fit of this sensor. Raises UnknownName, listing those there are."""
+    return optics_from_json(fitted_document(name))
+
+
+def optics_from_json(content: dict[str, Any]) -> FittedOptics:
+    """The optics that a fitted file describes. Raises BadRobotInput for another format or missing keys."""
+    if content.get("format") != FORMAT:
+        raise BadRobotInput(f"a fitted sensor must have format {FORMAT}, got {content.get('format')!r}; fit again")
+    try:
+        model, limits = content["model"], content["model"]["limits"]
+        return FittedOptics(
+            degree=int(model["degree"]),
+            places=int(model["places"]),
+            reaches_mm=tuple(map(float, model["reaches_mm"])),
+            weights=_rows(model["weights"]),
+            flat_degree=int(model["flat_degree"]),
+            flat=_rows(model["flat"]),
+            limits=Limits(
+                steepest=float(limits["steepest"]),
+                left=float(limits["left"]),
+                right=float(limits["right"]),
+                top=float(limits["top"]),
+                bottom=float(limits["bottom"]),
+                lowest=tuple(map(float, limits["lowest"])),
+                highest=tuple(map(float, limits["highest"])),
+            ),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadRobotInput(f"a fitted sensor lacks or garbles {error}; fit again") from error
+
+
+def optics_to_json(optics: FittedOptics) -> dict[str, Any]:
+    """What optics_from_json() reads back, with six digits of each number."""
+    return {
+        "degree": optics.degree,
+        "places": optics.places,
+        "reaches_mm": list(optics.reaches_mm),
+        "weights": [[float(f"{value:.6g}") for value in row] for row in optics.weights],
+        "flat_degree": optics.flat_degree,
+        "flat": [[float(f"{value:.6g}") for value in row] for row in optics.flat],
+        "limits": {key: _short(value) for key, value in optics.limits._asdict().items()},
+    }
+
+
+def _short(value: Any) -> Any:
+    return [float(f"{one:.6g}") for one in value] if isinstance(value, tuple) else float(f"{value:.6g}")
+
+
+def _rows(values: Any) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(map(float, row)) for row in values)

@@ -1,0 +1,155 @@
+"""What sits on a gel: specks of dust, hairs, scratches, grains under the skin, and printed markers."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import RobotConfigError
+from robot.sim.gel.surface import Array, Field, Surface
+
+_SUBPIXEL = 4  # cv2 draws at 1/16 of a pixel
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """Flaws of one gel, drawn once from `seed`: how many of each, and how rough the skin is (rms slope)."""
+
+    seed: int
+    specks: int = 14
+    hairs: int = 3
+    grains: int = 25
+    texture: float = 0.012
+
+
+@dataclass(frozen=True)
+class FlawMaps:
+    """What flaws do to a picture: `darkening` (rows, cols) multiplies it, `slope_x` and `slope_y` add to the gel's."""
+
+    darkening: Array
+    slope_x: Array
+    slope_y: Array
+
+
+@lru_cache(maxsize=8)
+def flaw_maps(flaws: Flaws, field: Field) -> FlawMaps:
+    """The maps of these flaws; the same flaws are on the same places whatever the size of the image."""
+    rng = np.random.default_rng([flaws.seed, 0x6E1])
+    darkening = _specks(rng, flaws.specks, field) * _hairs(rng, flaws.hairs, field)
+    heights = _grains(rng, flaws.grains, field)
+    down, right = (
+        np.gradient(heights, field.pixel_mm, axis=axis) if heights.shape[axis] > 1 else np.zeros_like(heights)
+        for axis in (0, 1)
+    )
+    rough = rng.standard_normal((2, field.rows, field.cols), dtype=np.float32)
+    # Skin is rough at many scales; grains of two pixels are what a camera still sees.
+    rough = np.stack([cv2.GaussianBlur(one, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for one in rough])
+    return FlawMaps(darkening, (right + rough[0]).astype(np.float32), (down + rough[1]).astype(np.float32))
+
+
+def _places(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    return rng.uniform(-0.5, 0.5, (count, 2))
+
+
+def _specks(rng: np.random.Generator, count: int, field: Field) -> Array:
+    """Dark dots of 0.03 to 0.12 mm, each let through 50 to 90 % of the light."""
+    out = np.ones((field.rows, field.cols), np.float32)
+    radii, values = rng.uniform(0.03, 0.12, count), rng.uniform(0.5, 0.9, count)
+    for place, radius, value in zip(_places(rng, count), radii, values, strict=True):
+        _dot(out, place, radius, float(value), field)
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7))
+
+
+def _dot(image: Array, place: NDArray[Any], radius_mm: float, value: float, field: Field) -> None:
+    scale = 1 << _SUBPIXEL
+    x = round(((place[0] + 0.5) * field.cols - 0.5) * scale)
+    y = round(((place[1] + 0.5) * field.rows - 0.5) * scale)
+    radius = max(1, round(radius_mm / field.pixel_mm * scale))
+    cv2.circle(image, (x, y), radius, value, -1, cv2.LINE_8, _SUBPIXEL)
+
+
+def _hairs(rng: np.random.Generator, count: int, field: Field) -> Array:
+    """Thin dark arcs of 0.5 to 2.5 mm: hairs on the gel and scratches in it."""
+    out = np.ones((field.rows, field.cols), np.float32)
+    for place in _places(rng, count):
+        length, bend, angle = rng.uniform(0.5, 2.5), rng.uniform(-1.5, 1.5), rng.uniform(0, 2 * math.pi)
+        along = np.linspace(-0.5, 0.5, 9)
+        turn = angle + bend * along
+        path = np.cumsum(np.stack([np.cos(turn), np.sin(turn)], axis=1), axis=0) * length / 9 / field.pixel_mm
+        path += (place + 0.5) * (field.cols, field.rows)
+        points = np.rint(path * (1 << _SUBPIXEL)).astype(np.int32)[:, None]
+        cv2.polylines(out, [points], False, float(rng.uniform(0.7, 0.9)), 1, cv2.LINE_8, _SUBPIXEL)
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.6))
+
+
+def _grains(rng: np.random.Generator, count: int, field: Field) -> Array:
+    """Heights in mm of little bumps (grit under the skin, 0.05 to 0.15 mm wide)."""
+    x, y = field.positions()
+    height, width = field.size_mm
+    out = np.zeros((field.rows, field.cols), np.float32)
+    places, radii, slopes = _places(rng, count), rng.uniform(0.05, 0.15, count), rng.uniform(0.05, 0.3, count)
+    for place, radius, slope in zip(places, radii, slopes, strict=True):
+        across = np.exp(-(((x - place[0] * width) / radius) ** 2))
+        out += np.float32(slope * radius) * across * np.exp(-(((y - place[1] * height) / radius) ** 2))
+    return out
+
+
+# Markers ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Markers:
+    """Black dots printed on the gel, `pitch_mm` apart, that move with its surface.
+
+    A press spreads them: the shift is `spread` times sum u (x - x_i) exp(-|x - x_i|^2 / (2 reach^2)), normalised,
+    which is -spread * reach * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
+    """
+
+    pitch_mm: float = 1.5
+    radius_mm: float = 0.2
+    darkness: float = 0.75
+    spread: float = 0.5
+    reach_mm: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius_mm < self.pitch_mm / 2 and self.reach_mm > 0 and 0 <= self.darkness <= 1):
+            raise RobotConfigError(f"markers must be dots smaller than half their pitch, got {self}")
+
+
+def marker_positions(markers: Markers, surface: Surface) -> Array:
+    """(count, 2): x, y of the dots in mm from the middle of the field, moved by the surface."""
+    at_rest = _at_rest(markers, surface.field)
+    heights = surface.coarse(4)
+    height, width = surface.field.size_mm
+    steps = np.array([width / heights.shape[1], height / heights.shape[0]])
+    smooth = cv2.GaussianBlur(heights, (0, 0), *(markers.reach_mm / steps))
+    pixels = ((at_rest / (width, height) + 0.5) * heights.shape[::-1] - 0.5).astype(np.float32)
+    out = at_rest.copy()
+    for axis, step in enumerate(steps):
+        if heights.shape[1 - axis] > 1:
+            slope = np.gradient(smooth, axis=1 - axis) / np.float32(step)
+            found = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            out[:, axis] -= np.clip(found[:, 0] * markers.spread * markers.reach_mm, -width, width)
+    return out
+
+
+@lru_cache(maxsize=8)
+def _at_rest(markers: Markers, field: Field) -> Array:
+    height, width = field.size_mm
+    axes = [(np.arange(int(size / markers.pitch_mm)) + 0.5) * markers.pitch_mm for size in (width, height)]
+    middles = [axis - axis.mean() if axis.size else np.zeros(1) for axis in axes]
+    return np.stack([axis.ravel() for axis in np.meshgrid(*middles)], axis=1).astype(np.float32)
+
+
+def marker_darkening(markers: Markers, surface: Surface) -> Array:
+    """(rows, cols) factors: 1, and 1 - darkness where a marker is."""
+    field = surface.field
+    out = np.ones((field.rows, field.cols), np.float32)
+    height, width = field.size_mm
+    for place in marker_positions(markers, surface) / np.array([width, height], np.float32):
+        _dot(out, place, markers.radius_mm, 1 - markers.darkness, field)
+    return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.8))

@@ -1,0 +1,224 @@
+"""From the shape of a gel to colours: near-field LEDs, or a low-order model fitted to real presses.
+
+Both answer with grey levels (0 to 255, not yet clipped) for red, green and blue, and a flat gel gives the
+backdrop. What a sensor adds (tint, dust, blur, noise) is in `robot.sim.gel.sensor`.
+
+LEDs (SIMULATION: near-field LED): a point source at s with axis o and emission order m lights the point p of a
+matt surface with normal n by w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. One colour
+is a bar of such points. The unpressed gel has w_flat, and the picture is
+    I_c = backdrop_c * (ambient + (1 - ambient) * sum_b mix_cb * shade_b * w_b / w_flat_b),
+so that what the backdrop holds (the lamp's own falloff, the vignette of the lens) is not counted twice.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from robot.errors import RobotConfigError
+from robot.sim.gel.surface import Array, Field, Surface, resized
+
+Triple = tuple[float, float, float]
+
+
+class Optics(ABC):
+    """What turns a surface into colours. Frozen and hashable, so that maps made once are found again."""
+
+    @abstractmethod
+    def backdrop(self, field: Field) -> Array:
+        """The unpressed gel: (rows, cols, 3) grey levels."""
+
+    @abstractmethod
+    def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
+        """The pressed gel: (rows, cols, 3) grey levels; `slopes` are the surface's and those of its flaws."""
+
+
+# Near-field LEDs -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Bar:
+    """LEDs of one colour beside the gel: `points` of them along a line that faces the middle of the field.
+
+    `angle_rad` is where it stands, counted from the right of the image, counter-clockwise as seen on screen;
+    `height_mm` is above the gel, on the camera's side; `order` is the Lambertian order of emission.
+    """
+
+    angle_rad: float
+    distance_mm: float = 13.0
+    height_mm: float = 5.5
+    length_mm: float = 12.0
+    points: int = 4
+    order: float = 1.0
+
+    def __post_init__(self) -> None:
+        lengths = (self.distance_mm, self.height_mm)
+        if not all(0 < value < math.inf for value in lengths) or self.points < 1 or self.order < 0:
+            raise RobotConfigError(f"a bar of LEDs must stand above the gel and hold one LED or more, got {self}")
+
+    def positions(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """(points, 3): x, y, z of the LEDs in mm, y down."""
+        outwards = np.array([math.cos(self.angle_rad), -math.sin(self.angle_rad), 0.0])
+        along = np.array([-outwards[1], outwards[0], 0.0])
+        shares = np.linspace(-0.5, 0.5, self.points) if self.points > 1 else np.zeros(1)
+        middle = outwards * self.distance_mm + np.array([0.0, 0.0, self.height_mm])
+        return np.asarray(middle + shares[:, None] * self.length_mm * along)
+
+
+@dataclass(frozen=True)
+class Glow:
+    """One channel of the unpressed gel: floor + span * exp(-(x-x0)^2/wx^2 - (y-y0)^2/wy^2), plus a slant.
+
+    Grey levels; x and y run from -1 to 1 over the field.
+    """
+
+    floor: float
+    span: float
+    x0: float = 0.0
+    y0: float = 0.0
+    width_x: float = 1.0
+    width_y: float = 1.0
+    slant_x: float = 0.0
+    slant_y: float = 0.0
+
+    def __call__(self, field: Field) -> Array:
+        """(rows, cols) grey levels, none below 1."""
+        x, y = field.unit_positions()
+        hill = np.exp(-(((x - self.x0) / self.width_x) ** 2)) * np.exp(-(((y - self.y0) / self.width_y) ** 2))
+        level = self.floor + self.span * hill + self.slant_x * x + self.slant_y * y
+        return np.asarray(np.maximum(level, 1), np.float32)
+
+
+# Like a GelSight Mini: blue from above, red from below on the left, green from the right; a pink middle.
+MINI_BARS = (Bar(math.radians(234)), Bar(math.radians(346)), Bar(math.radians(122)))
+MINI_GLOWS = (
+    Glow(64, 99, 0.0, -0.12, 1.09, 0.98, 0.0, -6.0),
+    Glow(50, 76, 0.2, -0.13, 1.4, 1.9, -14.0, -1.0),
+    Glow(28, 133, 0.03, 0.13, 0.88, 0.85, 0.0, 9.0),
+)
+# How much of each channel (rows) comes from each bar (columns); the rows add up to 1.
+MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
+
+
+@dataclass(frozen=True)
+class LedOptics(Optics):
+    """Three bars of near-field LEDs.
+
+    `ambient` is the share of the light that comes from everywhere (reflected inside the gel); `shadow` is how
+    much of a bar's light a surface in its way takes (0: cast shadows are left out and not computed).
+    Raises RobotConfigError for shares outside 0 to 1 or mixes that do not add up to 1.
+    """
+
+    bars: tuple[Bar, Bar, Bar] = MINI_BARS
+    glows: tuple[Glow, Glow, Glow] = MINI_GLOWS
+    mix: tuple[Triple, Triple, Triple] = MINI_MIX
+    ambient: float = 0.38
+    shadow: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.ambient <= 1 and 0 <= self.shadow <= 1):
+            raise RobotConfigError(f"ambient and shadow must be 0 to 1, got {self.ambient} and {self.shadow}")
+        if any(abs(sum(row) - 1) > 1e-6 or min(row) < 0 for row in self.mix):
+            raise RobotConfigError(f"each row of mix must be shares that add up to 1, got {self.mix}")
+
+    def backdrop(self, field: Field) -> Array:
+        return np.stack([glow(field) for glow in self.glows], axis=-1)
+
+    def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
+        lit = [_relative_light(rays, slopes) for rays in _bar_rays(self.bars, surface.field)]
+        if self.shadow > 0 and surface.displacement_mm.any():
+            shades = cast_shadows(surface, self.bars)
+            lit = [light * (1 - np.float32(self.shadow) * shade) for light, shade in zip(lit, shades, strict=True)]
+        out = self.backdrop(surface.field)
+        for channel, row in enumerate(self.mix):
+            light = sum(np.float32(share) * one for share, one in zip(row, lit, strict=True))
+            out[..., channel] *= np.float32(self.ambient) + np.float32(1 - self.ambient) * light
+        return out
+
+
+@lru_cache(maxsize=6)
+def _bar_rays(bars: tuple[Bar, ...], field: Field) -> tuple[list[tuple[Array, Array, Array]], ...]:
+    return tuple(led_rays(bar, field) for bar in bars)
+
+
+def led_rays(bar: Bar, field: Field) -> list[tuple[Array, Array, Array]]:
+    """For each LED the vector (x, y, z maps) whose product with the normal is its share of w / w_flat."""
+    middle = np.array([0.0, 0.0, 0.0])
+    x, y = (axis.astype(np.float64) for axis in field.positions())
+    rays, flat = [], np.zeros((field.rows, field.cols))
+    for led in bar.positions():
+        away = (led[0] - x, led[1] - y, np.full((1, 1), led[2]))
+        distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
+        axis = (middle - led) / np.linalg.norm(middle - led)
+        facing = np.maximum(0, -sum(a * b for a, b in zip(axis, away, strict=True)) / distance)
+        strength = facing**bar.order / distance**3
+        rays.append([part * strength for part in away])
+        flat += rays[-1][2]
+    flat = np.maximum(flat, np.finfo(np.float64).tiny)
+    return [tuple((part / flat).astype(np.float32) for part in ray) for ray in rays]
+
+
+def _relative_light(rays: list[tuple[Array, Array, Array]], slopes: tuple[Array, Array]) -> Array:
+    """sum of max(0, n . ray): 1 where the gel is flat. A facet turned away from a LED gets nothing from it."""
+    slope_x, slope_y = slopes
+    total, one, part = np.zeros_like(slope_x), np.empty_like(slope_x), np.empty_like(slope_x)
+    for x, y, z in rays:
+        np.multiply(slope_x, x, out=one)
+        np.multiply(slope_y, y, out=part)
+        one += part
+        np.subtract(z, one, out=one)
+        np.maximum(one, 0, out=one)
+        total += one
+    total /= np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+    return total
+
+
+# Shadows ---------------------------------------------------------------------------------------------------
+
+_SHADOW_STEP = 4  # image pixels per point of the shadow's grid: penumbras are wider than that
+_REACHES_MM = (0.4, 0.8, 1.4, 2.2)  # how far towards the bar a higher surface is looked for
+_PENUMBRA_MM = 0.5  # how far a surface must stand into the light to take all of it: bars are long, light soft
+
+
+def cast_shadows(surface: Surface, bars: tuple[Bar, ...]) -> list[Array]:
+    """For each bar the share (0 to 1) of its light that the surface itself keeps from each pixel."""
+    heights = surface.coarse(_SHADOW_STEP)
+    full = (surface.field.rows, surface.field.cols)
+    out = []
+    for looks in _shadow_looks(bars, surface.field, heights.shape):
+        over = np.zeros_like(heights)
+        for map_x, map_y, rise in looks:
+            towards = cv2.remap(heights, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            np.maximum(over, towards - heights - rise, out=over)
+        shade = np.minimum(over / np.float32(_PENUMBRA_MM), 1)
+        out.append(np.clip(resized(cv2.GaussianBlur(shade, (0, 0), 1.2), full), 0, 1))
+    return out
+
+
+@lru_cache(maxsize=6)
+def _shadow_looks(
+    bars: tuple[Bar, ...], field: Field, shape: tuple[int, int]
+) -> tuple[list[tuple[Array, Array, Array]], ...]:
+    """For each bar and reach: where to look (x, y maps) and how high the light's ray is there (mm)."""
+    grid = Field(shape[0], shape[1], 1.0)
+    steps = (field.size_mm[1] / shape[1], field.size_mm[0] / shape[0])
+    x, y = (axis * np.float32(step) for axis, step in zip(grid.positions(), steps, strict=True))
+    columns, rows = np.meshgrid(np.arange(shape[1], dtype=np.float32), np.arange(shape[0], dtype=np.float32))
+    out = []
+    for bar in bars:
+        led_x, led_y, led_z = bar.positions().mean(axis=0)
+        away = np.hypot(led_x - x, led_y - y)
+        unit_x, unit_y = (led_x - x) / away, (led_y - y) / away
+        looks = [
+            (
+                (columns + reach / steps[0] * unit_x).astype(np.float32),
+                (rows + reach / steps[1] * unit_y).astype(np.float32),
+                (reach * led_z / away).astype(np.float32),
+            )
+            for reach in _REACHES_MM
+        ]
+        out.append(looks)
+    return tuple(out)

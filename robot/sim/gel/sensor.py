@@ -1,0 +1,250 @@
+"""The simulated gel sensor: a displacement map in, the picture that its camera takes out.
+
+    sensor = draw_sensor(seed=3, finger="a")
+    before = sensor.background(seed=1)
+    during = sensor.render(contact.displacement_mm, seed=2)
+
+A sensor is what was built: its gel, its lamps, its dust. Pictures of one sensor differ by the surface and, through
+their seed, by the camera's noise alone.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import RobotConfigError, UnknownName
+from robot.gel_settings import GelSettings
+from robot.sim.contact.layer import Layer
+from robot.sim.gel.fitted_optics import load_fitted
+from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
+from robot.sim.gel.optics import MINI_BARS, MINI_GLOWS, Bar, Glow, LedOptics, Optics, Triple
+from robot.sim.gel.surface import Array, Field, Surface
+
+Picture = NDArray[np.uint8]
+
+MODULUS_MPA = (0.2, 0.8)
+POISSON = (0.45, 0.49)
+THICKNESS_MM = (2.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The camera's noise in grey levels: variance = read^2 + shot * grey level."""
+
+    read: float = 0.8
+    shot: float = 0.006
+
+
+_PLAIN_LED, _PLAIN_NOISE, _ANY_GEL = LedOptics(), Noise(), GelSettings()
+
+
+@dataclass(frozen=True)
+class GelSensor:
+    """One gel with its lamps and camera; frozen, hashable, and the same whenever it is drawn again.
+
+    `tint` and `exposure` scale the channels, `blur_px` is the camera's point spread (standard deviation).
+    Raises RobotConfigError for settings out of range.
+    """
+
+    layer: Layer
+    optics: Optics = _PLAIN_LED
+    rows: int = 240
+    cols: int = 320
+    pixel_mm: float = 0.0634
+    tint: Triple = (1.0, 1.0, 1.0)
+    exposure: float = 1.0
+    blur_px: float = 0.7
+    noise: Noise = _PLAIN_NOISE
+    flaws: Flaws | None = None
+    markers: Markers | None = None
+
+    def __post_init__(self) -> None:
+        Field(self.rows, self.cols, self.pixel_mm)
+        factors = (*self.tint, self.exposure)
+        if not all(0 < factor < math.inf for factor in factors) or not 0 <= self.blur_px < math.inf:
+            raise RobotConfigError(f"tint and exposure must be above 0 and blur_px 0 or more, got {self}")
+        if not (0 <= self.noise.read < math.inf and 0 <= self.noise.shot < math.inf):
+            raise RobotConfigError(f"noise must be 0 or more grey levels, got {self.noise}")
+
+    @property
+    def gel(self) -> GelSettings:
+        """What the gel is made of."""
+        return GelSettings(self.layer.thickness_mm, self.layer.modulus_mpa, self.layer.poisson)
+
+    @property
+    def field(self) -> Field:
+        """The part of the gel that the camera sees."""
+        return Field(self.rows, self.cols, self.pixel_mm)
+
+    @property
+    def field_mm(self) -> tuple[float, float]:
+        """(height, width) of the field in mm."""
+        return self.field.size_mm
+
+    def background(self, seed: int) -> Picture:
+        """The untouched gel: (rows, cols, 3) uint8 RGB; the same as render() of no displacement."""
+        return self._exposed(_untouched(self), seed)
+
+    def render(self, displacement_mm: NDArray[Any], seed: int) -> Picture:
+        """The picture of a pressed gel: (rows, cols, 3) uint8 RGB.
+
+        `displacement_mm`: (r, c), inwards, on any grid that covers the field. `seed` makes the noise alone.
+        Raises SceneError for a map that is empty, has another number of axes, or is not finite.
+        """
+        surface = Surface(displacement_mm, self.field)
+        if not surface.displacement_mm.any():
+            return self._exposed(_untouched(self), seed)
+        return self._exposed(self._clean(surface), seed)
+
+    def _clean(self, surface: Surface) -> Array:
+        """Grey levels (rows, cols, 3) before noise and clipping."""
+        slope_x, slope_y = surface.slopes
+        dark: Array | None = None
+        if self.flaws is not None:
+            maps = flaw_maps(self.flaws, self.field)
+            slope_x, slope_y, dark = slope_x + maps.slope_x, slope_y + maps.slope_y, maps.darkening
+        image = self.optics.colours(surface, (slope_x, slope_y))
+        if self.markers is not None:
+            printed = marker_darkening(self.markers, surface)
+            dark = printed if dark is None else dark * printed
+        if dark is not None:
+            image *= dark[..., None]
+        image *= np.array(self.tint, np.float32) * np.float32(self.exposure)
+        return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
+
+    def _exposed(self, clean: Array, seed: int) -> Picture:
+        """With noise, rounded and clipped to 0..255."""
+        if self.noise.read == 0 and self.noise.shot == 0:
+            return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
+        spread = np.maximum(clean, 0) * np.float32(self.noise.shot)
+        spread += np.float32(self.noise.read**2)
+        cv2.sqrt(spread, dst=spread)
+        spread *= _noise_tile(self.rows, self.cols, seed)
+        out: Picture = cv2.add(clean, spread, dtype=cv2.CV_8U)
+        return out
+
+
+@lru_cache(maxsize=8)
+def _untouched(sensor: GelSensor) -> Array:
+    return sensor._clean(Surface(np.zeros((1, 1)), sensor.field))
+
+
+_TILE_MARGIN = 64
+
+
+@lru_cache(maxsize=2)
+def _tile(rows: int, cols: int) -> Array:
+    shape = (rows + _TILE_MARGIN, cols + _TILE_MARGIN, 3)
+    return np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
+
+
+def _noise_tile(rows: int, cols: int, seed: int) -> Array:
+    """Standard normal noise (rows, cols, 3): a window of one large tile, placed and turned by the seed.
+
+    Drawing each value anew costs more than the optics; 64 x 64 places, mirrored and of either sign, do not repeat
+    in any picture a person or a tower compares.
+    """
+    rng = np.random.default_rng([seed, 0x7015E])
+    down, right = (int(value) for value in rng.integers(0, _TILE_MARGIN, 2))
+    flip_rows, flip_cols, sign = (1 if value else -1 for value in rng.integers(0, 2, 3))
+    window = _tile(rows, cols)[down : down + rows, right : right + cols][::flip_rows, ::flip_cols]
+    return window * np.float32(sign)
+
+
+# Drawing sensors -------------------------------------------------------------------------------------------
+
+
+def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _ANY_GEL) -> GelSensor:
+    """A sensor as one comes from the factory, and after some use: its own gel, lamps, tint and dust.
+
+    The same seed, finger and optics give the same sensor. `optics`: led, or the name of a fitted sensor. `gel`: what
+    is not to be drawn; all else is drawn as without it.
+    Raises UnknownName for other optics and RobotConfigError for an empty finger.
+    """
+    if optics not in OPTICS:
+        raise UnknownName(f"no optics is called {optics!r}; known are {', '.join(sorted(OPTICS))}")
+    if not finger:
+        raise RobotConfigError("a finger must have a name, got an empty one; use a or b")
+    rng = np.random.default_rng([seed, *finger.encode(), 0x6E1])
+    layer = Layer(
+        modulus_mpa=float(np.exp(rng.uniform(*np.log(MODULUS_MPA)))),
+        poisson=float(rng.uniform(*POISSON)),
+        thickness_mm=float(rng.uniform(*THICKNESS_MM)),
+    )
+    sensor = GelSensor(
+        replace(layer, **gel.known()),
+        tint=_triple(1 + 0.02 * rng.standard_normal(3)),
+        exposure=float(rng.uniform(0.9, 1.12)),
+        blur_px=float(rng.uniform(0.5, 0.9)),
+        noise=Noise(float(rng.uniform(0.6, 1.1)), float(rng.uniform(0.003, 0.012))),
+        flaws=_draw_flaws(rng),
+    )
+    return replace(sensor, optics=OPTICS[optics](rng))
+
+
+def _triple(values: Any) -> Triple:
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
+
+
+def _draw_flaws(rng: np.random.Generator) -> Flaws:
+    return Flaws(
+        seed=int(rng.integers(1 << 31)),
+        specks=int(rng.poisson(12)),
+        hairs=int(rng.poisson(2.5)),
+        grains=int(rng.poisson(20)),
+        texture=float(rng.uniform(0.003, 0.01)),
+    )
+
+
+def _draw_led(rng: np.random.Generator) -> LedOptics:
+    """Lamps a little askew (5 degrees, a millimetre) and of unequal power (4 %)."""
+    power = np.exp(0.04 * rng.standard_normal(3))
+    bars = tuple(_draw_bar(bar, rng) for bar in MINI_BARS)
+    glows = tuple(_draw_glow(glow, float(gain), rng) for glow, gain in zip(MINI_GLOWS, power, strict=True))
+    return LedOptics(
+        bars,  # type: ignore[arg-type]
+        glows,  # type: ignore[arg-type]
+        ambient=float(rng.uniform(0.33, 0.43)),
+        shadow=float(rng.uniform(0.15, 0.35)),
+    )
+
+
+def _draw_bar(bar: Bar, rng: np.random.Generator) -> Bar:
+    turn, out, up = rng.standard_normal(3) * (math.radians(5), 0.8, 0.35)
+    return replace(
+        bar,
+        angle_rad=float(bar.angle_rad + turn),
+        distance_mm=float(max(11.0, bar.distance_mm + out)),
+        height_mm=float(max(3.0, bar.height_mm + up)),
+        order=float(rng.uniform(0.7, 1.5)),
+    )
+
+
+def _draw_glow(glow: Glow, gain: float, rng: np.random.Generator) -> Glow:
+    """The same glow by a lamp of `gain` times the power, moved, wider or narrower, and slanted a little."""
+    x, y, slant_x, slant_y = rng.standard_normal(4) * (0.05, 0.05, 2.5, 2.5)
+    wide = np.exp(0.06 * rng.standard_normal(2))
+    return Glow(
+        glow.floor * gain,
+        glow.span * gain,
+        float(glow.x0 + x),
+        float(glow.y0 + y),
+        float(glow.width_x * wide[0]),
+        float(glow.width_y * wide[1]),
+        float(glow.slant_x + slant_x),
+        float(glow.slant_y + slant_y),
+    )
+
+
+OPTICS: dict[str, Callable[[np.random.Generator], Optics]] = {
+    "led": _draw_led,
+    "gelsight": lambda _: load_fitted("gelsight"),
+    "gelsight_mini": lambda _: load_fitted("gelsight_mini"),
+}

@@ -1,0 +1,79 @@
+"""Objects of the simulated rig: `draw_object(seed, index)` gives the same one wherever it is called.
+
+Four separate streams of numbers draw the shape, the relief, the material and the looks, so that neither colour nor
+paint says anything about what touch can feel. Families and reliefs are dealt like cards: within one deck (as many
+objects as there are families) each comes once, in an order of its own.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from robot.errors import RobotConfigError, UnknownName
+from robot.sim.objects.body import Body, SdfBody
+from robot.sim.objects.looks import Looks, draw_looks
+from robot.sim.objects.materials import Material, draw_material
+from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
+from robot.sim.objects.shapes import SHAPES
+
+STROKE_MM = 110.0  # of the simulated gripper, into which every object fits
+SHELL_MM = 3.0
+HEAVY_KG = 0.6
+# Streams of random numbers; a new purpose takes a new number, and no other object changes.
+_SHAPE, _RELIEF, _MATERIAL, _LOOKS, _FAMILY_DECK, _RELIEF_DECK = range(6)
+
+
+@dataclass(frozen=True)
+class SimObject:
+    """A thing on the table. `relief.amplitude_mm` is 0 for a smooth one."""
+
+    object_id: str
+    family: str
+    relief: Relief
+    material: Material
+    looks: Looks
+    body: Body = field(repr=False)
+
+    @cached_property
+    def mass_kg(self) -> float:
+        """Solid while that weighs at most 0.6 kg; beyond, hollow with a wall of 3 mm, as bottles and castings are."""
+        solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
+        return solid if solid <= HEAVY_KG else min(solid, shell)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "mass_kg"}
+
+
+def draw_object(seed: int, index: int, *, family: str | None = None, relief: str | None = None) -> SimObject:
+    """Object `index` of the world `seed`; `family` and `relief` can be fixed.
+
+    A pure function of its arguments, cheap until the body is used. Raises UnknownName, RobotConfigError.
+    """
+    for name, value in (("seed", seed), ("index", index)):
+        if not isinstance(value, int | np.integer) or value < 0:
+            raise RobotConfigError(f"{name} must be a whole number from 0, got {value!r}")
+    chosen = _dealt(SHAPES, family, "family", seed, index, _FAMILY_DECK)
+    worn = _dealt(RELIEFS, relief, "relief", seed, index, _RELIEF_DECK)
+    shape = SHAPES[chosen](np.random.default_rng([seed, index, _SHAPE]))
+    pattern = draw_relief(worn, np.random.default_rng([seed, index, _RELIEF]), shape.relief_limit_mm)
+    return SimObject(
+        object_id=f"{chosen}-{worn}-{seed:04d}-{index:05d}",
+        family=chosen,
+        relief=pattern,
+        material=draw_material(np.random.default_rng([seed, index, _MATERIAL])),
+        looks=draw_looks(np.random.default_rng([seed, index, _LOOKS])),
+        body=SdfBody(shape, pattern),
+    )
+
+
+def _dealt(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
+    """The name asked for, or the next card of the deck."""
+    if name is None:
+        deck, place = divmod(index, len(table))
+        return list(table)[int(np.random.default_rng([seed, deck, stream]).permutation(len(table))[place])]
+    if name not in table:
+        raise UnknownName(f"{what} must be one of {', '.join(table)}; got {name!r}")
+    return name

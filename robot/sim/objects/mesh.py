@@ -1,0 +1,374 @@
+"""Scanned or drawn meshes (STL, OBJ, PLY) as objects of the simulated rig; needs the extra `touch-retrieval[mesh]`.
+
+Scans are too coarse for a gel (a triangle of a scanned can is some mm wide), so that a mesh wears procedural relief
+like any other object: the hit is moved along the ray by the height of the relief over the cosine of the angle. Only
+geometry is read: no materials, textures, or files that a mesh names.
+"""
+
+import io
+import re
+import zlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from robot.errors import SceneError
+from robot.sim.objects.body import Body, Rays, Vectors
+from robot.sim.objects.draw import STROKE_MM, SimObject
+from robot.sim.objects.looks import draw_looks
+from robot.sim.objects.materials import draw_material
+from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
+from robot.sim.objects.shapes.base import Cylindrical, Floats, relief_limit
+from robot.sim.objects.wall import Wall, bake_plain, ends_weight, smoothstep
+
+FORMATS = ("stl", "obj", "ply")
+TALLEST_MM = 300.0
+THINNEST_MM = 2.0
+_METRES_BELOW = 2.0
+_CREASE_COSINE = 0.77
+_BACK_MM = 1.0
+_UP = {"z": (0, 1, 2), "y": (0, 2, 1)}
+Faces = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A closed surface in mm, its faces counter-clockwise from outside: vertices (V, 3), faces (F, 3)."""
+
+    vertices: Vectors
+    faces: Faces
+
+    @cached_property
+    def corners(self) -> Vectors:
+        """Corners of the faces, (F, 3, 3)."""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def face_normals(self) -> Vectors:
+        """Unit normals of the faces, (F, 3)."""
+        return np.asarray(self._crosses / np.maximum(np.linalg.norm(self._crosses, axis=1, keepdims=True), 1e-300))
+
+    @cached_property
+    def _crosses(self) -> Vectors:
+        a, b, c = self.corners.transpose(1, 0, 2)
+        return np.cross(b - a, c - a)
+
+    @cached_property
+    def corner_normals(self) -> Vectors:
+        """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own beside a crease.
+
+        Faces count by their angle at the vertex (Thuermer and Wuethrich 1998), so that how a flat side was cut
+        into triangles does not matter.
+        """
+        total = np.zeros_like(self.vertices)
+        for corner in range(3):
+            a, b, c = (self.corners[:, (corner + turn) % 3] for turn in range(3))
+            wide = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            angle = np.arctan2(wide, np.einsum("ij,ij->i", b - a, c - a))
+            np.add.at(total, self.faces[:, corner], angle[:, None] * self.face_normals)
+        total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+        shared, own = total[self.faces], self.face_normals[:, None, :]
+        calm = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
+        return np.where(calm, shared, own)
+
+    @cached_property
+    def areas(self) -> Vectors:
+        """Areas of the faces in mm2."""
+        return np.asarray(np.linalg.norm(self._crosses, axis=1) / 2)
+
+    @cached_property
+    def volume_mm3(self) -> float:
+        """Signed volume, by the divergence theorem: positive if the faces look outwards."""
+        a, b, c = (self.corners - self.vertices.mean(axis=0)).transpose(1, 0, 2)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+    def normals_at(self, face: Faces, points: Vectors) -> Vectors:
+        """Normals mixed from the corners', at points (N, 3) on the faces."""
+        a, b, c = self.corners[face].transpose(1, 0, 2)
+        whole = self._crosses[face]
+        square = np.maximum(np.einsum("ij,ij->i", whole, whole), 1e-300)
+        v = np.einsum("ij,ij->i", np.cross(points - a, c - a), whole) / square
+        w = np.einsum("ij,ij->i", np.cross(b - a, points - a), whole) / square
+        share = np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
+        mixed = np.einsum("ij,ijk->ik", share, self.corner_normals[face])
+        return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300))
+
+
+class MeshBody(Body):
+    """A mesh under relief. A ray that starts inside hits at 0; relief does not widen the outline."""
+
+    def __init__(self, mesh: Mesh, relief: Relief) -> None:
+        self.mesh, self.relief = mesh, relief
+        out = 0.0 if relief.engraved else relief.amplitude_mm
+        outwards = np.array([out, out, 0.0])
+        self.lower, self.upper = mesh.vertices.min(axis=0) - outwards, mesh.vertices.max(axis=0) + outwards
+        radius = float(np.mean(self.upper[:2] - self.lower[:2])) / 2
+        self.chart = Cylindrical(radius, float(self.upper[2]))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_caster", "_samples")}
+
+    @cached_property
+    def wall(self) -> Wall | None:
+        """The relief on a cylinder round the mesh."""
+        return bake_plain(self.chart, self.relief)
+
+    @cached_property
+    def _caster(self) -> Any:
+        """Embree's tree over the faces; it casts on one thread."""
+        trimesh, intersector = _packages()
+        return intersector(trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False))
+
+    @cached_property
+    def _samples(self) -> tuple[cKDTree, Vectors, Vectors]:
+        """Points about 1 mm apart on the surface, and the normals of their faces."""
+        count = int(np.clip(self.mesh.areas.sum(), 4000, 60000))
+        rng = np.random.default_rng(5)
+        ends = np.cumsum(self.mesh.areas)
+        face = np.minimum(np.searchsorted(ends, rng.uniform(0, ends[-1], count)), len(ends) - 1)
+        share = rng.dirichlet(np.ones(3), count)
+        places = np.einsum("ij,ijk->ik", share, self.mesh.corners[face])
+        return cKDTree(places), places, self.mesh.face_normals[face]
+
+    def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
+        """Exact volume; the shell's is area times thickness, at most the whole."""
+        return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
+
+    def _cast(self, rays: Rays) -> Vectors:
+        # A face that lies in the bounding box would be missed by rays that start on it.
+        back = np.minimum(rays.near_mm, _BACK_MM)
+        face, distance = self._first(rays.origins - back[:, None] * rays.directions, rays.directions)
+        hit = np.flatnonzero(face >= 0)
+        result = np.full(len(back), np.inf)
+        result[hit] = distance - back[hit]
+        cosine = -np.einsum("ij,ij->i", rays.directions[hit], self.mesh.face_normals[face[hit]])
+        outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (back[hit] == 0)]
+        result[inside] = 0.0
+        result[outside] -= self._lift(face[outside], rays, outside, result[outside])
+        return np.asarray(np.maximum(result, 0.0))
+
+    def _first(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
+        """First face along each ray (-1: none), and for those with one the distance to its plane, in float64."""
+        face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
+        hit = face >= 0
+        normal, corner = self.mesh.face_normals[face[hit]], self.mesh.corners[face[hit], 0]
+        speed = np.einsum("ij,ij->i", directions[hit], normal)
+        offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
+        return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
+
+    def _lift(self, face: Faces, rays: Rays, chosen: Faces, distance: Vectors) -> Vectors:
+        """How much earlier (or, engraved, later) rays meet the relief than the mesh."""
+        if self.wall is None:
+            return np.zeros(len(face))
+        origins, directions = rays.origins[chosen], rays.directions[chosen]
+        normals = self.mesh.normals_at(face, origins + distance[:, None] * directions)
+        cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
+        lift = np.zeros(len(face))
+        # Twice, as where the ray meets the relief is not above where it meets the mesh.
+        for _ in range(2):
+            points = origins + (distance - lift)[:, None] * directions
+            lift = self._height(points, normals, rays.step_mm) / cosine
+        return lift
+
+    def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:
+        """Relief in mm, faded where the surface turns away from the cylinder and at foot and top."""
+        assert self.wall is not None
+        x, y, z = np.ascontiguousarray(points.T, np.float32)
+        height: Floats = self.wall.level(step_mm).at(*self.chart.locate(x, y, z))
+        radius = np.maximum(np.hypot(x, y), 1e-6)
+        facing = (x * normals[:, 0] + y * normals[:, 1]) / radius
+        weight = smoothstep(facing, 0.3, 0.75) * np.clip(2.2 * radius / self.chart.radius_mm - 0.2, 0, 1)
+        fade = max(1.5, 0.8 * self.relief.amplitude_mm)
+        return np.asarray(height * weight * ends_weight(z, self.chart.height_mm, fade), np.float64)
+
+    def _normals(self, points: Vectors, step_mm: float) -> Vectors:
+        """The mesh's normal n, tilted by the relief: n - (grad h - n (n . grad h))."""
+        normals = self._bare_normals(points)
+        if self.wall is None:
+            return normals
+        sides = np.eye(3) * step_mm / 2
+        columns = [
+            self._height(points + s, normals, step_mm) - self._height(points - s, normals, step_mm) for s in sides
+        ]
+        gradient = np.stack(columns, axis=1) / step_mm
+        return np.asarray(normals - gradient + normals * np.einsum("ij,ij->i", gradient, normals)[:, None])
+
+    def _bare_normals(self, points: Vectors) -> Vectors:
+        """Smoothed normals of the faces under the points, found from just outside."""
+        guess = self._guess(points)
+        reach = self.relief.amplitude_mm + 2 * _BACK_MM
+        face, distance = self._first(points + reach * guess, -guess)
+        found = np.flatnonzero(face >= 0)
+        depth = reach - distance
+        near = np.abs(depth) < reach
+        face, found, depth = face[found][near], found[near], depth[near]
+        place = points[found] + depth[:, None] * guess[found]
+        guess[found] = self.mesh.normals_at(face, place)
+        return guess
+
+    def _guess(self, points: Vectors) -> Vectors:
+        """Normal of the nearest sample that does not have the point behind it, as the far side of a thin wall has."""
+        tree, places, normals = self._samples
+        apart, nearest = tree.query(points, k=6)
+        behind = -np.einsum("nkj,nkj->nk", points[:, None, :] - places[nearest], normals[nearest])
+        allowed = self.relief.amplitude_mm if self.relief.engraved else 0.0
+        best = np.argmin(apart + 4 * np.maximum(behind - allowed, 0), axis=1)
+        return np.asarray(normals[nearest[np.arange(len(points)), best]])
+
+
+# Reading -----------------------------------------------------------------------------------------------------
+
+
+def load_mesh_object(
+    path: str | Path,
+    seed: int,
+    *,
+    relief: str | None = None,
+    material: str | None = None,
+    scale_to_mm: float | None = None,
+    up: str = "z",
+) -> SimObject:
+    """Read a mesh, stand it on the table and give it relief, material and looks drawn from `seed` and its name.
+
+    `scale_to_mm`: mm per unit of the file. None: 1000 (metres) if its largest extent is below 2 units, else 1 (mm).
+    `up`: the file's upward axis, "z" or "y". Raises SceneError for a file that is no closed solid of a size that
+    the gripper (110 mm) can close on, UnknownName, and SceneError naming the extra where its packages are missing.
+    """
+    file = Path(path)
+    mesh = _stand(_read(file), file, scale_to_mm, up)
+    stream = [seed, zlib.crc32(file.stem.encode())]
+    worn = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
+    limit = relief_limit(min(_narrowest(mesh.vertices), 94.0), 3.0)
+    pattern = draw_relief(worn, np.random.default_rng([*stream, 1]), limit)
+    return SimObject(
+        object_id=f"{object_prefix(file)}{worn}-{seed:04d}",
+        family="mesh",
+        relief=pattern,
+        material=draw_material(np.random.default_rng([*stream, 2]), material),
+        looks=draw_looks(np.random.default_rng([*stream, 3])),
+        body=MeshBody(mesh, pattern),
+    )
+
+
+def object_prefix(file: Path) -> str:
+    """What the object_id of this file's object begins with."""
+    return f"mesh.{re.sub(r'[^A-Za-z0-9._]+', '_', file.stem)}-"
+
+
+def _packages() -> tuple[Any, Any]:
+    """trimesh and its ray caster on embree. Raises SceneError where one is missing."""
+    try:
+        import trimesh
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+    except ImportError as error:
+        raise SceneError(
+            f"meshes need trimesh and embreex, and {error.name or error} is missing; "
+            "run pip install 'touch-retrieval[mesh]'"
+        ) from error
+    return trimesh, RayMeshIntersector
+
+
+def _read(file: Path) -> Mesh:
+    """Vertices and faces of the file, equal vertices merged, faces without area dropped. Raises SceneError."""
+    kind = file.suffix.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise SceneError(f"a mesh must be a file of {', '.join(FORMATS)}, got {file.name!r}")
+    trimesh, _ = _packages()
+    try:
+        data = file.read_bytes()
+        # From memory and without a resolver: the reader cannot open what the file names.
+        loaded = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True)
+        vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
+    except OSError as error:
+        raise SceneError(f"{file} cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # a damaged file raises whatever the parser stumbles over
+        reason = "it is neither whole nor text" if isinstance(error, ImportError) else error  # a guesser of encodings
+        raise SceneError(f"{file} must be a mesh in {kind.upper()}, and cannot be read as one: {reason}") from error
+    _check_arrays(file, vertices, faces)
+    return _merged(vertices, faces)
+
+
+def _check_arrays(file: Path, vertices: Vectors, faces: Faces) -> None:
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or vertices.ndim != 2:
+        raise SceneError(f"{file} must hold triangles, and holds none; export the surface, not points or curves")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneError(f"{file} has faces of vertices that it does not have; export it again")
+    if not np.isfinite(vertices[faces]).all():
+        raise SceneError(f"{file} must have finite vertices, and some are NaN or infinite; export it again")
+
+
+def _merged(vertices: Vectors, faces: Faces) -> Mesh:
+    """One vertex for each place, and no face that has lost its area by that."""
+    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
+    _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
+    faces = number.reshape(-1)[faces]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return Mesh(vertices[first], faces[whole])
+
+
+def _stand(mesh: Mesh, file: Path, scale_to_mm: float | None, up: str) -> Mesh:
+    """The mesh in mm, foot on z = 0, centred, faces outwards, after all checks. Raises SceneError."""
+    if up not in _UP:
+        raise SceneError(f'the upward axis must be "z" or "y", got {up!r}')
+    if scale_to_mm is not None and not (np.isfinite(scale_to_mm) and scale_to_mm > 0):
+        raise SceneError(f"scale_to_mm must be a positive number of mm per unit, got {scale_to_mm!r}")
+    _check_closed(mesh, file)
+    extents = np.ptp(mesh.vertices, axis=0)
+    scale = (1000.0 if extents.max() < _METRES_BELOW else 1.0) if scale_to_mm is None else scale_to_mm
+    vertices = mesh.vertices[:, _UP[up]] * scale * ([1, -1, 1] if up == "y" else [1, 1, 1])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices = vertices - [*(low + high)[:2] / 2, low[2]]
+    _check_size(vertices, file, scale)
+    standing = Mesh(vertices, mesh.faces)
+    if standing.volume_mm3 < 0:
+        standing = Mesh(vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
+    if standing.volume_mm3 < 1.0:
+        raise SceneError(f"{file} must enclose a volume, got {standing.volume_mm3:g} mm3; is it a flat surface?")
+    return standing
+
+
+def _check_closed(mesh: Mesh, file: Path) -> None:
+    """Each edge must lie between an even number of faces, half of which run along it and half against it."""
+    if not len(mesh.faces):
+        raise SceneError(f"{file} must hold triangles with an area, and holds none")
+    edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, number, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    if opened := int((counts % 2).sum()):
+        raise SceneError(
+            f"{file} must be a closed surface, and {opened} edges lie beside a hole; close it first, for example "
+            "with trimesh.repair.fill_holes, the 3D print tools of Blender or MeshLab's Close Holes"
+        )
+    balance = np.bincount(number.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    if balance.any():
+        raise SceneError(f"{file} must have all faces turned outwards; set them right with trimesh.repair.fix_normals")
+
+
+def _check_size(vertices: Vectors, file: Path, scale: float) -> None:
+    hint = f"at {scale:g} mm a unit; give scale_to_mm if the file is in other units"
+    extents = np.ptp(vertices, axis=0)
+    if extents.min() < THINNEST_MM:
+        raise SceneError(f"{file} must be at least {THINNEST_MM:g} mm thick, got {extents.min():.3g} mm {hint}")
+    if extents[2] > TALLEST_MM:
+        raise SceneError(f"{file} must be at most {TALLEST_MM:g} mm high, got {extents[2]:.4g} mm {hint}")
+    if (narrow := _narrowest(vertices)) > STROKE_MM:
+        raise SceneError(
+            f"{file} must fit between fingers {STROKE_MM:g} mm apart in some direction, "
+            f"and its narrowest width is {narrow:.4g} mm {hint}"
+        )
+
+
+def _narrowest(vertices: Vectors) -> float:
+    """Smallest horizontal width, over the directions square to the sides of the outline's convex hull."""
+    flat = vertices[:, :2]
+    try:
+        hull = flat[ConvexHull(flat).vertices]
+    except QhullError:
+        return 0.0
+    sides = np.roll(hull, -1, axis=0) - hull
+    across = np.stack([-sides[:, 1], sides[:, 0]], axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
+    return float(np.ptp(hull @ across.T, axis=0).min())

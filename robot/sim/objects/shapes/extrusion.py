@@ -1,0 +1,233 @@
+"""Outlines pulled up from the table: boxes, prisms, ovals; tapered or twisted."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot.sim.objects.shapes.base import (
+    Chart,
+    Floats,
+    Points,
+    Shape,
+    arctan2,
+    bounds,
+    length,
+    relief_limit,
+    rounded,
+    smooth_min,
+)
+
+
+class Outline(ABC):
+    """A flat closed curve round the origin, with a signed distance, extents and an arc length, in mm."""
+
+    reach_x_mm: float
+    reach_y_mm: float
+    radius_mm: float
+    length_mm: float
+
+    @abstractmethod
+    def distance(self, x: Floats, y: Floats) -> Floats:
+        """Signed distance in mm, exact outside."""
+
+    @abstractmethod
+    def locate(self, x: Floats, y: Floats) -> Floats:
+        """Arc length in mm of the curve's point next to (x, y), in [0, length_mm)."""
+
+    @abstractmethod
+    def place(self, s: Floats) -> tuple[Points, Points]:
+        """Points of the curve at arc length s and outward normals there, (N, 2) each."""
+
+
+@dataclass(frozen=True)
+class RoundedRectangle(Outline):
+    """2 half_x by 2 half_y with corners of radius `corner_mm` > 0; an oval when that is the smaller half."""
+
+    half_x_mm: float
+    half_y_mm: float
+    corner_mm: float
+
+    @property
+    def reach_x_mm(self) -> float:  # type: ignore[override]
+        return self.half_x_mm
+
+    @property
+    def reach_y_mm(self) -> float:  # type: ignore[override]
+        return self.half_y_mm
+
+    @property
+    def radius_mm(self) -> float:  # type: ignore[override]
+        return float(np.hypot(*self._inner)) + self.corner_mm
+
+    @property
+    def _inner(self) -> tuple[float, float]:
+        return self.half_x_mm - self.corner_mm, self.half_y_mm - self.corner_mm
+
+    @property
+    def length_mm(self) -> float:  # type: ignore[override]
+        return 4 * sum(self._inner) + 2 * np.pi * self.corner_mm
+
+    def distance(self, x: Floats, y: Floats) -> Floats:
+        return rounded(np.abs(x) - np.float32(self.half_x_mm), np.abs(y) - np.float32(self.half_y_mm), self.corner_mm)
+
+    def locate(self, x: Floats, y: Floats) -> Floats:
+        """From the middle of the back (+y) over the left to the front, so that s grows to the right in front."""
+        a, b = (np.float32(value) for value in self._inner)
+        p, q = np.abs(x) - a, np.abs(y) - b
+        # Deep inside, the nearer face counts: p and q are shifted so that the larger one is an edge's.
+        depth = np.maximum(np.minimum(-p, -q), 0) + np.float32(1e-6)
+        angle = arctan2(np.maximum(p + depth, 0), np.maximum(q + depth, 0))
+        along = np.clip(a + p, 0, a) + angle * np.float32(self.corner_mm) + np.clip(-q, 0, b)
+        quarter = np.float32(self.length_mm / 4)
+        s = np.where(y > 0, along, 2 * quarter - along)
+        return np.asarray(np.where(x > 0, 4 * quarter - s, s))
+
+    def place(self, s: Floats) -> tuple[Points, Points]:
+        a, b = self._inner
+        half = self.length_mm / 2
+        folded = np.where(s > half, 2 * half - s, s)
+        along = np.where(folded > half / 2, half - folded, folded)
+        angle = np.clip((along - a) / self.corner_mm, 0, np.pi / 2)
+        straight = np.clip(along - a - self.corner_mm * np.pi / 2, 0, b)
+        normal = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+        sign = np.stack([np.where(s > half, 1, -1), np.where(folded > half / 2, -1, 1)], axis=1)
+        core = np.stack([np.clip(along, 0, a), b - straight], axis=1)
+        return sign * (core + self.corner_mm * normal), sign * normal
+
+
+@dataclass(frozen=True)
+class Polygon(Outline):
+    """A regular polygon of `sides`, `apothem_mm` from its middle to a face, corners rounded by `corner_mm` > 0."""
+
+    sides: int
+    apothem_mm: float
+    corner_mm: float
+
+    @property
+    def reach_x_mm(self) -> float:  # type: ignore[override]
+        return float((self.apothem_mm - self.corner_mm) / np.cos(np.pi / self.sides) + self.corner_mm)
+
+    @property
+    def reach_y_mm(self) -> float:  # type: ignore[override]
+        return self.reach_x_mm
+
+    @property
+    def radius_mm(self) -> float:  # type: ignore[override]
+        return self.reach_x_mm
+
+    @property
+    def _half(self) -> float:
+        """Half of a face's straight part."""
+        return float((self.apothem_mm - self.corner_mm) * np.tan(np.pi / self.sides))
+
+    @property
+    def length_mm(self) -> float:  # type: ignore[override]
+        return self.sides * 2 * self._half + 2 * np.pi * self.corner_mm
+
+    def _fold(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+        """The face's number, and coordinates along and across it; face 0 looks to the front (-y)."""
+        wedge = np.float32(2 * np.pi / self.sides)
+        face = np.rint(arctan2(x, -y) / wedge)
+        turn = face * wedge
+        sine, cosine = np.sin(turn), np.cos(turn)
+        return face, x * cosine + y * sine, x * sine - y * cosine
+
+    def distance(self, x: Floats, y: Floats) -> Floats:
+        _, u, v = self._fold(x, y)
+        side = np.abs(u) - np.float32(self._half)
+        height = v - np.float32(self.apothem_mm - self.corner_mm)
+        corner = length(np.maximum(side, 0), np.maximum(height, 0))
+        return np.where(height > 0, corner, height) - np.float32(self.corner_mm)
+
+    def locate(self, x: Floats, y: Floats) -> Floats:
+        face, u, v = self._fold(x, y)
+        side = np.abs(u) - np.float32(self._half)
+        height = np.maximum(v - np.float32(self.apothem_mm - self.corner_mm), np.float32(1e-6))
+        bend = np.minimum(arctan2(np.maximum(side, 0), height), np.float32(np.pi / self.sides))
+        along = np.minimum(np.abs(u), np.float32(self._half)) + bend * np.float32(self.corner_mm)
+        s = face * np.float32(self.length_mm / self.sides) + np.copysign(along, u) + np.float32(self.length_mm / 2)
+        return np.where(s < 0, s + np.float32(self.length_mm), s)
+
+    def place(self, s: Floats) -> tuple[Points, Points]:
+        shifted = s - self.length_mm / 2
+        face = np.rint(shifted / (self.length_mm / self.sides))
+        u = shifted - face * (self.length_mm / self.sides)
+        bend = np.sign(u) * np.maximum(np.abs(u) - self._half, 0) / self.corner_mm
+        turn = face * 2 * np.pi / self.sides
+        normal = np.stack([np.sin(turn + bend), -np.cos(turn + bend)], axis=1)
+        along, across = np.clip(u, -self._half, self._half), self.apothem_mm - self.corner_mm
+        core = np.stack(
+            [along * np.cos(turn) + across * np.sin(turn), along * np.sin(turn) - across * np.cos(turn)], axis=1
+        )
+        return core + self.corner_mm * normal, normal
+
+
+class Unrolled(Chart):
+    """s = arc length of an outline, t = z, in the frame of a shape that may shrink and twist with height."""
+
+    def __init__(self, shape: "Extrusion") -> None:
+        self._shape = shape
+        self.width_mm, self.height_mm = shape.outline.length_mm, shape.height_mm
+
+    def locate(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+        u, v, _ = self._shape.straighten(x, y, z)
+        return self._shape.outline.locate(u, v), z
+
+    def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
+        point, normal = self._shape.outline.place(s)
+        start = point * self._shape.scale(t)[:, None] + normal
+        turn = self._shape.twist_per_mm * t
+        sine, cosine = np.sin(turn), np.cos(turn)
+        origins = [start[:, 0] * cosine - start[:, 1] * sine, start[:, 0] * sine + start[:, 1] * cosine, t]
+        inward = [normal[:, 1] * sine - normal[:, 0] * cosine, -normal[:, 0] * sine - normal[:, 1] * cosine, 0 * t]
+        return np.stack(origins, axis=1), np.stack(inward, axis=1)
+
+
+class Extrusion(Shape):
+    """An outline from z = 0 to `height_mm`, upper and lower edges rounded by `rim_mm`.
+
+    `taper`: share by which the outline has shrunk at the top; `twist_rad`: how far it has turned there.
+    """
+
+    def __init__(
+        self, outline: Outline, height_mm: float, *, rim_mm: float = 0.0, taper: float = 0.0, twist_rad: float = 0.0
+    ) -> None:
+        self.outline, self.height_mm, self.rim_mm, self.taper = outline, height_mm, rim_mm, taper
+        self.twist_per_mm = twist_rad / height_mm
+        reach = outline.radius_mm
+        wide = (outline.reach_x_mm, outline.reach_y_mm) if twist_rad == 0 else (reach, reach)
+        self.lower, self.upper = bounds(*wide, height_mm)
+        self.chart = Unrolled(self)
+        self._upright = taper == 0 and twist_rad == 0
+        # How much faster than the point itself the straightened one can move.
+        self._stretch = np.float32(np.hypot(1, reach * taper / height_mm) + reach * abs(self.twist_per_mm))
+        narrow = 2 * min(outline.reach_x_mm, outline.reach_y_mm) * (1 - taper)
+        self.relief_limit_mm = relief_limit(narrow, (95 - 2 * min(wide)) / 2)
+
+    def scale(self, z: Floats) -> Floats:
+        """Size of the outline at height z, relative to the one at the base."""
+        return 1 - np.float32(self.taper / self.height_mm) * np.clip(z, 0, np.float32(self.height_mm))
+
+    def straighten(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats | None]:
+        """Undo twist and taper: coordinates in the outline's plane, and its size there (None: 1)."""
+        if self.twist_per_mm:
+            turn = np.float32(self.twist_per_mm) * np.clip(z, 0, np.float32(self.height_mm))
+            sine, cosine = np.sin(turn), np.cos(turn)
+            x, y = x * cosine + y * sine, y * cosine - x * sine
+        if not self.taper:
+            return x, y, None
+        size = self.scale(z)
+        return x / size, y / size, size
+
+    def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        u, v, size = self.straighten(x, y, z)
+        side = self.outline.distance(u, v)
+        if size is not None:
+            side = side * size
+        half = np.float32(self.height_mm / 2)
+        ends = np.abs(z - half) - half
+        if self._upright:
+            return rounded(side, ends, self.rim_mm)
+        # Leaning sides do not meet the ends at right angles: see Cone.
+        return -smooth_min(-side / self._stretch, -ends, 2 * self.rim_mm)

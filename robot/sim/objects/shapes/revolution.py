@@ -1,0 +1,149 @@
+"""Solids of revolution: parts drawn in the half-plane (r, z), joined with rounded seams."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot.sim.objects.shapes.base import Cylindrical, Floats, Shape, bounds, length, relief_limit, rounded, smooth_min
+
+
+class Part(ABC):
+    """A flat signed distance in the half-plane r >= 0."""
+
+    top_mm: float
+    radius_mm: float
+
+    @abstractmethod
+    def distance(self, r: Floats, z: Floats) -> Floats:
+        """Signed distance in mm."""
+
+
+@dataclass(frozen=True)
+class Drum(Part):
+    """A cylinder from `bottom_mm` to `top_mm` whose edges are rounded by `rim_mm`."""
+
+    radius_mm: float
+    bottom_mm: float
+    top_mm: float
+    rim_mm: float = 0.0
+
+    def distance(self, r: Floats, z: Floats) -> Floats:
+        middle, half = (self.top_mm + self.bottom_mm) / 2, (self.top_mm - self.bottom_mm) / 2
+        return rounded(r - np.float32(self.radius_mm), np.abs(z - np.float32(middle)) - np.float32(half), self.rim_mm)
+
+
+@dataclass(frozen=True)
+class Ball(Part):
+    """A sphere centred on the axis; with `ring_mm`, a torus of that radius lying flat."""
+
+    size_mm: float
+    height_mm: float
+    ring_mm: float = 0.0
+
+    @property
+    def top_mm(self) -> float:  # type: ignore[override]
+        return self.height_mm + self.size_mm
+
+    @property
+    def radius_mm(self) -> float:  # type: ignore[override]
+        return self.ring_mm + self.size_mm
+
+    def distance(self, r: Floats, z: Floats) -> Floats:
+        return length(r - np.float32(self.ring_mm), z - np.float32(self.height_mm)) - np.float32(self.size_mm)
+
+
+@dataclass(frozen=True)
+class Cone(Part):
+    """A frustum: radius `base_mm` at the bottom, `head_mm` at the top; `rim_mm` rounds its edges."""
+
+    base_mm: float
+    head_mm: float
+    bottom_mm: float
+    top_mm: float
+    rim_mm: float = 0.0
+
+    @property
+    def radius_mm(self) -> float:  # type: ignore[override]
+        return max(self.base_mm, self.head_mm)
+
+    def distance(self, r: Floats, z: Floats) -> Floats:
+        half = np.float32((self.top_mm - self.bottom_mm) / 2)
+        height = z - np.float32((self.top_mm + self.bottom_mm) / 2)
+        slope = (self.base_mm - self.head_mm) / (self.top_mm - self.bottom_mm)
+        cosine = np.float32(1 / np.sqrt(1 + slope**2))
+        side = (r - np.float32((self.base_mm + self.head_mm) / 2) + height * np.float32(slope)) * cosine
+        # Side and ends do not meet at right angles: the rounded maximum stays below the distance all the same.
+        return -smooth_min(-side, half - np.abs(height), 2 * self.rim_mm)
+
+
+class Revolution(Shape):
+    """Union of `parts`, seams rounded over `blend_mm`, minus `hollow`; cut flat at z = 0 and at `height_mm`."""
+
+    def __init__(
+        self, parts: tuple[Part, ...], height_mm: float, *, blend_mm: float = 0.0, hollow: Part | None = None
+    ) -> None:
+        self.parts, self.height_mm, self.blend_mm, self.hollow = parts, height_mm, blend_mm, hollow
+        # A blend may bulge by a quarter of its width.
+        self.radius_mm = max(part.radius_mm for part in parts) + blend_mm / 4 * (len(parts) > 1)
+        self.lower, self.upper = bounds(self.radius_mm, self.radius_mm, height_mm)
+        self.chart = Cylindrical(max(part.radius_mm for part in parts), height_mm, self.radius_mm + 1)
+        self.relief_limit_mm = relief_limit(2 * self.radius_mm)
+        if hollow is not None:
+            self.relief_limit_mm = min(self.relief_limit_mm, (self.radius_mm - hollow.radius_mm) / 2)
+            self.mask_slope = 1 / self._mask_width
+        self._cut_top = len(parts) > 1 or parts[0].top_mm > height_mm
+
+    def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        r = length(x, y)
+        distance = self.parts[0].distance(r, z)
+        for part in self.parts[1:]:
+            distance = smooth_min(distance, part.distance(r, z), self.blend_mm)
+        if self.hollow is not None:
+            distance = np.maximum(distance, -self.hollow.distance(r, z))
+        if self._cut_top:
+            distance = np.maximum(distance, z - np.float32(self.height_mm))
+        return np.maximum(distance, -z)
+
+    @property
+    def _mask_width(self) -> float:
+        return 0.6 * (self.radius_mm - self.hollow.radius_mm) if self.hollow is not None else 1.0
+
+    def mask(self, x: Floats, y: Floats, z: Floats) -> Floats | None:
+        if self.hollow is None:
+            return None
+        inner = length(x, y) - np.float32(self.hollow.radius_mm)
+        return np.asarray(np.clip(inner * np.float32(1 / self._mask_width), 0, 1))
+
+
+class Rod(Revolution):
+    """A cylinder with a screw thread cut by `depth_mm` (profile: a trapezoid), and a plain foot of `foot_mm`."""
+
+    def __init__(
+        self, radius_mm: float, height_mm: float, *, pitch_mm: float, depth_mm: float, starts: int, foot: Part
+    ) -> None:
+        super().__init__((Drum(radius_mm, 0, height_mm, rim_mm=min(1.5, radius_mm / 4)), foot), height_mm, blend_mm=1)
+        self.chart = Cylindrical(radius_mm, height_mm, self.radius_mm + 1)
+        self.pitch_mm, self.depth_mm, self.starts, self.foot = pitch_mm, depth_mm, starts, foot
+        self.relief_limit_mm = min(0.25, relief_limit(2 * radius_mm))
+
+    def macro(self, s: Floats, t: Floats) -> Floats | None:
+        phase = t[:, None] / self.pitch_mm - self.starts * s[None, :] / self.chart.width_mm
+        wave = np.abs(2 * (phase - np.floor(phase)) - 1).astype(np.float32)
+        # Flanks of 30 degrees to the radius need half a pitch for the depth of an ISO thread; crests are flat.
+        free = np.clip((t - self.foot.top_mm) / self.pitch_mm, 0, 1).astype(np.float32)
+        return np.asarray(-np.float32(self.depth_mm) * free[:, None] * (1 - np.clip(wave * 1.4 - 0.2, 0, 1)))
+
+
+class Fluted(Revolution):
+    """A cylinder with `count` lobes of `depth_mm` round it, straight or twisted: a knob, a column, a grip."""
+
+    def __init__(self, drum: Drum, *, count: int, depth_mm: float, turns: float = 0.0, sharpness: float = 1.0) -> None:
+        super().__init__((drum,), drum.top_mm)
+        self.count, self.depth_mm, self.turns, self.sharpness = count, depth_mm, turns, sharpness
+        self.relief_limit_mm = min(self.relief_limit_mm, 1.0)
+
+    def macro(self, s: Floats, t: Floats) -> Floats | None:
+        phase = self.count * s[None, :] / self.chart.width_mm + self.turns * t[:, None] / self.height_mm
+        wave = np.abs(np.sin(np.pi * phase)) ** self.sharpness
+        return np.asarray(-self.depth_mm * (1 - wave), np.float32)

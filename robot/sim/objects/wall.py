@@ -1,0 +1,179 @@
+"""The wall of an object, unrolled: its relief baked into height maps from fine to coarse.
+
+A height map is drawn once per object and looked up bilinearly. Where the shape turns away from its chart (rims,
+caps, poles, the far side of a handle) relief fades out, so that it never tears at an edge.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.sim.objects.relief import Relief, Sheet
+from robot.sim.objects.shapes.base import Chart, Floats, Points, Shape
+
+FINEST_MM = 0.14
+_MOST_NODES = 1.2e6
+_LEVELS = 4
+_CELL_MM = 1.5
+_REMAP_LIMIT = 32000  # cv2 counts pixels of a row in 16 bits
+
+
+@dataclass(frozen=True)
+class Level:
+    """One height map in mm, with its highest point and how fast relief can change with place (mm per mm)."""
+
+    height_mm: Floats
+    per_s: float
+    per_t: float
+    highest_mm: float
+    slope: float
+    pixel_mm: float
+
+    def at(self, s: Floats, t: Floats) -> Floats:
+        """Heights at map coordinates in mm, (N,) each."""
+        u, v = s * np.float32(self.per_s), t * np.float32(self.per_t)
+        parts = [slice(start, start + _REMAP_LIMIT) for start in range(0, len(u), _REMAP_LIMIT)]
+        heights = [
+            cv2.remap(self.height_mm, u[None, part], v[None, part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for part in parts
+        ]
+        return np.concatenate(heights, axis=1)[0] if heights else u
+
+
+@dataclass(frozen=True)
+class Wall:
+    """The baked relief of a shape, in levels of halved resolution."""
+
+    levels: tuple[Level, ...]
+
+    def level(self, step_mm: float) -> Level:
+        """The coarsest level whose pixels are not wider than `step_mm` (or the finest)."""
+        fitting = [level for level in self.levels if level.pixel_mm <= step_mm]
+        return fitting[-1] if fitting else self.levels[0]
+
+
+def bake(shape: Shape, relief: Relief) -> Wall | None:
+    """Draw relief and the shape's own pattern on its wall; None for a bare shape."""
+    sheet = _sheet(shape.chart)
+    height, macro = relief.height(sheet), shape.macro(sheet.s, sheet.t)
+    if height is None and macro is None:
+        return None
+    weight, stretch = _fit(shape, sheet, relief.amplitude_mm)
+    total = np.asarray(sum(part for part in (height, macro) if part is not None) * weight, np.float32)
+    return Wall(tuple(_levels(total, sheet, stretch, shape.mask_slope)))
+
+
+def bake_plain(chart: Chart, relief: Relief) -> Wall | None:
+    """Relief alone, everywhere; None for a smooth one."""
+    sheet = _sheet(chart)
+    height = relief.height(sheet)
+    return None if height is None else Wall(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))
+
+
+def _sheet(chart: Chart) -> Sheet:
+    """Nodes for a wall; columns and rows can be halved `_LEVELS` times."""
+    width, height = chart.width_mm, chart.height_mm
+    pixel = max(FINEST_MM, np.sqrt(width * height / _MOST_NODES))
+    block = 2 ** (_LEVELS - 1)
+    return Sheet(
+        width, height, block * int(np.ceil(height / pixel / block)) + 1, block * int(np.ceil(width / pixel / block))
+    )
+
+
+def _levels(height: Floats, sheet: Sheet, stretch: Floats, mask_slope: float) -> list[Level]:
+    levels = []
+    for number in range(_LEVELS):
+        if number:
+            height = np.ascontiguousarray(_halved(height))
+        rows, columns = height.shape
+        per_s, per_t = columns / sheet.width_mm, (rows - 1) / sheet.height_mm
+        padded = np.concatenate([height, height[:, :2]], axis=1)
+        slope = _steepest(padded, per_s, per_t, stretch) + mask_slope * float(np.abs(height).max())
+        levels.append(Level(padded, per_s, per_t, float(height.max()), slope, max(1 / per_s, 1 / per_t)))
+    return levels
+
+
+def _halved(height: Floats) -> Floats:
+    """Every other node after a binomial blur; the blur is periodic along s and keeps the ends of t."""
+    wide = cv2.copyMakeBorder(height, 0, 0, 2, 2, cv2.BORDER_WRAP)
+    kernel = np.array([1, 4, 6, 4, 1], np.float32) / 16
+    return np.asarray(cv2.sepFilter2D(wide, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)[::2, 2:-2:2])
+
+
+def _steepest(padded: Floats, per_s: float, per_t: float, stretch: Floats) -> float:
+    """The largest slope of the bilinear surface, measured on the object and not on the map."""
+    across = np.abs(np.diff(padded, axis=1)).max(axis=1) * per_s
+    rows = np.linspace(0, len(stretch) - 1, len(across)).round().astype(int)
+    along = np.abs(np.diff(padded, axis=0)).max() * per_t
+    return float(np.hypot((across * stretch[rows]).max(), along))
+
+
+# Where relief belongs ----------------------------------------------------------------------------------------
+
+
+def _fit(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Floats, Floats]:
+    """Weight of relief at each node (rows, columns), and how much the map is stretched, by coarse row.
+
+    The wall is looked at from outside, along the chart's rays, on a coarse grid.
+    """
+    rows = max(int(sheet.height_mm / _CELL_MM), 12) + 1
+    columns = max(int(sheet.width_mm / _CELL_MM), 24)
+    coarse = Sheet(sheet.width_mm, sheet.height_mm, rows, columns)
+    s, t = np.meshgrid(coarse.s, coarse.t)
+    points, hit, facing, gain = _look(shape, s.ravel(), t.ravel())
+    place = np.where(hit[:, None], points, np.nan).reshape(rows, columns, 3)
+    step = np.linalg.norm(np.roll(place, -1, axis=1) - np.roll(place, 1, axis=1), axis=2) / (2 * coarse.pixel_mm[1])
+    room = np.nan_to_num(step, nan=0.0).clip(0.05, 1)
+    weight = (smoothstep(facing, 0.35, 0.8) * gain).reshape(rows, columns) * np.clip(2.2 * room - 0.2, 0, 1)
+    weight *= ends_weight(coarse.t, coarse.height_mm, max(1.5, 0.8 * amplitude_mm))[:, None]
+    used = np.where(weight > 0.02, room, 1).min(axis=1)
+    return _spread(weight.astype(np.float32), coarse, sheet, amplitude_mm), np.asarray(1 / used, np.float32)
+
+
+def _look(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArray[np.bool_], Points, Points]:
+    """What the chart's rays meet: points, hits, cosine to the ray, and the distance's own slope there."""
+    origins, directions = shape.chart.rays(s, t)
+    p, d = origins.astype(np.float32), directions.astype(np.float32)
+    far, travelled = np.float32(np.linalg.norm(shape.upper - shape.lower) + 4), np.zeros(len(p), np.float32)
+    for _ in range(48):
+        step = shape.distance(p)
+        travelled += step
+        p = p + step[:, None] * d
+        if not ((step > 0.02) & (travelled < far)).any():
+            break
+    hit = (np.abs(shape.distance(p)) < 0.1) & (travelled < far)
+    gradient = _gradient(shape, p, 0.3)
+    gain = np.linalg.norm(gradient, axis=1)
+    facing = -np.sum(gradient * d, axis=1) / np.maximum(gain, 1e-6)
+    return p, hit, np.where(hit, facing, 0), np.clip(gain, 0, 1)
+
+
+def _gradient(shape: Shape, points: Points, step_mm: float) -> Points:
+    sides = [np.eye(3, dtype=np.float32)[axis] * np.float32(step_mm) for axis in range(3)]
+    columns = [shape.distance(points + side) - shape.distance(points - side) for side in sides]
+    return np.stack(columns, axis=1) / (2 * step_mm)
+
+
+def smoothstep(x: Points, low: float, high: float) -> Points:
+    """0 below `low`, 1 above `high`, smooth between."""
+    u = np.clip((x - low) / (high - low), 0, 1)
+    return np.asarray(u * u * (3 - 2 * u))
+
+
+def ends_weight(t: Points, height_mm: float, fade_mm: float) -> Points:
+    """0 at the lowest and the highest place, so that an object keeps its foot on the table; 1 further in."""
+    return smoothstep(np.minimum(t, height_mm - t), 0.3, 0.3 + fade_mm)
+
+
+def _spread(weight: Floats, coarse: Sheet, sheet: Sheet, amplitude_mm: float) -> Floats:
+    """Weights on the fine nodes, drawn back from where they end and softened."""
+    wide = cv2.copyMakeBorder(weight, 0, 0, 4, 4, cv2.BORDER_WRAP)
+    calm = cv2.erode(wide, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    calm = cv2.GaussianBlur(calm, (0, 0), sigmaX=max(0.7, 0.4 * amplitude_mm / _CELL_MM))
+    u = 4 + np.arange(sheet.columns, dtype=np.float32) * np.float32(coarse.columns / sheet.columns)
+    v = np.arange(sheet.rows, dtype=np.float32) * np.float32((coarse.rows - 1) / (sheet.rows - 1))
+    x, y = np.meshgrid(u, v)
+    fine = cv2.remap(calm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(fine * ends_weight(sheet.t, sheet.height_mm, 1.0)[:, None], np.float32)
