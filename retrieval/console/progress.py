@@ -63,12 +63,16 @@ class Bar:
 class Collected(Protocol):
     """What `CollectBar` asks of robot.collect.Progress."""
 
-    settled: int
-    wanted: int
-    attempts: int
-    objects: int
-    objects_done: int
-
+    @property
+    def settled(self) -> int: ...
+    @property
+    def wanted(self) -> int: ...
+    @property
+    def attempts(self) -> int: ...
+    @property
+    def objects(self) -> int: ...
+    @property
+    def objects_done(self) -> int: ...
     @property
     def accept_rate(self) -> float: ...
 
