@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from retrieval.errors import BadInput, RetrievalError
     from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-    from retrieval.model.encoded import Encoded
+    from retrieval.model.touches import Encoded
     from retrieval.search.answer import Match, QueryResult
     from retrieval.search.build import build_index
     from retrieval.search.build_report import BuildReport
@@ -47,7 +47,7 @@ _PLACES = {
     "BadInput": "errors:BadInput",
     "BuildReport": "search.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
-    "Encoded": "model.encoded:Encoded",
+    "Encoded": "model.touches:Encoded",
     "Match": "search.answer:Match",
     "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from retrieval.model.gel_check import CONTACT, GelCheck
+from retrieval.model.judge import CONTACT, GelCheck
 from tests import synthetic
 from tests.notebooks import FOLDER, execute, kinds
 

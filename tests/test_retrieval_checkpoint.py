@@ -26,9 +26,8 @@ from retrieval.model.checkpoint import (
     store_checkpoint,
     write_tensors,
 )
-from retrieval.model.fusion import Matcher
-from retrieval.model.gel_check import GelCheck
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.judge import GelCheck
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import read_stored
 from retrieval.version import __version__

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import retrieval
-from retrieval.data.images import Preprocessing
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig, load_config, preset_names
 from retrieval.model.towers import OUTPUTS, TOWERS

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from retrieval.commands.cli import main
-from retrieval.data.images import Preprocessing
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
 from retrieval.model import export as exporting
 from retrieval.model import onnx_encoder
@@ -19,8 +19,7 @@ from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.config import Config, MatcherConfig
 from retrieval.model.encode import TorchEncoder, encode_touches, touch_features
 from retrieval.model.export import export
-from retrieval.model.fusion import Matcher
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, sealed, unsealed
 from retrieval.model.towers import OUTPUTS, TOWERS
 from retrieval.search.build import build_index

@@ -68,7 +68,7 @@ def test_a_run_that_was_stopped_keeps_its_finished_parts(grasps, matcher, tmp_pa
     whole = encode_recording(grasps, matcher, TINY, None, quiet=True)
     monkeypatch.setattr("retrieval.training.features._PART", 4)
     with monkeypatch.context() as during:
-        during.setattr("retrieval.data.images.Preprocessing.load_photo", lambda *_: 1 / 0)
+        during.setattr("retrieval.data.preprocessing.Preprocessing.load_photo", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
     assert len(list(tmp_path.iterdir())) == 3  # of 4, 4 and 1 touches; no photo was finished

@@ -84,7 +84,7 @@ def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, caps
     lines = (first / "metadata.jsonl").read_bytes()
     assert frontier_report._recording(None, tmp_path, quick=True) == first
     assert (first / "metadata.jsonl").read_bytes() == lines
-    assert "$ retrieve collect --rig sim" in capsys.readouterr().err
+    assert "of 6 simulated objects" in capsys.readouterr().err
 
 
 # Stability -------------------------------------------------------------------------------------------------
@@ -93,8 +93,8 @@ def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, caps
 @pytest.fixture
 def few_cases(monkeypatch):
     """Packages that have no hard case but what a test gives the robot."""
-    for package in ("indexes", "retrieval"):
-        monkeypatch.setattr(f"{package}.hard_cases.hard_cases", tuple)
+    for place in ("retrieval.lab.hard_cases.vectors", "retrieval.lab.hard_cases"):
+        monkeypatch.setattr(f"{place}.hard_cases", tuple)
 
     def give(*cases):
         monkeypatch.setattr(of_robot, "hard_cases", lambda: cases)

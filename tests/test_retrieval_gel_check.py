@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
 from retrieval.training.foreign import DRAWN, draw_foreign
 from retrieval.training.judgement import Pictures, contact_threshold, fit_gel_check, fit_gel_head
 

@@ -11,7 +11,7 @@ import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from retrieval.data.dataset import load_attempts, load_grasps
-from retrieval.data.images import Preprocessing
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
 from retrieval.training.gate import Gate, GateSettings, GraspNet

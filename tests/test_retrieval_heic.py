@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
-from retrieval.data import heic
+from retrieval.data import images
 from retrieval.data.images import decode_rgb
 from retrieval.errors import ImageError
 from tests.test_retrieval_images import exif, noise, saved
@@ -18,7 +18,7 @@ KINDS = ["HEIF", "AVIF"]
 
 @pytest.fixture(autouse=True)
 def _registered():
-    assert heic._heif_is_registered()
+    assert images._heif_is_registered()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -66,10 +66,10 @@ def test_a_file_cut_at_any_length_is_refused(kind):
 def test_a_heic_picture_without_its_package_names_the_extra(monkeypatch):
     data = saved(Image.new("RGB", (16, 16)), "HEIF")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    heic._heif_is_registered.cache_clear()
+    images._heif_is_registered.cache_clear()
     with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
         decode_rgb(data, "photo.heic")
-    heic._heif_is_registered.cache_clear()
+    images._heif_is_registered.cache_clear()
 
 
 def test_an_avif_picture_where_pillow_was_built_without_says_so(monkeypatch):
@@ -81,14 +81,11 @@ def test_an_avif_picture_where_pillow_was_built_without_says_so(monkeypatch):
 
 def test_a_film_is_no_picture():
     film = b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(100)
-    assert heic.decoder_of(film, "x") is None
     with pytest.raises(ImageError, match="not a PNG, JPEG"):
         decode_rgb(film, "x")
 
 
 def test_a_header_that_asks_for_too_many_pixels_is_refused_before_they_are_decoded(monkeypatch):
-    from retrieval.data import images
-
     data = {kind: saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS}
     monkeypatch.setattr(images, "MAX_PIXELS", 64 * 64 - 1)
     for kind in KINDS:

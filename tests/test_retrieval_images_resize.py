@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval.data import images
+from retrieval.data import images, preprocessing
 from retrieval.data import resize as resizing
-from retrieval.data.images import BACKGROUNDS, Preprocessing, subtract_background, to_float
+from retrieval.data.images import to_float
+from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing, subtract_background
 from retrieval.data.resize import resize
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from tests.test_retrieval_images import sample_files, saved
@@ -256,5 +257,5 @@ def test_the_digest_is_of_the_settings_and_the_version():
 
 def test_another_version_is_another_digest(monkeypatch):
     before = Preprocessing().digest()
-    monkeypatch.setattr(images, "PREPROCESSING_VERSION", 1)
+    monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", 1)
     assert Preprocessing().digest() != before

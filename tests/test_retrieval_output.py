@@ -74,7 +74,7 @@ def test_a_terminal_of_plain_ascii_is_shown_escapes():
 
 SPEAKING = """
 import sys
-from retrieval import cli
+from retrieval.commands import cli
 cli.COMMANDS["check"] = lambda _: (cli.say("said"), cli.print_json({}))
 sys.exit(cli.main(["check", "."]))
 """

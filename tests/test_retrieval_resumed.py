@@ -23,7 +23,7 @@ PHOTOS, BATCH = 24, 4
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
-from retrieval import embed
+from retrieval.search import embed
 from retrieval.search.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 

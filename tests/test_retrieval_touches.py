@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from retrieval.data import images
-from retrieval.data.touches import read_grasps, read_image
 from retrieval.errors import BadInput, ImageError
+from retrieval.model.touches import read_grasps, read_image
 
 GREY = np.full((4, 6, 3), 128, dtype=np.uint8)
 

@@ -336,7 +336,7 @@ def test_a_training_that_diverges_says_so_and_writes_nothing(recording, tmp_path
 GRADIENTS = """
 import sys, torch
 from pathlib import Path
-from retrieval import distributed
+from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import PairSampler, load_grasps
 from retrieval.model.losses import contrastive_loss
@@ -426,7 +426,7 @@ def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording
 BATCH_STATISTICS = """
 import sys, torch
 from torch import nn
-from retrieval import distributed
+from retrieval.training import distributed
 from retrieval.model.towers import build_tower
 
 torch.set_num_threads(1)

@@ -137,7 +137,7 @@ def test_a_failure_while_a_recording_is_made_can_be_tried_again(tmp_path, monkey
 
 def test_a_process_that_is_killed_leaves_whole_grasps(tmp_path):
     code = (
-        "import os, sys; import numpy as np; from robot import recording\n"
+        "import os, sys; import numpy as np; from robot.recording import folder as recording\n"
         "writer = recording.RecordingWriter(sys.argv[1], {'source': 'test', 'sensor': 'GelSight'})\n"
         "image = np.zeros((2, 2, 3), np.uint8)\n"
         "writer.append('1', 'mug', {'photo': image, 'touch_a': image})\n"

@@ -32,7 +32,7 @@ from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.fusion import judge_of
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.posterior import Judged, Questions
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording

@@ -1,40 +1,36 @@
-"""Pictures: from a file's bytes to float32 RGB in 0..1, resized, with the gel's background taken off.
-
-    bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> what a tower sees
+"""Pictures: from a file's bytes to float32 RGB in 0..1.
 
 Pillow reads and checks every file. It keeps only the high byte of 16-bit colour, so deeper samples are
 decoded a second time with OpenCV after Pillow has loaded the file whole. (OpenCV's imread fills what a
 truncated JPEG lacks with grey and says nothing.) Colour profiles and gamma chunks are not applied.
 """
 
-import hashlib
 import io
-import json
 import struct
 import threading
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError, features
 
 from indexes.store.regular import read_regular
-from retrieval.data.heic import AVIF_EXTENSIONS, HEIC_EXTENSIONS, decoder_of
-from retrieval.data.resize import RgbImage, check_rgb, resize
-from retrieval.errors import BadInput, ConfigError, ImageError, NumericalError
+from retrieval.data.resize import RgbImage
+from retrieval.errors import BadInput, ImageError
 
+HEIC_EXTENSIONS = frozenset({".heic", ".heif", ".hif"})
+AVIF_EXTENSIONS = frozenset({".avif"})
+_AVIF_BRANDS = frozenset({b"avif", b"avis"})
+_HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
 """Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
 MOST_REDUCED = 160_000_000
 """Pixels of such a file."""
 MAX_BYTES = 512 * 2**20
-PREPROCESSING_VERSION = 2
-"""Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
 
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
@@ -67,9 +63,6 @@ class _Quiet:
 
 
 _quiet = _Quiet()
-
-
-# Reading ---------------------------------------------------------------------------------------------
 
 
 def read_rgb(path: str | Path) -> RgbImage:
@@ -122,7 +115,7 @@ def _reason(error: BaseException) -> str:
 
 def _decode(data: bytes, name: str | Path) -> RgbImage:
     check_pixels(_webp_size(data), name)
-    decoder = decoder_of(data, name)
+    decoder = _other_decoder(data, name)
     with _quiet:
         try:
             image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
@@ -135,6 +128,38 @@ def _decode(data: bytes, name: str | Path) -> RgbImage:
             orientation = _orientation(image)
             rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
     return np.ascontiguousarray(_upright(rgb, orientation))
+
+
+def _other_decoder(data: bytes, name: str | Path) -> str | None:
+    """Pillow's name of the decoder for these bytes, "HEIF" or "AVIF", made known to it; None for any other picture.
+
+    Both files begin with a box of type "ftyp" that lists what its reader must know. Raises ImageError where the
+    decoder is not installed.
+    """
+    if data[4:8] != b"ftyp":
+        return None
+    box = data[: min(int.from_bytes(data[:4], "big"), 256)]
+    brands = {box[at : at + 4] for at in range(8, len(box), 4)}
+    if brands & _AVIF_BRANDS:
+        if not features.check("avif"):
+            raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")
+        return "AVIF"
+    if not brands & _HEIC_BRANDS:
+        return None  # a film
+    if not _heif_is_registered():
+        raise ImageError(name, "a HEIC picture, which needs pillow-heif: pip install 'touch-retrieval[heif]'")
+    return "HEIF"
+
+
+@cache
+def _heif_is_registered() -> bool:
+    """Whether Pillow reads HEIC; tells it of the package that does."""
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        return False
+    register_heif_opener()
+    return True
 
 
 def _reduce(image: Image.Image) -> None:
@@ -267,117 +292,3 @@ def _upright(image: RgbImage, orientation: int) -> RgbImage:
     rows = -1 if orientation in (3, 4, 7, 8) else 1
     columns = -1 if orientation in (2, 3, 6, 7) else 1
     return image[::rows, ::columns]
-
-
-# The gel's background --------------------------------------------------------------------------------
-
-_SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
-    "difference": lambda touch, reference: touch - reference,
-    "difference+0.5": lambda touch, reference: np.clip(touch - reference + np.float32(0.5), 0, 1),
-    "abs": lambda touch, reference: np.abs(touch - reference),
-}
-BACKGROUNDS = ("none", *_SUBTRACT)
-"""What is done with R, the untouched gel: nothing; T - R in -1..1; that plus 0.5, clipped; |T - R|."""
-
-
-def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
-    """Take the untouched gel off a touch, both (H, W, 3) float32 in 0..1, by one of BACKGROUNDS.
-
-    "none" returns `touch` itself. In float32: uint8 subtraction wraps, and turns 1 grey level darker into 255
-    brighter. Raises ConfigError for an unknown policy or a missing reference, BadInput for other shapes.
-    """
-    _check_policy(policy)
-    check_rgb(touch, "touch")
-    if policy == "none":
-        return touch
-    if reference is None:
-        raise _missing_reference(policy)
-    check_rgb(reference, "reference")
-    if touch.shape != reference.shape:
-        raise BadInput(f"touch and reference must have one shape, got {touch.shape} and {reference.shape}")
-    return _SUBTRACT[policy](touch, reference)
-
-
-def _check_policy(policy: object) -> None:
-    if policy not in BACKGROUNDS:
-        raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {policy!r}")
-
-
-def _missing_reference(policy: str) -> ConfigError:
-    return ConfigError(
-        f'background = "{policy}" needs a picture of the untouched gel beside each touch: '
-        'give a reference, or set background = "none"'
-    )
-
-
-# Both together ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Preprocessing:
-    """How files become what the towers see: sides of the squares in pixels, and one of BACKGROUNDS."""
-
-    touch_px: int = 128
-    photo_px: int = 256
-    background: str = "none"
-
-    def __post_init__(self) -> None:
-        for key in ("touch_px", "photo_px"):
-            side = getattr(self, key)
-            if type(side) is not int or not 1 <= side <= 4096:
-                raise ConfigError(f"{key} must be a whole number of pixels from 1 to 4096, got {side!r}")
-        _check_policy(self.background)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON types; `from_dict` reads them back."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":
-        """Make from named settings; one left out takes its default. Raises ConfigError for an unknown one."""
-        known = [field.name for field in fields(cls)]
-        if unknown := sorted(set(settings) - set(known)):
-            raise ConfigError(f"unknown preprocessing setting {unknown[0]!r}; known: {', '.join(known)}")
-        return cls(**settings)
-
-    def digest(self) -> str:
-        """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
-        content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-    def photo(self, image: RgbImage) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, photo_px, 3). Raises BadInput, NumericalError."""
-        return _finite(resize(image, (self.photo_px, self.photo_px)), "photo")
-
-    def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
-        """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
-
-        The background goes after resizing: the two files may have different sizes, the work is less, and for
-        "abs" sensor noise is averaged away while it has both signs instead of adding up to a grey veil.
-        """
-        size = (self.touch_px, self.touch_px)
-        if self.background == "none" or reference is None:
-            return _finite(subtract_background(resize(image, size), None, self.background), "touch")
-        touch = subtract_background(resize(image, size), resize(reference, size), self.background)
-        return _finite(touch, "touch")
-
-    def load_photo(self, path: str | Path) -> RgbImage:
-        """Read a photo as (photo_px, photo_px, 3) float32. Raises ImageError."""
-        return self.photo(read_rgb(path))
-
-    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
-        """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.
-
-        Raises ImageError, and ConfigError where the policy needs a reference that is not given.
-        """
-        if self.background == "none":
-            return self.touch(read_rgb(path))
-        if reference is None:
-            raise _missing_reference(self.background)
-        return self.touch(read_rgb(path), read_rgb(reference))
-
-
-def _finite(image: RgbImage, what: str) -> RgbImage:
-    if not np.isfinite(image).all():
-        raise NumericalError(f"the {what} holds a NaN or infinite sample; every sample must lie in 0..1")
-    return image

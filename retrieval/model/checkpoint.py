@@ -22,9 +22,8 @@ from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours, writ
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher
-from retrieval.model.gel_check import GelCheck
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.judge import GelCheck
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import (
     FORMAT,

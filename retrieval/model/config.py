@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from indexes.store.regular import read_regular
-from retrieval.data.images import Preprocessing
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 
 # How the touch is fused with the photo; what a checkpoint needs to be rebuilt.

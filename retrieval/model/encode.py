@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from retrieval.errors import ConfigError
-from retrieval.model.encoded import TouchCodes
 from retrieval.model.fusion import Code, Matcher
+from retrieval.model.touches import TouchCodes
 
 T = TypeVar("T")
 Image = NDArray[np.float32]

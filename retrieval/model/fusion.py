@@ -16,7 +16,6 @@ from torch.nn import functional
 
 from retrieval.errors import BadInput
 from retrieval.model.config import MatcherConfig
-from retrieval.model.gel_head import GelHead
 from retrieval.model.judge import Judge
 from retrieval.model.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.pruner import Pruner
@@ -155,3 +154,22 @@ def score_halves(
 ) -> NDArray[np.float32]:
     """`Judge.logits` of a head in PyTorch and touch halves (G, hidden)."""
     return judge_of(head).logits(touch_halves.detach().cpu().numpy(), photo_halves, rows)
+
+
+KINDS = ("contact", "untouched", "foreign")
+"""What the gel head tells apart."""
+
+
+class GelHead(nn.Module):
+    """A linear layer to one logit for each of KINDS."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.kinds = nn.Linear(features, len(KINDS))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Readings (B, fingers, 2) of features (B, fingers, F): log-odds of "no gel image" against both others, and of
+        contact against an untouched gel."""
+        contact, untouched, foreign = self.kinds(features).unbind(-1)
+        gel = torch.logsumexp(torch.stack([contact, untouched], dim=-1), dim=-1)  # ONNX knows no logaddexp
+        return torch.stack([foreign - gel, contact - untouched], dim=-1)

@@ -22,8 +22,8 @@ from indexes.store.regular import read_regular
 from retrieval.console.files import SEAL
 from retrieval.data.resize import RgbImage
 from retrieval.errors import CheckpointError
-from retrieval.model.encoded import TouchCodes
 from retrieval.model.stored import Stored
+from retrieval.model.touches import TouchCodes
 
 log = logging.getLogger(__name__)
 ENDING = ".onnx"

@@ -12,8 +12,7 @@ from indexes.store.regular import open_regular, parse_json
 from retrieval.console.files import HEADER
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
-from retrieval.model.gel_check import GelCheck
-from retrieval.model.judge import Judge
+from retrieval.model.judge import GelCheck, Judge
 
 FORMAT = 1
 _PARTS = ("config", "split", "provenance")

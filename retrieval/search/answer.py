@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from retrieval.model.gel_check import NO_CONTACT, NOT_A_GEL
+from retrieval.model.judge import NO_CONTACT, NOT_A_GEL
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_GEL: 5}

@@ -21,8 +21,8 @@ class BuildReport:
     with a photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew,
     `renamed` of which had another name in the index before, and `resumed` of which stood in no index yet, but had been
     embedded by a build that was cut off. removed: names that are gone. skipped: pictures that could not be read;
-    ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all of
-    whose pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
+    ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all
+    of whose pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
     (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
     rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
 

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from retrieval.data.touches import AnyImage, read_image
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
-from retrieval.model.encoded import Encoded
+from retrieval.model.touches import AnyImage, Encoded, read_image
 from retrieval.search.defaults import find_model
 
 

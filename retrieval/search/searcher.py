@@ -12,15 +12,21 @@ from numpy.typing import NDArray
 from indexes.errors import UnsupportedFormat
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
-from retrieval.data.touches import AnyImage, AnyTouches, GivenImage
 from retrieval.errors import BadInput
-from retrieval.model.encoded import Encoded, Encoder, TouchCodes, TouchReader
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.judge import Judge
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
 from retrieval.model.onnx_encoder import exported_beside
 from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
-from retrieval.model.stopwatch import Stopwatch
 from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
+from retrieval.model.touches import (
+    AnyImage,
+    AnyTouches,
+    Encoded,
+    Encoder,
+    GivenImage,
+    Stopwatch,
+    TouchCodes,
+    TouchReader,
+)
 from retrieval.search import defaults
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
 from retrieval.search.listing import listed_photo, require_usable

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
-from retrieval.data.images import Preprocessing, read_rgb
+from retrieval.data.images import read_rgb
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
 from retrieval.model.checkpoint import read_tensors, tensors_digest, write_tensors

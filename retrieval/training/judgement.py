@@ -1,7 +1,7 @@
 """What a checkpoint needs beyond its ranking, fitted when its training is over: a posterior, and a check of touches.
 
 The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects. The check
-(`retrieval.model.gel_check`) reads the touch tower's features: its linear layer is fitted on touches and untouched gels
+(`retrieval.model.judge`) reads the touch tower's features: its linear layer is fitted on touches and untouched gels
 of training objects and on foreign pictures, its thresholds on those of validation objects.
 """
 
@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from retrieval.data.dataset import Grasp
-from retrieval.data.images import Preprocessing, read_rgb
+from retrieval.data.images import read_rgb
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
-from retrieval.model.fusion import Matcher, judge_of
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.model.gel_head import KINDS, GelHead
+from retrieval.model.fusion import KINDS, GelHead, Matcher, judge_of
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
 from retrieval.model.posterior import Judged, Posterior, fit_posterior
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign import draw_foreign

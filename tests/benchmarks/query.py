@@ -15,12 +15,12 @@ from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import TorchEncoder, touch_batch
-from retrieval.model.encoded import Encoder
 from retrieval.model.export import graph_of
 from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, sealed
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import fingerprint, read_judge
+from retrieval.model.touches import Encoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.searcher import Searcher
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of

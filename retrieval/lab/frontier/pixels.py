@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
-from retrieval.data.images import Preprocessing
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.points import Panel, Point, Row, missed
 from retrieval.lab.frontier.sample import Array, Sample

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from retrieval.data.images import Preprocessing, subtract_background, to_float
+from retrieval.data.images import to_float
+from retrieval.data.preprocessing import Preprocessing, subtract_background
 from retrieval.data.resize import resize
 from retrieval.lab.hard_cases.case import HardCase, refused
 

@@ -1,0 +1,128 @@
+"""From a picture to what a tower sees: resized, with the gel's background taken off.
+
+bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> what a tower sees
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import RgbImage, check_rgb, resize
+from retrieval.errors import BadInput, ConfigError, NumericalError
+
+PREPROCESSING_VERSION = 2
+"""Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
+
+_SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
+    "difference": lambda touch, reference: touch - reference,
+    "difference+0.5": lambda touch, reference: np.clip(touch - reference + np.float32(0.5), 0, 1),
+    "abs": lambda touch, reference: np.abs(touch - reference),
+}
+BACKGROUNDS = ("none", *_SUBTRACT)
+"""What is done with R, the untouched gel: nothing; T - R in -1..1; that plus 0.5, clipped; |T - R|."""
+
+
+def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
+    """Take the untouched gel off a touch, both (H, W, 3) float32 in 0..1, by one of BACKGROUNDS.
+
+    "none" returns `touch` itself. In float32: uint8 subtraction wraps, and turns 1 grey level darker into 255
+    brighter. Raises ConfigError for an unknown policy or a missing reference, BadInput for other shapes.
+    """
+    _check_policy(policy)
+    check_rgb(touch, "touch")
+    if policy == "none":
+        return touch
+    if reference is None:
+        raise _missing_reference(policy)
+    check_rgb(reference, "reference")
+    if touch.shape != reference.shape:
+        raise BadInput(f"touch and reference must have one shape, got {touch.shape} and {reference.shape}")
+    return _SUBTRACT[policy](touch, reference)
+
+
+def _check_policy(policy: object) -> None:
+    if policy not in BACKGROUNDS:
+        raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {policy!r}")
+
+
+def _missing_reference(policy: str) -> ConfigError:
+    return ConfigError(
+        f'background = "{policy}" needs a picture of the untouched gel beside each touch: '
+        'give a reference, or set background = "none"'
+    )
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How files become what the towers see: sides of the squares in pixels, and one of BACKGROUNDS."""
+
+    touch_px: int = 128
+    photo_px: int = 256
+    background: str = "none"
+
+    def __post_init__(self) -> None:
+        for key in ("touch_px", "photo_px"):
+            side = getattr(self, key)
+            if type(side) is not int or not 1 <= side <= 4096:
+                raise ConfigError(f"{key} must be a whole number of pixels from 1 to 4096, got {side!r}")
+        _check_policy(self.background)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON types; `from_dict` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":
+        """Make from named settings; one left out takes its default. Raises ConfigError for an unknown one."""
+        known = [field.name for field in fields(cls)]
+        if unknown := sorted(set(settings) - set(known)):
+            raise ConfigError(f"unknown preprocessing setting {unknown[0]!r}; known: {', '.join(known)}")
+        return cls(**settings)
+
+    def digest(self) -> str:
+        """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
+        content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def photo(self, image: RgbImage) -> RgbImage:
+        """(H, W, 3) in 0..1 to (photo_px, photo_px, 3). Raises BadInput, NumericalError."""
+        return _finite(resize(image, (self.photo_px, self.photo_px)), "photo")
+
+    def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
+        """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
+
+        The background goes after resizing: the two files may have different sizes, the work is less, and for
+        "abs" sensor noise is averaged away while it has both signs instead of adding up to a grey veil.
+        """
+        size = (self.touch_px, self.touch_px)
+        if self.background == "none" or reference is None:
+            return _finite(subtract_background(resize(image, size), None, self.background), "touch")
+        touch = subtract_background(resize(image, size), resize(reference, size), self.background)
+        return _finite(touch, "touch")
+
+    def load_photo(self, path: str | Path) -> RgbImage:
+        """Read a photo as (photo_px, photo_px, 3) float32. Raises ImageError."""
+        return self.photo(read_rgb(path))
+
+    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
+        """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.
+
+        Raises ImageError, and ConfigError where the policy needs a reference that is not given.
+        """
+        if self.background == "none":
+            return self.touch(read_rgb(path))
+        if reference is None:
+            raise _missing_reference(self.background)
+        return self.touch(read_rgb(path), read_rgb(reference))
+
+
+def _finite(image: RgbImage, what: str) -> RgbImage:
+    if not np.isfinite(image).all():
+        raise NumericalError(f"the {what} holds a NaN or infinite sample; every sample must lie in 0..1")
+    return image

@@ -1,0 +1,298 @@
+"""Gel images however they are given, and what the matcher makes of them: halves, embeddings and readings.
+
+Files, bytes, Pillow images or arrays, one grasp or several.
+
+How deep the lists are nested says what is meant, so nothing is guessed:
+
+    [a, b]             one grasp: an image for each finger of the model
+    [[a, b], [a, b]]   several grasps of one object
+    a                  one grasp of a model with one finger
+"""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from string import ascii_lowercase
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb, to_float
+from retrieval.data.resize import RgbImage
+from retrieval.errors import BadInput, ImageError, NumericalError
+from retrieval.model.config import Config
+from retrieval.model.judge import contact_level
+
+AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any]
+"""A path (text is one), the bytes of a file, a Pillow image, or an array (H, W, 3) uint8, red first."""
+AnyTouches: TypeAlias = AnyImage | Sequence[AnyImage] | Sequence[Sequence[AnyImage]]
+"""One grasp or several, as the text above says. An array of 4 or 5 axes is a list of those below it."""
+
+_WANTED = "a path, the bytes of a file, a Pillow image or a uint8 array (height, width, 3)"
+_NESTED = "one grasp is a list with an image for each finger, several grasps are a list of such lists"
+
+
+@dataclass(frozen=True, eq=False)
+class GivenImage:
+    """An image as it was given, not read yet. name: how answers and messages call it, a file by its path."""
+
+    image: AnyImage
+    name: str
+
+    def read(self) -> RgbImage:
+        """(H, W, 3) float32 RGB in 0..1; the same numbers however a picture is given. Raises ImageError."""
+        return read_image(self.image, self.name)
+
+    def loaded(self) -> "GivenImage":
+        """Itself. A Pillow image reads its file when it is first asked for pixels, which two threads must not do at
+        once: it does so here, before they do."""
+        if isinstance(self.image, Image.Image):
+            with suppress(Exception):  # told by `read`
+                self.image.load()
+        return self
+
+
+def read_image(image: AnyImage, name: str) -> RgbImage:
+    """An image however it is given as (H, W, 3) float32 RGB in 0..1; `name` stands for it where it is no file.
+
+    Raises ImageError. Arrays must be uint8: of other types the range would have to be guessed.
+    """
+    if isinstance(image, str | os.PathLike):
+        return read_rgb(os.fspath(image))
+    if isinstance(image, bytes | bytearray | memoryview):
+        return decode_rgb(bytes(image), name)
+    return pillow_rgb(image, name) if isinstance(image, Image.Image) else _array_rgb(image, name)
+
+
+def _array_rgb(image: NDArray[Any], name: str) -> RgbImage:
+    if image.dtype != np.uint8:
+        raise ImageError(
+            name,
+            f"an array must hold uint8 samples in 0..255, got {image.dtype}; make them of samples in 0..1 by "
+            "np.rint(255 * image).astype(np.uint8)",
+        )
+    if image.ndim != 3 or image.shape[2] != 3:
+        raise ImageError(
+            name,
+            f"an array must be (height, width, 3), red first, got {image.shape}; repeat a grey image by "
+            "np.stack([image] * 3, axis=-1), leave an alpha channel out, and put channels last",
+        )
+    check_pixels((image.shape[1], image.shape[0]), name)
+    return np.ascontiguousarray(to_float(np.asarray(image)))
+
+
+def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str = "") -> list[list[GivenImage]]:
+    """The grasps in what was given for one object, each with an image for each finger; no image is read.
+
+    what: how one grasp is called in messages. of: what they begin with, such as "object 3, ". Raises BadInput where
+    the nesting or the number of images is not as the text above says.
+    """
+    grasps = [_images_of(grasp, of) for grasp in _lists(given, of)]
+    if not grasps:
+        raise BadInput(f"{of}give at least one {what}: {_NESTED}")
+    named = [[_given(image, g, f, of) for f, image in enumerate(grasp)] for g, grasp in enumerate(grasps, start=1)]
+    for grasp in named:
+        if len(grasp) != fingers:
+            raise BadInput(
+                f"{of}this model takes {fingers} gel image(s) for one {what}; got {len(grasp)}: "
+                f"{', '.join(image.name for image in grasp)} ({_NESTED})"
+            )
+    return named
+
+
+def _lists(given: AnyTouches, of: str) -> list[Any]:
+    """A list for each grasp, by the depth of nesting."""
+    if _is_image(given):
+        return [[given]]
+    items = _items(given, of)
+    images = [_is_image(item) for item in items]
+    if not any(images):
+        return items
+    if not all(images):
+        raise BadInput(f"{of}images and lists of images stand side by side; {_NESTED}")
+    return [items]
+
+
+def _images_of(grasp: Any, of: str) -> list[AnyImage]:
+    images = _items(grasp, of)
+    for image in images:
+        if not _is_image(image):
+            raise BadInput(
+                f"{of}an image must be {_WANTED}, got {type(image).__name__}; {_NESTED}; several objects go to "
+                "query_many"
+            )
+    return images
+
+
+def _is_image(item: object) -> bool:
+    if isinstance(item, np.ndarray):
+        return item.ndim <= 3
+    return isinstance(item, str | os.PathLike | bytes | bytearray | memoryview | Image.Image)
+
+
+def _items(given: object, of: str) -> list[Any]:
+    if isinstance(given, Sequence | np.ndarray):
+        return list(given)
+    raise BadInput(f"{of}an image must be {_WANTED}, got {type(given).__name__}; {_NESTED}")
+
+
+def _given(image: AnyImage, grasp: int, finger: int, of: str) -> GivenImage:
+    if isinstance(image, str | os.PathLike):
+        return GivenImage(image, os.fspath(image))
+    letter = ascii_lowercase[finger] if finger < len(ascii_lowercase) else str(finger + 1)
+    return GivenImage(image, f"{of}grasp {grasp}, finger {letter} ({_kind(image)})")
+
+
+def _kind(image: Any) -> str:
+    if isinstance(image, np.ndarray):
+        return f"array {' x '.join(map(str, image.shape))} {image.dtype}"
+    if isinstance(image, Image.Image):
+        return f"Pillow image {image.width} x {image.height} {image.mode}"
+    return f"{len(bytes(image))} bytes"
+
+
+BATCH = 32
+"""Grasps whose images are in memory, and in the encoder, at once."""
+DECODERS = 2  # a touch has as many images
+Floats = NDArray[np.float32]
+
+
+class TouchCodes(NamedTuple):
+    """What is made of G grasps, float32: halves (G, hidden), embeddings (G, embedding_dim), and what tells whether they
+    are touches: readings (G, fingers, 2) of a model with a gel head, levels (G, fingers) of grey by which images differ
+    from their no-contact frames, where these were given (`retrieval.model.judge`)."""
+
+    halves: Floats
+    embeddings: Floats
+    readings: Floats | None = None
+    levels: Floats | None = None
+
+
+class Encoder(Protocol):
+    """What makes codes of touches: PyTorch or ONNX Runtime."""
+
+    @property
+    def name(self) -> str:
+        """How it is called in the answer."""
+
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
+        """Encode grasps, each its fingers' images."""
+
+
+class Encoded(NamedTuple):
+    """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
+    found, and `halves` (N, hidden), by which it judges pairs. float32.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     embeddings, halves = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
+    >>> len(embeddings), len(halves), embeddings.dtype.name
+    (2, 2, 'float32')
+    """
+
+    embeddings: Floats
+    halves: Floats
+
+
+class Stopwatch:
+    """Milliseconds of named stages and in total."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._stages: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._stages[stage] = self._stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+
+    def finished(self, shares: int) -> dict[str, float]:
+        """One of so many equal shares: of the stages in their order, and of "total" since it was made."""
+        everything = {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}
+        return {stage: ms / shares for stage, ms in everything.items()}
+
+
+class TouchReader:
+    """Reads and encodes the touches of a model."""
+
+    def __init__(self, config: Config, encoder: Encoder, compares: bool = False) -> None:
+        """compares: whether a touch is compared with its no-contact frame, to see if there is a contact."""
+        self.encoder, self.fingers, self._compares = encoder, config.matcher.fingers, compares
+        self._preprocessing = config.preprocessing
+
+    def grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
+        """The grasps of one object, by `retrieval.model.touches.read_grasps`; no image is read."""
+        return read_grasps(touches, self.fingers, of=of)
+
+    def references(self, background: Sequence[AnyImage] | None) -> Sequence[RgbImage | None]:
+        """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
+        that is missing, and for one that would not be looked at."""
+        policy = self._preprocessing.background
+        if background is None and policy != "none":
+            raise BadInput(
+                f'this model subtracts the untouched gel (background = "{policy}"): give a no-contact frame for each '
+                "finger with --background"
+            )
+        if background is None:
+            return [None] * self.fingers
+        if policy == "none" and not self._compares:
+            raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
+        frames = read_grasps(background, self.fingers, what="background")
+        if len(frames) != 1:
+            raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
+        return [frame.read() for frame in frames[0]]
+
+    def encode(
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None], clock: Stopwatch
+    ) -> TouchCodes:
+        """Of all grasps, in batches, with stages "decode" and "encode" on the clock."""
+        parts, levels = [], []
+        for start in range(0, len(grasps), BATCH):
+            with clock("decode"):
+                views = self._views(grasps[start : start + BATCH], references)
+                levels += [[level for _, level in grasp] for grasp in views]
+            with clock("encode"):
+                parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
+        halves, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
+        readings = [part.readings for part in parts if part.readings is not None]
+        return TouchCodes(
+            _finite(halves, "half"),
+            _finite(embeddings, "embedding"),
+            np.concatenate(readings) if readings else None,
+            None if references[0] is None else np.array(levels, dtype=np.float32),
+        )
+
+    def _views(
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None]
+    ) -> list[list[tuple[RgbImage, float]]]:
+        """The images of grasps as the tower sees them, and how far each is from its no-contact frame (0 without one);
+        made side by side; of several bad ones the first is told.
+
+        The threads end with the call, for a fork of the process would not have them.
+        """
+
+        subtracts = self._preprocessing.background != "none"
+
+        def view(given: GivenImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
+            image = given.read()
+            level = 0.0 if reference is None else contact_level(image, reference)
+            return self._preprocessing.touch(image, reference if subtracts else None), level
+
+        with ThreadPoolExecutor(DECODERS, "decode") as threads:
+            jobs = [
+                [threads.submit(view, given.loaded(), frame) for given, frame in zip(grasp, references, strict=True)]
+                for grasp in grasps
+            ]
+            return [[job.result() for job in grasp] for grasp in jobs]
+
+
+def _finite(values: Floats, name: str) -> Floats:
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} holds a NaN or infinite number; the model is unfit")
+    return values
