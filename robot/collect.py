@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RecordingError, RobotConfigError
-from robot.grasping.attempt import Attempt, Attempter
+from robot.grasping.attempt import Attempter, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, judge
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
@@ -201,7 +201,7 @@ class _Collection:
         _check_log(log, writer, names)
         self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
-        self._pending: dict[str, deque[Callable[[], Attempt]]] = defaultdict(deque)
+        self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
         self._progress = progress
         self._start, self._settled_before = time.monotonic(), self._settled()
 
@@ -229,7 +229,7 @@ class _Collection:
         under_way, so_far = len(self._pending[name]) if ahead else 0, self.tallies[name]
         return so_far.accepted + under_way < self.settings.grasps and so_far.attempts + under_way < self.settings.limit
 
-    def _record(self, attempt: Attempt) -> None:
+    def _record(self, attempt: GraspAttempt) -> None:
         """Ask the gate, write the attempt's line and then its grasp."""
         began, self._seconds = self._seconds, round(self._seconds + attempt.lasted_s, 3)
         logged = self._judged(attempt)
@@ -247,7 +247,7 @@ class _Collection:
             )
         self.tallies[attempt.object_id].add(logged)
 
-    def _judged(self, attempt: Attempt) -> LoggedAttempt:
+    def _judged(self, attempt: GraspAttempt) -> LoggedAttempt:
         said = functools.partial(
             LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
         )

@@ -16,7 +16,7 @@ from typing import Self
 import cv2
 
 from robot.errors import RobotError
-from robot.grasping.attempt import Attempt, Attempter
+from robot.grasping.attempt import Attempter, GraspAttempt
 from robot.grasping.settings import AttemptSettings
 from robot.rig import Rig
 
@@ -49,7 +49,7 @@ class Jobs:
                 initargs=(make_rig, attempter.seed, attempter.settings),
             )
 
-    def submit(self, object_id: str, number: int) -> Callable[[], Attempt]:
+    def submit(self, object_id: str, number: int) -> Callable[[], GraspAttempt]:
         """Begin an attempt; the callable waits for it. It raises the attempt's own RobotError, and a RobotError for
         any other failure in another process."""
         if self._pool is None:
@@ -101,7 +101,7 @@ def _restore(environment: dict[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def _result(future: Future[Attempt], object_id: str, number: int) -> Attempt:
+def _result(future: Future[GraspAttempt], object_id: str, number: int) -> GraspAttempt:
     try:
         return future.result()
     except RobotError:
@@ -149,7 +149,7 @@ def _connected(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Atte
     return Attempter(rig, seed, settings)
 
 
-def _run(object_id: str, number: int) -> Attempt:
+def _run(object_id: str, number: int) -> GraspAttempt:
     if not _made:
         _made.append(_make[0]())
     return _made[0].run(object_id, number)

@@ -17,7 +17,7 @@ from unittest.mock import patch
 import numpy as np
 
 from retrieval.commands.cli import main as retrieve
-from robot.emulators.wsg50.server import Emulator, serve_tcp
+from robot.emulators.wsg50.server import EmulatedWSG50, serve_tcp
 from robot.readings import Frame, Intrinsics
 from robot.recording.folder import read_info, read_recording
 from robot.rig import RIGS, load_rig
@@ -52,7 +52,7 @@ def rehearse(folder, objects=OBJECTS, grasps=GRASPS, iterations=2):
 @contextlib.contextmanager
 def replayed(folder, source, grasps):
     """The name of a rig that shows the recording `source` again."""
-    emulator = Emulator(speed_up=50.0, referenced=True)
+    emulator = EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         serve_tcp(emulator) as url,
         patch("robot.rig.input", lambda: "", create=True),

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from robot.collect import CollectSettings, collect
-from robot.emulators.wsg50.server import Emulator, serve_tcp
+from robot.emulators.wsg50.server import EmulatedWSG50, serve_tcp
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye
@@ -70,7 +70,7 @@ def replay_rig(emulator=None):
 @contextlib.contextmanager
 def replay_file(emulator=None):
     """The rig's file, whose devices are there as long as this is open."""
-    emulator = emulator or Emulator(speed_up=50.0, referenced=True)
+    emulator = emulator or EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         tempfile.TemporaryDirectory() as name,
         serve_tcp(emulator) as url,

@@ -13,7 +13,7 @@ import pytest
 
 from retrieval.commands import cli
 from retrieval.search.answer import EXIT_CODES
-from robot.emulators.wsg50.server import Emulator
+from robot.emulators.wsg50.server import EmulatedWSG50
 from robot.rig import load_rig
 from tests import synthetic
 from tests.replay_rig import replay_file
@@ -46,7 +46,7 @@ def home(tmp_path, recording, catalogue, monkeypatch):
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
     (tmp_path / "points.csv").write_text(POINTS)
     monkeypatch.chdir(tmp_path)
-    with replay_file(Emulator(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
+    with replay_file(EmulatedWSG50(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
         shutil.copy(rig, tmp_path)
         yield tmp_path
 

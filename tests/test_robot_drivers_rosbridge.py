@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from robot.drivers.sawyer import rosbridge
 from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
-from robot.emulators.sawyer.server import Emulator, Faults, serve
+from robot.emulators.sawyer.server import EmulatedSawyer, Faults, serve
 from robot.errors import DeviceError
 from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
 
@@ -312,7 +312,7 @@ def test_a_missing_package_is_a_sentence_with_the_extra(monkeypatch):
 
 
 def test_the_emulator_answers_what_rosbridge_would():
-    with serve(Emulator()) as url, contextlib.closing(RosbridgeLink(url, timeout_s=5.0)) as link:
+    with serve(EmulatedSawyer()) as url, contextlib.closing(RosbridgeLink(url, timeout_s=5.0)) as link:
         link.open()
         with pytest.raises(DeviceError, match="/none does not exist"):
             link.call("/none", {})

@@ -22,7 +22,7 @@ from robot.drivers.sawyer.messages import JOINTS, Mount
 from robot.drivers.sawyer.rosbridge import Arrival
 from robot.drivers.sawyer.straight_line import Schedule, way_points
 from robot.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
-from robot.emulators.sawyer.server import LIMB, Emulator, Faults, serve
+from robot.emulators.sawyer.server import LIMB, EmulatedSawyer, Faults, serve
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
 from tests.waiting import running, until
@@ -42,7 +42,7 @@ def arm_at(url, **changes):
 @contextlib.contextmanager
 def connected(emulator=None, **changes):
     """An emulator and a connected arm; machines are slow, so states may be a second old unless a test says less."""
-    emulator = emulator or Emulator()
+    emulator = emulator or EmulatedSawyer()
     with serve(emulator) as url, arm_at(url, **{"max_state_age_s": 1.0, **changes}) as arm:
         yield emulator, arm
 
@@ -332,7 +332,7 @@ def test_settings_are_read_back_and_what_is_not_taken_is_noted():
         found = {"url": arm.settings()["url"], "tip": "right_hand", "speed_ratio": 0.2, "command_timeout_s": 0.2}
         assert arm.settings() == found  # and nothing that is measured: it would be another each time
         assert arm.refused == {}
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.silent.add(LIMB + "set_speed_ratio")
     with connected(emulator, timeout_s=0.5) as (_, arm):
         assert arm.refused == {"speed_ratio": "asked 0.3, nothing can be read back"}
@@ -409,7 +409,7 @@ def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkey
 
 
 def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.silent.add(messages.COLLISION[0])
     with caplog.at_level(logging.WARNING), connected(emulator, timeout_s=0.5) as (_, arm):
         assert arm.refused == {"collision state": "nothing comes: collisions are not seen"}
@@ -482,7 +482,7 @@ def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
 def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with contextlib.ExitStack() as robot:
-        arm = arm_at(robot.enter_context(serve(Emulator())), reconnect_tries=3, timeout_s=5.0)
+        arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), reconnect_tries=3, timeout_s=5.0)
         arm.connect()
         robot.close()
         until(lambda: not arm._link.is_open)
@@ -524,7 +524,7 @@ with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
 
 
 def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     with serve(emulator) as url:
         code = PROGRAM.replace("PORT", url.rpartition(":")[2])
         with running([sys.executable, "-c", code]) as process:
@@ -577,7 +577,7 @@ def test_solutions_that_leap_are_refused_before_anything_moves(monkeypatch):
 
 @pytest.mark.parametrize("kind", ["wrong_id", "dropped", "corrupted"])
 def test_answers_that_never_come_end_in_time(kind):
-    with connected(Emulator(), timeout_s=1.0, ik_retries=1) as (emulator, arm):
+    with connected(EmulatedSawyer(), timeout_s=1.0, ik_retries=1) as (emulator, arm):
         arm._link.timeout_s = 0.1
         emulator.faults.rate, emulator.faults.kinds = 1.0, (kind,)
         emulator.silent.update(topic for topic, _ in (messages.COLLISION,))
@@ -602,18 +602,18 @@ def test_an_arm_held_by_somebody_is_not_pushed_on():
         def command(self, target):
             pass
 
-    with connected(Emulator(model=Held())) as (_, arm), pytest.raises(DeviceError, match="must follow within"):
+    with connected(EmulatedSawyer(model=Held())) as (_, arm), pytest.raises(DeviceError, match="must follow within"):
         arm.move_to(Pose(0.0, 0.0, 250.0, 1.5), 200.0)
     with (
-        connected(Emulator(model=Held()), settle_s=0.1) as (_, arm),
+        connected(EmulatedSawyer(model=Held()), settle_s=0.1) as (_, arm),
         pytest.raises(DeviceError, match="is the arm blocked"),
     ):
         arm.move_to(Pose(0.0, 0.0, 45.0, 0.0), 200.0)
 
 
 def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
-    for prepare in (Emulator.press_estop, lambda emulator: setattr(emulator.model, "enabled", False)):
-        emulator = Emulator()
+    for prepare in (EmulatedSawyer.press_estop, lambda emulator: setattr(emulator.model, "enabled", False)):
+        emulator = EmulatedSawyer()
         prepare(emulator)
         with serve(emulator) as url:
             arm = arm_at(url)
@@ -625,7 +625,7 @@ def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
 
 
 def test_motors_stay_off_where_connecting_must_let_nothing_move():
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.model.enabled = False
     with serve(emulator) as url:
         arm = arm_at(url, enable=True)
@@ -637,12 +637,12 @@ def test_motors_stay_off_where_connecting_must_let_nothing_move():
 
 
 def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.model.enabled = False
     with caplog.at_level(logging.WARNING), connected(emulator, enable=True):
         assert emulator.model.enabled
         assert "motors are being enabled" in caplog.text
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.press_estop()
     with serve(emulator) as url, pytest.raises(DeviceError, match="never resets"):
         arm_at(url, enable=True).connect()
@@ -650,7 +650,7 @@ def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
 
 
 def test_a_robot_that_says_nothing_or_has_no_such_tip_is_named():
-    emulator = Emulator()
+    emulator = EmulatedSawyer()
     emulator.silent.add(LIMB + "tip_states")
     with serve(emulator) as url, pytest.raises(DeviceError, match="no message on /robot/limb/right/tip_states"):
         arm_at(url, timeout_s=0.5).connect()
@@ -659,7 +659,7 @@ def test_a_robot_that_says_nothing_or_has_no_such_tip_is_named():
 
 
 def test_it_connects_closes_and_connects_again_and_leaves_no_thread():
-    with serve(Emulator()) as url:
+    with serve(EmulatedSawyer()) as url:
         arm = arm_at(url)
         arm.close()
         for _ in range(3):
@@ -682,7 +682,7 @@ def test_it_connects_closes_and_connects_again_and_leaves_no_thread():
 def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds, monkeypatch, capsys):
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.01)
     faults, outcomes = Faults(rate, kinds, seed=20), Counter()
-    with connected(Emulator(faults=faults), timeout_s=1.0) as (emulator, arm):
+    with connected(EmulatedSawyer(faults=faults), timeout_s=1.0) as (emulator, arm):
         for number in range(10):
             target = Pose(0.0, 0.0, 40.0 + 20 * (number % 2), 0.0)
             try:

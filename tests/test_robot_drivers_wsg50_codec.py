@@ -1,4 +1,4 @@
-"""The WSG-50's frames to the byte, and what is found in damaged, cut and noisy streams."""
+"""The WSG-50's packets to the byte, and what is found in damaged, cut and noisy streams."""
 
 import contextlib
 import itertools
@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.drivers.wsg50 import codec, commands
-from robot.drivers.wsg50.codec import Frame, WireError, decode, encode
+from robot.drivers.wsg50.codec import Packet, WireError, decode, encode
 from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState
 from robot.errors import DeviceError
-from tests.wsg50_frames import COMMANDS, FRAMES, MANUAL_REPLIES, bytes_of
+from tests.wsg50_packets import COMMANDS, MANUAL_REPLIES, PACKETS, bytes_of
 
 BUILT = {
     "acknowledge": commands.acknowledge(),
@@ -47,48 +47,48 @@ PARSERS = (
 )
 
 
-def all_frames(stream):
-    """Every frame of a stream that is there as a whole."""
+def all_packets(stream):
+    """Every packet of a stream that is there as a whole."""
     buffer, found = bytearray(stream), []
     while True:
-        used, frame = decode(buffer)
+        used, packet = decode(buffer)
         del buffer[:used]
-        if frame is None:
+        if packet is None:
             return found
-        found.append(frame)
+        found.append(packet)
 
 
 def fed(chunks):
-    """Every frame of a stream that comes in pieces."""
+    """Every packet of a stream that comes in pieces."""
     buffer, found = bytearray(), []
     for chunk in chunks:
         buffer += chunk
         while True:
-            used, frame = decode(buffer)
+            used, packet = decode(buffer)
             del buffer[:used]
-            if frame is None:
+            if packet is None:
                 break
-            found.append(frame)
+            found.append(packet)
     return found
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_a_frame_of_the_manual_is_written_and_read_to_the_byte(name):
-    text, command, payload = FRAMES[name]
-    frame = Frame(command, bytes.fromhex(payload))
-    assert encode(frame) == bytes.fromhex(text)
-    assert decode(bytes.fromhex(text)) == (len(bytes.fromhex(text)), frame)
+@pytest.mark.parametrize("name", PACKETS)
+def test_a_packet_of_the_manual_is_written_and_read_to_the_byte(name):
+    text, command, payload = PACKETS[name]
+    packet = Packet(command, bytes.fromhex(payload))
+    assert encode(packet) == bytes.fromhex(text)
+    assert decode(bytes.fromhex(text)) == (len(bytes.fromhex(text)), packet)
 
 
 def test_every_command_of_the_public_tests_comes_out_of_its_builder():
     assert set(BUILT) == set(COMMANDS)
-    for name, frame in BUILT.items():
-        assert encode(frame) == bytes_of(name), name
+    for name, packet in BUILT.items():
+        assert encode(packet) == bytes_of(name), name
 
 
-def test_the_check_sum_runs_to_zero_over_a_frame_and_to_50f5_over_the_preamble():
+def test_the_check_sum_runs_to_zero_over_a_packet_and_to_50f5_over_the_preamble():
     assert codec.checksum(b"\xaa\xaa\xaa") == 0x50F5
-    assert [codec.checksum(bytes_of(name)) for name in FRAMES] == [0] * len(FRAMES)
+    assert [codec.checksum(bytes_of(name)) for name in PACKETS] == [0] * len(PACKETS)
 
 
 def test_the_check_sum_is_not_the_textbook_ccitt():
@@ -99,20 +99,20 @@ def test_the_check_sum_is_not_the_textbook_ccitt():
     assert binascii.crc_hqx(body, 0xFFFF) != 0x760E
 
 
-def test_builders_without_a_printed_frame_pack_what_the_table_says():
-    assert commands.home(2) == Frame(0x20, b"\x02")
+def test_builders_without_a_printed_packet_pack_what_the_table_says():
+    assert commands.home(2) == Packet(0x20, b"\x02")
     assert commands.move(1.0, 2.0, relative=True, stop_on_block=False).payload[0] == 1
-    assert commands.release(1.0, 2.0) == Frame(0x26, struct.pack("<ff", 1, 2))
-    assert commands.set_acceleration(150.0) == Frame(0x30, bytes.fromhex("00001643"))
-    assert commands.set_force_limit(40.0) == Frame(0x32, struct.pack("<f", 40))
-    assert commands.set_soft_limits(5.0, 100.0) == Frame(0x34, struct.pack("<ff", 5, 100))
-    assert commands.statistics(reset=True) == Frame(0x42, b"\x01")
-    assert commands.ask(Command.OPENING) == Frame(0x43, b"\x00\x00\x00")
-    assert commands.update(Command.FORCE, 20, on_change=True) == Frame(0x45, b"\x03\x14\x00")
+    assert commands.release(1.0, 2.0) == Packet(0x26, struct.pack("<ff", 1, 2))
+    assert commands.set_acceleration(150.0) == Packet(0x30, bytes.fromhex("00001643"))
+    assert commands.set_force_limit(40.0) == Packet(0x32, struct.pack("<f", 40))
+    assert commands.set_soft_limits(5.0, 100.0) == Packet(0x34, struct.pack("<ff", 5, 100))
+    assert commands.statistics(reset=True) == Packet(0x42, b"\x01")
+    assert commands.ask(Command.OPENING) == Packet(0x43, b"\x00\x00\x00")
+    assert commands.update(Command.FORCE, 20, on_change=True) == Packet(0x45, b"\x03\x14\x00")
 
 
 def test_replies_mean_what_the_manual_says():
-    answers = [name for name in MANUAL_REPLIES if FRAMES[name][1] != 0x01]
+    answers = [name for name in MANUAL_REPLIES if PACKETS[name][1] != 0x01]
     status = {name: commands.reply(decode(bytes_of(name))[1])[0] for name in answers}
     assert status == {
         "homing done": Status.SUCCESS,
@@ -146,8 +146,8 @@ def test_every_status_and_bit_has_the_number_of_the_manual():
 @pytest.mark.parametrize(
     "misuse",
     [
-        lambda: commands.reply(Frame(0x22, b"\x00")),
-        lambda: commands.reply(Frame(0x22, b"\x63\x00")),
+        lambda: commands.reply(Packet(0x22, b"\x00")),
+        lambda: commands.reply(Packet(0x22, b"\x63\x00")),
         lambda: commands.number(b"\x00\x00\x00"),
         lambda: commands.number(struct.pack("<f", math.nan)),
         lambda: commands.limits(bytes(31)),
@@ -163,9 +163,9 @@ def test_every_status_and_bit_has_the_number_of_the_manual():
         lambda: commands.update(Command.INFO, 10),
         lambda: commands.update(Command.FORCE, 0),
         lambda: commands.update(Command.FORCE, 65536),
-        lambda: Frame(0xAA),
-        lambda: Frame(256),
-        lambda: Frame(1, bytes(codec.MAX_PAYLOAD + 1)),
+        lambda: Packet(0xAA),
+        lambda: Packet(256),
+        lambda: Packet(1, bytes(codec.MAX_PAYLOAD + 1)),
     ],
 )
 def test_what_cannot_be_is_the_codecs_own_error(misuse):
@@ -175,99 +175,99 @@ def test_what_cannot_be_is_the_codecs_own_error(misuse):
 
 
 def test_a_stream_is_the_same_whole_halved_and_byte_by_byte():
-    stream = b"".join(bytes_of(name) for name in FRAMES)
-    want = [Frame(command, bytes.fromhex(payload)) for _, command, payload in FRAMES.values()]
-    assert all_frames(stream) == want
+    stream = b"".join(bytes_of(name) for name in PACKETS)
+    want = [Packet(command, bytes.fromhex(payload)) for _, command, payload in PACKETS.values()]
+    assert all_packets(stream) == want
     assert fed([stream[: len(stream) // 2], stream[len(stream) // 2 :]]) == want
     assert fed([stream[at : at + 1] for at in range(len(stream))]) == want
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_a_frame_cut_at_any_length_is_waited_for(name):
+@pytest.mark.parametrize("name", PACKETS)
+def test_a_packet_cut_at_any_length_is_waited_for(name):
     whole = bytes_of(name)
     for length in range(len(whole)):
-        used, frame = decode(whole[:length])
-        assert (used, frame) == (0, None)
+        used, packet = decode(whole[:length])
+        assert (used, packet) == (0, None)
 
 
 @pytest.mark.parametrize(
     "noise", [b"\x00", b"\xaa", b"\xaa\xaa", b"\xaa\xaa\xaa", b"\xaa\xaa\x00", b"\xaa" * 9, b"hello"]
 )
-@pytest.mark.parametrize("name", FRAMES)
-def test_noise_before_and_between_costs_no_frame(name, noise):
-    frame = decode(bytes_of(name))[1]
+@pytest.mark.parametrize("name", PACKETS)
+def test_noise_before_and_between_costs_no_packet(name, noise):
+    packet = decode(bytes_of(name))[1]
     stream = noise + bytes_of(name) + noise + bytes_of(name)
-    assert all_frames(stream) == [frame, frame]
-    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [frame, frame]
+    assert all_packets(stream) == [packet, packet]
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [packet, packet]
 
 
 def test_three_aa_must_stand_in_a_row():
-    """Public drivers count any three AA: AA 00 AA AA then begins a frame for them."""
+    """Public drivers count any three AA: AA 00 AA AA then begins a packet for them."""
     spread = b"\xaa\x00\xaa\xaa" + bytes_of("stop")[3:]
-    assert all_frames(spread + bytes_of("info")) == [Frame(0x50)]
+    assert all_packets(spread + bytes_of("info")) == [Packet(0x50)]
 
 
 @pytest.mark.parametrize(
     "payload", [b"\xaa\xaa\xaa", b"\xaa" * 7, b"x\xaa\xaa\xaa\x22\x00\x00", b"\xaa\xaa\xaa\xaa\x06"]
 )
-def test_a_preamble_inside_a_payload_splits_no_frame(payload):
-    frame = Frame(Command.LOOP, payload)
-    stream = encode(frame) + encode(frame)
-    assert len(stream.split(codec.PREAMBLE)) > 3  # a public driver cuts there: two frames make two cuts, not more
-    assert all_frames(stream) == [frame, frame]
-    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [frame, frame]
+def test_a_preamble_inside_a_payload_splits_no_packet(payload):
+    packet = Packet(Command.LOOP, payload)
+    stream = encode(packet) + encode(packet)
+    assert len(stream.split(codec.PREAMBLE)) > 3  # a public driver cuts there: two packets make two cuts, not more
+    assert all_packets(stream) == [packet, packet]
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == [packet, packet]
 
 
-def test_a_whole_frame_inside_a_payload_stays_inside():
-    frame = Frame(Command.LOOP, bytes_of("fast stop"))
-    assert all_frames(encode(frame)) == [frame]
+def test_a_whole_packet_inside_a_payload_stays_inside():
+    packet = Packet(Command.LOOP, bytes_of("fast stop"))
+    assert all_packets(encode(packet)) == [packet]
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_a_frame_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
+@pytest.mark.parametrize("name", PACKETS)
+def test_a_packet_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
     good = bytes_of(name)
-    after = Frame(Command.LOOP, bytes(range(16)))
+    after = Packet(Command.LOOP, bytes(range(16)))
     close = bytes(codec.MAX_PAYLOAD)  # a flipped length may claim so much more
     for bit in range(8 * len(good)):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << bit % 8
-        found = all_frames(bytes(bad) + encode(after) + close)
+        found = all_packets(bytes(bad) + encode(after) + close)
         assert found[-1:] == [after]
         assert decode(good)[1] not in found[:-1]
 
 
-def test_a_good_frame_that_begins_inside_a_damaged_one_is_found():
+def test_a_good_packet_that_begins_inside_a_damaged_one_is_found():
     damaged = bytes_of("grasp 12 mm 34 mm/s")[:9]  # cut: its length claims the beginning of the next
-    assert all_frames(damaged + bytes_of("stop") + bytes_of("info")) == [Frame(0x22), Frame(0x50)]
+    assert all_packets(damaged + bytes_of("stop") + bytes_of("info")) == [Packet(0x22), Packet(0x50)]
 
 
 def test_a_length_above_the_largest_payload_is_noise_at_once():
     claim = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD + 1)
-    assert all_frames(claim + bytes_of("stop")) == [Frame(0x22)]
+    assert all_packets(claim + bytes_of("stop")) == [Packet(0x22)]
     waits = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD)
     assert decode(waits + bytes_of("stop")) == (0, None)
-    assert all_frames((waits + bytes_of("stop"))[1:]) == [Frame(0x22)]  # what a caller does when no more comes
+    assert all_packets((waits + bytes_of("stop"))[1:]) == [Packet(0x22)]  # what a caller does when no more comes
 
 
 @given(st.binary(max_size=80), st.integers(0, 255).filter(lambda number: number != 0xAA), st.binary(max_size=64))
-def test_whatever_is_framed_is_read_back(noise, command, payload):
-    frame = Frame(command, payload)
-    assert decode(encode(frame)) == (len(encode(frame)), frame)
-    assert frame in all_frames(noise + encode(frame) + bytes(codec.MAX_PAYLOAD + 8))
+def test_whatever_is_packetd_is_read_back(noise, command, payload):
+    packet = Packet(command, payload)
+    assert decode(encode(packet)) == (len(encode(packet)), packet)
+    assert packet in all_packets(noise + encode(packet) + bytes(codec.MAX_PAYLOAD + 8))
 
 
 @given(st.lists(st.binary(max_size=30), max_size=6))
 def test_pieces_change_nothing(chunks):
-    assert fed(chunks) == all_frames(b"".join(chunks))
+    assert fed(chunks) == all_packets(b"".join(chunks))
 
 
 def fuzzed(seed):
-    """A million bytes rich in AA, 00 and 01 with 2000 frames planted in them, and where each of these begins."""
+    """A million bytes rich in AA, 00 and 01 with 2000 packets planted in them, and where each of these begins."""
     rng = np.random.default_rng(seed)
     alphabet = np.array([0xAA] * 6 + [0x00] * 4 + [0x01] + list(range(2, 7)), np.uint8)
     noise = rng.choice(alphabet, 1_000_000).tobytes()
     stream, planted, before = bytearray(), {}, 0
-    for cut, name in zip(np.sort(rng.choice(len(noise), 2000, replace=False)), itertools.cycle(FRAMES), strict=False):
+    for cut, name in zip(np.sort(rng.choice(len(noise), 2000, replace=False)), itertools.cycle(PACKETS), strict=False):
         stream += noise[before:cut]
         planted[len(stream)] = name
         stream += bytes_of(name)
@@ -276,24 +276,24 @@ def fuzzed(seed):
 
 
 def places(stream):
-    """Where each frame begins that is found."""
+    """Where each packet begins that is found."""
     buffer, found, at = bytearray(stream), {}, 0
     while True:
-        used, frame = decode(buffer)
-        if frame is None:
+        used, packet = decode(buffer)
+        if packet is None:
             return found
-        found[at + used - len(encode(frame))] = frame
+        found[at + used - len(encode(packet))] = packet
         at += used
         del buffer[:used]
 
 
-def test_a_million_fuzzed_bytes_cost_a_planted_frame_only_where_noise_makes_a_frame_of_it():
-    """A planted frame is found, unless it lies inside noise that is itself a frame: a beginning, a length that reaches
-    so far, and a check sum that holds, which is so for 1 in 65536 of them. Nothing else is lost."""
+def test_a_million_fuzzed_bytes_cost_a_planted_packet_only_where_noise_makes_a_packet_of_it():
+    """A planted packet is found, unless it lies inside noise that is itself a packet: a beginning, a length that
+    reaches so far, and a check sum that holds, which is so for 1 in 65536 of them. Nothing else is lost."""
     stream, planted = fuzzed(0)
     found = places(stream)
     lost = {at for at in planted if at not in found}
-    inside = {at for start, frame in found.items() for at in range(start + 1, start + len(encode(frame)))}
+    inside = {at for start, packet in found.items() for at in range(start + 1, start + len(encode(packet)))}
     swallowed = inside & set(planted)
     assert lost == swallowed
     assert len(lost) <= 2
@@ -308,7 +308,7 @@ def test_whatever_is_found_in_noise_is_parsed_or_refused_with_the_drivers_own_er
             with contextlib.suppress(WireError):
                 parse(payload)
         with contextlib.suppress(WireError):
-            commands.reply(Frame(0x40, payload))
+            commands.reply(Packet(0x40, payload))
 
 
 class Counted(tuple):
@@ -322,14 +322,14 @@ class Counted(tuple):
 
 
 @pytest.mark.parametrize("half", ["aa aa aa 06 ff 00", "aa aa aa 06 00 01", "aa aa aa 06 ff 00 55"])
-def test_frames_that_break_off_cost_each_byte_once_however_many_claim_it(half, monkeypatch):
-    """Summed frame by frame, each byte is gone through once for every frame that claims it, 40 times here."""
+def test_packets_that_break_off_cost_each_byte_once_however_many_claim_it(half, monkeypatch):
+    """Summed packet by packet, each byte is gone through once for every packet that claims it, 40 times here."""
     stream = bytes.fromhex(half) * 500
     monkeypatch.setattr(codec, "_TABLE", Counted(codec._TABLE))
     Counted.looked = 0
-    used, frame = decode(stream)
-    assert frame is None
-    assert used > len(stream) - 265  # all but what may still become a frame
+    used, packet = decode(stream)
+    assert packet is None
+    assert used > len(stream) - 265  # all but what may still become a packet
     assert Counted.looked <= len(stream)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from robot.drivers.wsg50.commands import Statistics
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50.server import Emulator
+from robot.emulators.wsg50.server import EmulatedWSG50
 from robot.errors import DeviceError, RobotConfigError
 from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, TARE, bench
 
@@ -171,7 +171,7 @@ def test_a_serial_line_must_have_room_beside_the_updates(baud, stop_bits, ms, fi
 
 
 def test_it_does_not_home_where_connecting_must_move_nothing():
-    emulator = Emulator(referenced=False, speed_up=20.0)
+    emulator = EmulatedWSG50(referenced=False, speed_up=20.0)
     with bench(emulator=emulator, connect=False) as (gripper, _):
         gripper.may_move = False
         with pytest.raises(DeviceError, match="does not know its reference, and may not be moved now"):
@@ -182,12 +182,12 @@ def test_it_does_not_home_where_connecting_must_move_nothing():
 
 @PORTS
 def test_it_homes_on_connecting_where_the_reference_is_lost(port, caplog):
-    with bench(port, emulator=Emulator(speed_up=20.0)) as (gripper, emulator):
+    with bench(port, emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, emulator):
         assert emulator.heard.count(HOME) == 1
         assert "homing, the jaws move" in caplog.text
         assert gripper.state().opening_mm == pytest.approx(110.0)
         assert gripper.home().status == "idle"
-    with bench(home_direction="in", emulator=Emulator(speed_up=20.0)) as (gripper, _):
+    with bench(home_direction="in", emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, _):
         assert gripper.state().opening_mm == pytest.approx(0.0)
 
 

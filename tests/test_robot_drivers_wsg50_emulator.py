@@ -4,12 +4,12 @@ import struct
 
 import pytest
 
-from robot.drivers.wsg50.codec import Frame, decode, encode
+from robot.drivers.wsg50.codec import Packet, decode, encode
 from robot.emulators.wsg50.faults import KINDS
 from robot.emulators.wsg50.mechanics import Mechanics
-from robot.emulators.wsg50.server import Emulator, Faults
+from robot.emulators.wsg50.server import EmulatedWSG50, Faults
 from robot.errors import RobotConfigError
-from tests.wsg50_frames import bytes_of
+from tests.wsg50_packets import bytes_of
 
 MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x21, 0x22, 0x23, 0x24, 0x25, 0x26
 IDLE, NO_PART, PART_LOST, HOLDING, ERROR = 0, 2, 3, 4, 7
@@ -20,11 +20,11 @@ class Hand:
 
     def __init__(self, **settings):
         self.now = 0.0
-        self.emulator = Emulator(clock=lambda: self.now, **{"referenced": True} | settings)
+        self.emulator = EmulatedWSG50(clock=lambda: self.now, **{"referenced": True} | settings)
 
     def tell(self, command, payload=b""):
         """Status and parameters of its answer."""
-        *_, answer = self.emulator.receive(Frame(command, payload))
+        *_, answer = self.emulator.receive(Packet(command, payload))
         assert answer.id == command
         return struct.unpack_from("<H", answer.payload)[0], answer.payload[2:]
 
@@ -34,7 +34,7 @@ class Hand:
         for _ in range(round(seconds * 100)):
             self.now += 0.01
             said += self.emulator.tick()
-        return [(frame.id, struct.unpack_from("<H", frame.payload)[0]) for frame in said]
+        return [(packet.id, struct.unpack_from("<H", packet.payload)[0]) for packet in said]
 
     def to(self, command, width, speed=100.0):
         """A motion with a width, awaited: its result."""
@@ -157,7 +157,7 @@ def test_stop_aborts_a_motion_and_leaves_it_usable():
     hand = Hand(opening_mm=100.0)
     hand.tell(MOVE, b"\x02" + struct.pack("<ff", 10, 50))
     hand.wait(0.2)
-    first, second = hand.emulator.receive(Frame(STOP))
+    first, second = hand.emulator.receive(Packet(STOP))
     assert (first.id, first.payload) == (MOVE, b"\x13\x00")
     assert (second.id, second.payload) == (STOP, b"\x00\x00")
     assert not hand.emulator.moves
@@ -227,7 +227,7 @@ def test_updates_come_by_themselves_until_told_to_end():
     assert hand.wait(0.2) == []
 
 
-def test_an_answer_that_fits_no_frame_is_a_range_error():
+def test_an_answer_that_fits_no_packet_is_a_range_error():
     hand = Hand()
     assert hand.tell(0x06, bytes(254)) == (0, bytes(254))
     assert [hand.tell(0x06, bytes(size)) for size in (255, 256)] == [(28, b"")] * 2
@@ -261,12 +261,12 @@ def test_a_client_that_goes_without_a_word_leaves_a_fast_stop():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_fault_does_to_a_frame_what_its_name_says(kind):
-    frame = decode(bytes_of("grasp 12 mm 34 mm/s"))[1]
+def test_a_fault_does_to_a_packet_what_its_name_says(kind):
+    packet = decode(bytes_of("grasp 12 mm 34 mm/s"))[1]
     faults = Faults(1.0, [kind], delay_s=0.5)
-    pieces = list(faults.on(frame))
+    pieces = list(faults.on(packet))
     data = b"".join(piece.data or b"" for piece in pieces)
-    good = encode(frame)
+    good = encode(packet)
     assert faults.counts == {kind: 1}
     assert {
         "dropped": pieces == [],
@@ -274,20 +274,20 @@ def test_a_fault_does_to_a_frame_what_its_name_says(kind):
         "corrupted": len(data) == len(good) and sum((a ^ b).bit_count() for a, b in zip(data, good, strict=False)) == 1,
         "delayed": [(piece.data, piece.pause_s) for piece in pieces] == [(good, 0.5)],
         "split": data == good and [piece.pause_s for piece in pieces] == [0, 0.5],
-        "wrong id": (found := decode(data)[1]) and found.payload == frame.payload and found.id != frame.id,
+        "wrong id": (found := decode(data)[1]) and found.payload == packet.payload and found.id != packet.id,
         "disconnect": [piece.data for piece in pieces] == [None],
     }[kind]
 
 
 def test_faults_come_at_their_rate_and_the_same_from_the_same_seed():
-    frame = Frame(STOP)
+    packet = Packet(STOP)
     runs = []
     for _ in range(2):
         faults = Faults(0.1, seed=3)
-        runs.append([list(faults.on(frame)) for _ in range(2000)])
+        runs.append([list(faults.on(packet)) for _ in range(2000)])
         assert 140 <= sum(faults.counts.values()) <= 260
     assert runs[0] == runs[1]
-    assert not any(Faults().on(frame) is None for _ in range(5))
+    assert not any(Faults().on(packet) is None for _ in range(5))
 
 
 @pytest.mark.parametrize("settings", [{"rate": 1.5}, {"rate": -0.1}, {"kinds": ["gone"]}])

@@ -8,7 +8,7 @@ import pytest
 from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.port import LinkLost
 from robot.emulators.wsg50.faults import KINDS, Piece
-from robot.emulators.wsg50.server import Emulator, Faults
+from robot.emulators.wsg50.server import EmulatedWSG50, Faults
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench
@@ -16,7 +16,7 @@ from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script,
 
 @PORTS
 def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = Script()
     with bench(port, faults=script, emulator=slow, acknowledge_faults=True) as (gripper, _):
         script.tell({(GRASP, 2): "disconnect"})
@@ -31,7 +31,7 @@ def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
 
 
 def test_a_serial_line_that_is_cut_while_it_homes_on_connecting_is_opened_again_to_stop_it():
-    slow = Emulator(speed_up=0.1)
+    slow = EmulatedWSG50(speed_up=0.1)
     script = Script()
     with bench("pty", faults=script, emulator=slow, connect=False) as (gripper, _):
         script.tell({(HOME, 2): "disconnect"})
@@ -43,7 +43,7 @@ def test_a_serial_line_that_is_cut_while_it_homes_on_connecting_is_opened_again_
 
 
 def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(monkeypatch):
-    slow = Emulator(referenced=True, opening_mm=100.0, speed_up=0.1)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0, speed_up=0.1)
     script = Script()
 
     def no_cable():
@@ -73,7 +73,7 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(mon
 
 @PORTS
 def test_a_stop_whose_length_is_damaged_swallows_no_later_one(port):
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = Script()
     with bench(port, faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 5.0))
@@ -96,7 +96,7 @@ def test_an_echo_whose_length_is_damaged_swallows_no_later_one():
 
 def test_homing_whose_result_is_lost_is_not_done_twice():
     script = Script()
-    with bench(faults=script, emulator=Emulator(speed_up=2.0), connect=False) as (gripper, emulator):
+    with bench(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (gripper, emulator):
         script.tell({(HOME, 3): "dropped"})
         gripper.connect()
         assert emulator.heard.count(HOME) == 1
@@ -135,7 +135,7 @@ def test_a_grasp_is_done_once_whatever_of_it_is_lost(port, number):
 
 @pytest.mark.parametrize("kind", ["dropped", "duplicated", "corrupted", "delayed", "split", "wrong id"])
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_opening_ends_where_it_was_told_whatever_happens_to_a_frame(kind, number):
+def test_opening_ends_where_it_was_told_whatever_happens_to_a_packet(kind, number):
     script = Script()
     with bench(faults=script) as (gripper, emulator):
         for opening in (20.0, 80.0):
@@ -146,7 +146,7 @@ def test_opening_ends_where_it_was_told_whatever_happens_to_a_frame(kind, number
 
 def test_a_result_that_comes_twice_does_not_end_the_next_motion():
     script = Script()
-    slow = Emulator(referenced=True, opening_mm=50.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
     with bench(faults=script, emulator=slow, opening_speed_mm_s=100.0) as (gripper, _):
         script.tell({(MOVE, 3): "duplicated"})
         gripper.open(60.0)
@@ -157,7 +157,7 @@ def test_a_result_that_comes_twice_does_not_end_the_next_motion():
 
 def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
     script = Script()
-    slow = Emulator(referenced=True, opening_mm=50.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
     with bench(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
         script.tell({(MOVE, 2): "after a result"})
         assert gripper.open(40.0).opening_mm == pytest.approx(40.0, abs=0.1)
@@ -177,7 +177,7 @@ def test_every_reading_that_is_lost_is_asked_again():
 @pytest.mark.parametrize("kind", KINDS)
 def test_grasps_over_a_bad_line_end_right_or_with_a_reason_and_never_closing(port, kind):
     faults = Faults(0.0, [kind], seed=7, delay_s=0.02)
-    emulator = Emulator(referenced=True, speed_up=40.0)
+    emulator = EmulatedWSG50(referenced=True, speed_up=40.0)
     settings = {"timeout_s": 0.1, "acknowledge_faults": True, "update_ms": 10}
     with bench(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
         faults.rate = 0.005 if kind == "disconnect" else 0.02

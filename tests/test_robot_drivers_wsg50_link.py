@@ -18,20 +18,20 @@ from serial.urlhandler import protocol_socket
 from robot.drivers.wsg50 import codec as wsg50_codec
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50 import link as wsg50_link
-from robot.drivers.wsg50.codec import Frame, decode, encode
+from robot.drivers.wsg50.codec import Packet, decode, encode
 from robot.drivers.wsg50.commands import Command, Status
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import CommandFailed, Link, NoEcho, NoReply
 from robot.drivers.wsg50.port import LinkLost, Port
 from robot.errors import DeviceError
 from tests.waiting import until
-from tests.wsg50_frames import bytes_of
+from tests.wsg50_packets import bytes_of
 
 OK = bytes(2)
 
 
 class Peer:
-    """The other end of a TCP line: answers each frame by a function frame -> bytes, or None to hang up."""
+    """The other end of a TCP line: answers each packet by a function packet -> bytes, or None to hang up."""
 
     def __init__(self, answer):
         self.answer, self.heard = answer, []
@@ -50,12 +50,12 @@ class Peer:
             while data := self.receive(client):
                 buffer += data
                 while True:
-                    used, frame = decode(buffer)
+                    used, packet = decode(buffer)
                     del buffer[:used]
-                    if frame is None:
+                    if packet is None:
                         break
-                    self.heard.append(frame.id)
-                    answer = self.answer(frame)
+                    self.heard.append(packet.id)
+                    answer = self.answer(packet)
                     if answer is None:
                         return
                     client.sendall(answer)
@@ -118,16 +118,16 @@ class Timed:
         return told + bytes(itertools.islice(self.stream, self.at_once))
 
     def write(self, data):
-        frame = decode(data)[1]
-        if self.echoes and frame and frame.id == Command.LOOP:
-            self.told = reply(frame, frame.payload)
+        packet = decode(data)[1]
+        if self.echoes and packet and packet.id == Command.LOOP:
+            self.told = reply(packet, packet.payload)
 
     def close(self): ...
 
 
 TABLE = wsg50_codec._TABLE
 HALF = b"\xaa\xaa\xaa\x06\xff\x00"
-UPDATE = encode(Frame(Command.SYSTEM_STATE, OK + bytes(4)))
+UPDATE = encode(Packet(Command.SYSTEM_STATE, OK + bytes(4)))
 FLOODS = pytest.mark.parametrize(
     "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
 )
@@ -150,13 +150,13 @@ def ends(call, seconds=20.0):
     return ended[0]
 
 
-def reply(frame, parameters=b"", status=0):
-    return encode(Frame(frame.id, status.to_bytes(2, "little") + parameters))
+def reply(packet, parameters=b"", status=0):
+    return encode(Packet(packet.id, status.to_bytes(2, "little") + parameters))
 
 
-def echoing(frame):
+def echoing(packet):
     """Answers LOOP, and nothing else."""
-    return reply(frame, frame.payload) if frame.id == Command.LOOP else b""
+    return reply(packet, packet.payload) if packet.id == Command.LOOP else b""
 
 
 def linked(peer, timeout_s=0.2):
@@ -185,11 +185,11 @@ def test_a_loopback_port_gives_back_what_it_is_given():
 
 
 def test_a_reply_is_found_among_updates_and_noise():
-    def answer(frame):
-        if frame.id == Command.LOOP:
-            return echoing(frame)
-        update = encode(Frame(Command.OPENING, OK + b"\x00\x00\x16\x43"))
-        return update + b"\xaa\xaa noise" + update + reply(frame, b"\x00\x00\x20\x42")
+    def answer(packet):
+        if packet.id == Command.LOOP:
+            return echoing(packet)
+        update = encode(Packet(Command.OPENING, OK + b"\x00\x00\x16\x43"))
+        return update + b"\xaa\xaa noise" + update + reply(packet, b"\x00\x00\x20\x42")
 
     with Peer(answer) as peer, linked(peer) as link:
         assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 40.0
@@ -197,18 +197,18 @@ def test_a_reply_is_found_among_updates_and_noise():
 
 
 def test_pending_is_not_the_end_of_a_command():
-    def answer(frame):
-        return echoing(frame) or reply(frame, status=Status.CMD_PENDING) + reply(frame)
+    def answer(packet):
+        return echoing(packet) or reply(packet, status=Status.CMD_PENDING) + reply(packet)
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.call(Frame(Command.TARE)) == b""
-        link.begin(Frame(Command.HOME, b"\0"))
+        assert link.call(Packet(Command.TARE)) == b""
+        link.begin(Packet(Command.HOME, b"\0"))
         assert [link.poll(Command.HOME, 1.0), link.poll(Command.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
         assert link.poll(Command.HOME, 0.01) is None
 
 
 def test_another_status_than_success_says_which_command_and_why():
-    with Peer(lambda frame: echoing(frame) or reply(frame, status=16)) as peer, linked(peer) as link:
+    with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
         with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
             link.tell(commands.stop())
         assert caught.value.status is Status.ACCESS_DENIED
@@ -261,7 +261,7 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
     ids=["poll", "urgent", "sync", "call", "tell", "pump"],
 )
 def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, at_once, echoes, monkeypatch):
-    """Half frames byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
+    """Half packets byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
     peer = Timed(data, at_once, echoes)
     for module, name in ((wsg50_link, "Port"), (wsg50_link, "time"), (wsg50_codec, "_TABLE")):
         monkeypatch.setattr(module, name, peer)
@@ -296,10 +296,10 @@ def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end(
 
 
 def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
-    updates = b"".join(encode(Frame(Command.OPENING, OK + struct.pack("<f", each))) for each in range(800))
+    updates = b"".join(encode(Packet(Command.OPENING, OK + struct.pack("<f", each))) for each in range(800))
 
-    def answer(frame):
-        return echoing(frame) or reply(frame) + updates
+    def answer(packet):
+        return echoing(packet) or reply(packet) + updates
 
     with Peer(answer) as peer, linked(peer) as link:
         link.tell(commands.stop())
@@ -311,8 +311,8 @@ def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
 def test_a_command_that_was_heard_damaged_is_asked_again():
     statuses = [11, 0]
 
-    def answer(frame):
-        return echoing(frame) or reply(frame, status=statuses.pop(0))
+    def answer(packet):
+        return echoing(packet) or reply(packet, status=statuses.pop(0))
 
     with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
         link.tell(commands.stop())
@@ -321,7 +321,7 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
 
 
 def test_where_nobody_echoes_nothing_is_asked_again():
-    with Peer(lambda frame: b"") as peer, linked(peer, timeout_s=0.05) as link:
+    with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoEcho):
             link.tell(commands.stop())
         until(lambda: len(peer.heard) == 3)
@@ -330,7 +330,7 @@ def test_where_nobody_echoes_nothing_is_asked_again():
 
 
 def test_a_gripper_that_echoes_nothing_is_not_there():
-    with Peer(lambda frame: b"") as peer, linked(peer, timeout_s=0.05) as link:
+    with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoReply, match="is it on, and connected"):
             link.call(commands.stop())
         assert set(peer.heard) == {Command.LOOP}  # nothing was told to a line in doubt
@@ -340,13 +340,13 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
     """The first question is answered after the second was asked; without the echo the old value would be taken."""
     late = []
 
-    def answer(frame):
-        if frame.id == Command.LOOP:
-            return b"".join(late) + echoing(frame)
+    def answer(packet):
+        if packet.id == Command.LOOP:
+            return b"".join(late) + echoing(packet)
         if not late:
-            late.append(reply(frame, b"\x00\x00\x80\x3f"))  # 1.0
+            late.append(reply(packet, b"\x00\x00\x80\x3f"))  # 1.0
             return b""
-        return reply(frame, b"\x00\x00\x00\x40")  # 2.0
+        return reply(packet, b"\x00\x00\x00\x40")  # 2.0
 
     with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
         with pytest.raises(NoReply):
@@ -356,8 +356,8 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
 
 
 def test_a_doubled_reply_raises_doubt_before_the_next_command():
-    def answer(frame):
-        return echoing(frame) or 2 * reply(frame, b"\x00\x00\x80\x3f")
+    def answer(packet):
+        return echoing(packet) or 2 * reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
         link.call(commands.ask(Command.GET_FORCE_LIMIT))
@@ -367,11 +367,11 @@ def test_a_doubled_reply_raises_doubt_before_the_next_command():
         assert peer.heard.count(Command.LOOP) == loops + 1
 
 
-def test_a_frame_that_stops_half_way_hides_nothing_behind_it():
+def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
     half = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never come
 
-    def answer(frame):
-        return echoing(frame) or half + reply(frame, b"\x00\x00\x80\x3f")
+    def answer(packet):
+        return echoing(packet) or half + reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
         assert commands.number(link.call(commands.ask(Command.GET_FORCE_LIMIT))) == 1.0
@@ -381,8 +381,8 @@ def test_a_frame_that_stops_half_way_hides_nothing_behind_it():
 def test_replies_of_the_wrong_length_are_asked_again():
     answers = [b"\x01", b"\x00\x00\x80\x3f"]
 
-    def answer(frame):
-        return echoing(frame) or reply(frame, answers.pop(0))
+    def answer(packet):
+        return echoing(packet) or reply(packet, answers.pop(0))
 
     with Peer(answer) as peer, linked(peer) as link:
         assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 1.0
@@ -390,14 +390,14 @@ def test_replies_of_the_wrong_length_are_asked_again():
 
 
 def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
-    with Peer(lambda frame: echoing(frame) or reply(frame)) as peer, linked(peer) as link:
+    with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
         link.doubt()
         link.urgent(commands.stop())
         assert peer.heard == [Command.STOP]
 
 
 def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
-    with Peer(lambda frame: None) as peer:
+    with Peer(lambda packet: None) as peer:
         link = Link(peer.url, timeout_s=0.5)
         link.open()
         with pytest.raises(LinkLost, match=r"is gone.*recover"):

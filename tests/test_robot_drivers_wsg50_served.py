@@ -14,11 +14,11 @@ import time
 import numpy as np
 import pytest
 
-from robot.drivers.wsg50.codec import Frame, encode
+from robot.drivers.wsg50.codec import Packet, encode
 from robot.emulators.wsg50 import gripper as wsg50_emulated
-from robot.emulators.wsg50.server import Emulator, Faults, main, serve_pty, serve_tcp
+from robot.emulators.wsg50.server import EmulatedWSG50, Faults, main, serve_pty, serve_tcp
 from tests.waiting import STARTED, STARTED_IDS, first_line, running
-from tests.wsg50_frames import bytes_of
+from tests.wsg50_packets import bytes_of
 
 STOP = 0x22
 
@@ -31,27 +31,27 @@ def read_until(read, want, seconds=5.0):
 
 
 def test_it_speaks_the_printed_bytes_over_tcp():
-    with serve_tcp(Emulator()) as url:
+    with serve_tcp(EmulatedWSG50()) as url:
         host, port = url.removeprefix("socket://").split(":")
         with socket.create_connection((host, int(port)), timeout=5) as client:
             client.sendall(bytes_of("stop"))
-            want = encode(Frame(STOP, b"\0\0"))
+            want = encode(Packet(STOP, b"\0\0"))
             assert read_until(lambda: client.recv(100), want) == want
 
 
 def test_it_speaks_the_printed_bytes_over_a_terminal():
-    with serve_pty(Emulator()) as path:
+    with serve_pty(EmulatedWSG50()) as path:
         terminal = os.open(path, os.O_RDWR | os.O_NOCTTY)
         try:
             os.write(terminal, bytes_of("get force limit"))
-            want = encode(Frame(0x33, b"\0\0" + struct.pack("<f", 40)))
+            want = encode(Packet(0x33, b"\0\0" + struct.pack("<f", 40)))
             assert read_until(lambda: os.read(terminal, 100), want) == want
         finally:
             os.close(terminal)
 
 
-def damaged(frame):
-    return frame[:-1] + bytes([frame[-1] ^ 1])
+def damaged(packet):
+    return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
 def talk(client, sent, want):
@@ -67,37 +67,37 @@ def client_of(url):
 
 
 def test_a_damaged_command_is_answered_only_if_it_is_to_be():
-    emulator, said = Emulator(), encode(Frame(STOP, b"\x0b\x00"))
+    emulator, said = EmulatedWSG50(), encode(Packet(STOP, b"\x0b\x00"))
     with serve_tcp(emulator) as url, client_of(url) as client:
         client.sendall(damaged(bytes_of("stop")))
-        assert talk(client, bytes_of("loop abc"), encode(Frame(0x06, b"\0\0abc")))
+        assert talk(client, bytes_of("loop abc"), encode(Packet(0x06, b"\0\0abc")))
         emulator.answers_bad_checksum = True
         assert talk(client, b"\xaa" + damaged(bytes_of("stop")), said)
         assert STOP not in emulator.heard
 
 
 def test_a_length_that_lies_swallows_what_comes_next_until_its_bytes_are_there():
-    emulator = Emulator()
+    emulator = EmulatedWSG50()
     with serve_tcp(emulator) as url, client_of(url) as client:
         client.sendall(b"\xaa\xaa\xaa\x22\xff\x00" + bytes_of("info"))
         time.sleep(0.1)
         assert emulator.heard == []
-        assert talk(client, bytes(264), encode(Frame(0x50, bytes(2) + struct.pack("<BBHI", 1, 6, 0x4000, 20260101))))
+        assert talk(client, bytes(264), encode(Packet(0x50, bytes(2) + struct.pack("<BBHI", 1, 6, 0x4000, 20260101))))
 
 
-def test_no_frame_that_can_be_sent_ends_it():
+def test_no_packet_that_can_be_sent_ends_it():
     """Every id with payloads of every kind, huge numbers and such that are none among them."""
     rng = np.random.default_rng(0)
     odd = np.array([math.nan, math.inf, -math.inf, 3e38, -3e38, 1e-40, 0, 4], "<f4")
     sizes = [0, 1, 3, 4, 8, 9, 254, 255, 256]
     payloads = [rng.bytes(size) for size in sizes] + [rng.choice(odd, size).tobytes() for size in (1, 2) * 6]
     payloads += [b"\x02" + rng.choice(odd, 2).tobytes() for _ in range(6)]
-    frames = [Frame(each, payload) for payload in payloads for each in range(256) if each != 0xAA]
-    emulator = Emulator(referenced=True, speed_up=50.0)
+    packets = [Packet(each, payload) for payload in payloads for each in range(256) if each != 0xAA]
+    emulator = EmulatedWSG50(referenced=True, speed_up=50.0)
     with serve_tcp(emulator) as url, client_of(url) as client:
         client.setblocking(False)
-        stream, got = b"".join(map(encode, frames)) + bytes_of("loop abc"), bytearray()
-        want = encode(Frame(0x06, b"\0\0abc"))
+        stream, got = b"".join(map(encode, packets)) + bytes_of("loop abc"), bytearray()
+        want = encode(Packet(0x06, b"\0\0abc"))
         deadline = time.monotonic() + 30
         while want not in got[-10000:]:
             assert time.monotonic() < deadline
@@ -108,7 +108,7 @@ def test_no_frame_that_can_be_sent_ends_it():
                 got += data
             if writable:
                 stream = stream[client.send(stream[:4096]) :]
-    assert len(emulator.heard) == len(frames) + 1
+    assert len(emulator.heard) == len(packets) + 1
 
 
 def test_what_it_fails_on_costs_one_client(monkeypatch, caplog):
@@ -116,12 +116,12 @@ def test_what_it_fails_on_costs_one_client(monkeypatch, caplog):
         raise RuntimeError("as a mistake in it would")
 
     monkeypatch.setitem(wsg50_emulated._ACTIONS, 0x52, broken)
-    with serve_tcp(Emulator()) as url:
+    with serve_tcp(EmulatedWSG50()) as url:
         with client_of(url) as client:
             client.sendall(bytes_of("get tag"))
             assert client.recv(100) == b""
         with client_of(url) as client:
-            assert talk(client, bytes_of("stop"), encode(Frame(STOP, b"\0\0")))
+            assert talk(client, bytes_of("stop"), encode(Packet(STOP, b"\0\0")))
     assert "as a mistake in it would" in caplog.text
 
 
@@ -134,7 +134,7 @@ def test_a_port_in_use_is_a_sentence(capsys):
 
 def test_a_line_that_is_cut_can_be_taken_up_again():
     faults = Faults(1.0, ["disconnect"])
-    emulator = Emulator()
+    emulator = EmulatedWSG50()
     with serve_tcp(emulator, faults) as url:
         host, port = url.removeprefix("socket://").split(":")
         with socket.create_connection((host, int(port)), timeout=5) as client:

@@ -14,7 +14,7 @@ from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.commands import Status
 from robot.drivers.wsg50.driver import WSG50
 from robot.emulators.wsg50 import gripper as wsg50_emulated
-from robot.emulators.wsg50.server import Emulator
+from robot.emulators.wsg50.server import EmulatedWSG50
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_bench import ACK, FAST_STOP, GRASP, HOME, PORTS, QUICK, STOP, TARE, Script, bench
@@ -72,7 +72,7 @@ def test_a_warning_alone_keeps_nothing_from_working():
 
 @PORTS
 def test_what_is_held_stays_held_by_its_force_when_the_program_comes_back(port):
-    emulator = Emulator(referenced=True, speed_up=20.0, object_mm=40.0)
+    emulator = EmulatedWSG50(referenced=True, speed_up=20.0, object_mm=40.0)
     emulator.has_force_fingers = True
     with bench(port, emulator=emulator) as (gripper, _):
         gripper.grasp(10.0)
@@ -89,7 +89,10 @@ NOT_HEARD = {Status.SUCCESS, Status.CMD_PENDING, Status.CHECKSUM_ERROR}
 
 
 def test_a_grasp_that_is_answered_and_not_done_is_begun_again_only_where_it_was_not_heard():
-    with bench(timeout_s=0.1, emulator=Emulator(referenced=True, speed_up=50.0, object_mm=40.0)) as (gripper, emulator):
+    with bench(timeout_s=0.1, emulator=EmulatedWSG50(referenced=True, speed_up=50.0, object_mm=40.0)) as (
+        gripper,
+        emulator,
+    ):
         for status in Status:
             gripper.open(60.0)
             emulator.heard.clear()
@@ -122,7 +125,7 @@ def test_a_lost_reference_is_said_before_anything_moves():
 
 @PORTS
 def test_a_state_that_does_not_come_stops_the_motion(port):
-    slow = Emulator(referenced=True, object_mm=5.0)
+    slow = EmulatedWSG50(referenced=True, object_mm=5.0)
     with bench(port, emulator=slow, max_state_age_s=0.1) as (gripper, _):
         slow.mute_updates = True
         with pytest.raises(DeviceError, match=r"at most 0.1 s old"):
@@ -132,7 +135,7 @@ def test_a_state_that_does_not_come_stops_the_motion(port):
 
 
 def test_a_program_that_was_held_up_is_no_silent_gripper(monkeypatch):
-    slow = Emulator(referenced=True, object_mm=40.0)
+    slow = EmulatedWSG50(referenced=True, object_mm=40.0)
     with bench(emulator=slow, max_state_age_s=1.0) as (gripper, _):
         poll, waits = gripper._link.poll, [1.5]
 
@@ -146,7 +149,7 @@ def test_a_program_that_was_held_up_is_no_silent_gripper(monkeypatch):
 
 
 def test_a_fault_in_the_middle_of_a_motion_is_named():
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with bench(emulator=slow) as (gripper, _):
         thread = threading.Thread(target=lambda: (until(lambda: slow.moves), slow.fail("current")))
         thread.start()
@@ -170,7 +173,7 @@ def test_a_motion_that_never_ends_is_stopped(monkeypatch):
 @PORTS
 @pytest.mark.parametrize("call", ["grasp", "open", "home"])
 def test_ctrl_c_stops_the_jaws(port, call):
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     uses = {"grasp": lambda g: g.grasp(10.0, 10.0), "open": lambda g: g.open(10.0), "home": lambda g: g.home()}
     with bench(port, emulator=slow, opening_speed_mm_s=10.0, home_direction="in") as (gripper, _):
 
@@ -202,7 +205,7 @@ def test_stop_is_always_allowed_and_becomes_a_fast_stop_if_nobody_answers():
 
 def test_a_stop_that_is_answered_and_does_nothing_becomes_a_fast_stop(monkeypatch):
     monkeypatch.setitem(wsg50_emulated._ACTIONS, STOP, lambda own, _: 0)
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with bench(emulator=slow, max_state_age_s=0.1) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 5.0))
         until(lambda: slow.moves)
@@ -269,7 +272,7 @@ def test_closing_says_so_leaves_no_fault_and_keeps_what_is_held(port):
 
 def test_the_end_of_a_line_is_not_announced_while_the_jaws_may_move():
     """The gripper then stops by itself."""
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = Script()
     with bench(faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 5.0))
@@ -282,7 +285,7 @@ def test_the_end_of_a_line_is_not_announced_while_the_jaws_may_move():
 
 
 def test_closing_stops_what_moves():
-    slow = Emulator(referenced=True, opening_mm=100.0)
+    slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with bench(emulator=slow) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 10.0))
         until(lambda: slow.moves)

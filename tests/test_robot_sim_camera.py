@@ -8,12 +8,12 @@ import pytest
 
 from robot.errors import SceneError
 from robot.sim import camera as cameras
-from robot.sim.camera import Camera, Lighting, Placement, look
+from robot.sim.camera import Lighting, PinholeCamera, Placement, look
 from robot.sim.objects.draw import draw_object
 
 POST = draw_object(0, 0, family="cylinder", relief="smooth")
 HEIGHT_MM = float(POST.body.upper[2])
-CAMERA = Camera()
+CAMERA = PinholeCamera()
 LIGHT = Lighting.draw(np.random.default_rng(3))
 
 
@@ -122,9 +122,9 @@ def test_relief_that_is_large_enough_for_the_pixels_shows():
 )
 def test_a_camera_that_cannot_be_is_refused(settings):
     with pytest.raises(SceneError):
-        Camera(**settings)
+        PinholeCamera(**settings)
 
 
 def test_a_camera_that_sees_past_the_table_is_refused():
     with pytest.raises(SceneError, match="nothing but the table"):
-        look(POST, Placement(), Camera(position_mm=(0.0, -560.0, 80.0)))
+        look(POST, Placement(), PinholeCamera(position_mm=(0.0, -560.0, 80.0)))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.lab.hard_cases.contact import hard_gaps, hard_layers, is_finite, naive_solve, stability_sweep
-from robot.sim.contact.constrained_cg import Problem, nearest_of_sum
+from robot.sim.contact.constrained_cg import ContactProblem, nearest_of_sum
 from robot.sim.contact.kernels import Operator, influence, periodic_influence
 from robot.sim.contact.layer import Layer, press
 
@@ -136,7 +136,7 @@ def test_without_the_safeguard_the_pin_cycles_to_the_cap_and_with_it_the_energy_
     operator = Operator(influence(gap.shape, math.inf, 0.5), gap.shape)
     _, naive = naive_solve(operator, gap, 0.1, max_iterations=500)
     assert naive == 500
-    problem = Problem(operator, gap, load=0.1)
+    problem = ContactProblem(operator, gap, load=0.1)
     start, energies = problem.guess(), []
     for steps in range(0, 60, 3):
         pressure = problem.solve(start, 1e-12, steps).pressure

@@ -9,7 +9,7 @@ import pytest
 
 from robot.errors import BadRobotInput
 from robot.sim.gel import fitted_optics
-from robot.sim.gel.fitted_optics import FittedOptics, Limits, fitted_names, load_fitted
+from robot.sim.gel.fitted_optics import FittedLimits, FittedOptics, fitted_names, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 SMALL = Field(24, 32, 0.5)
@@ -40,7 +40,7 @@ def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
         rows,
         1,
         ((100.0, 90.0, 80.0), (5.0, 0.0, 0.0), (0.0, 5.0, 0.0)),
-        Limits(**{**free, **limits}),
+        FittedLimits(**{**free, **limits}),
     )
 
 

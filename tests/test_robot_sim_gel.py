@@ -15,7 +15,7 @@ from robot.sim.gel import optics
 from robot.sim.gel import sensor as gel
 from robot.sim.gel.fitted_optics import fitted_names, load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_positions
-from robot.sim.gel.optics import Bar, LedOptics, cast_shadows, led_rays
+from robot.sim.gel.optics import LedBar, LedOptics, cast_shadows, led_rays
 from robot.sim.gel.sensor import OPTICS, GelSensor, Noise, draw_sensor
 from robot.sim.gel.surface import Field, Surface, resized
 
@@ -144,16 +144,16 @@ def test_light_of_a_bar_is_the_near_field_formula(points):
     field = Field(5, 6, 3.0)
     rng = np.random.default_rng(0)
     slope_x, slope_y = rng.normal(0, 1.5, (2, 5, 6)).astype(np.float32)
-    bar = Bar(math.radians(30), points=points, order=1.7)
+    bar = LedBar(math.radians(30), points=points, order=1.7)
     light = optics._relative_light(led_rays(bar, field), (slope_x, slope_y))
     np.testing.assert_allclose(light, by_two_loops(bar, field, slope_x, slope_y), rtol=1e-4, atol=1e-5)
     assert (light == 0).any() or points > 1
 
 
 def test_leds_stand_where_they_are_said_to():
-    above = Bar(math.radians(90), distance_mm=10, height_mm=4, length_mm=6, points=3)
+    above = LedBar(math.radians(90), distance_mm=10, height_mm=4, length_mm=6, points=3)
     np.testing.assert_allclose(above.positions(), [[-3, -10, 4], [0, -10, 4], [3, -10, 4]], atol=1e-12)
-    right = Bar(0.0, distance_mm=10, height_mm=4, points=1)
+    right = LedBar(0.0, distance_mm=10, height_mm=4, points=1)
     np.testing.assert_allclose(right.positions(), [[10, 0, 4]], atol=1e-12)
 
 
@@ -173,11 +173,11 @@ def test_a_bump_throws_a_shadow_away_from_the_bar_and_a_flat_gel_none():
     field = Field(80, 80, 0.1)
     bump = np.zeros((80, 80))
     bump[36:44, 36:44] = 1.0
-    (shade,) = cast_shadows(Surface(bump, field), (Bar(0.0, height_mm=4.0),))
+    (shade,) = cast_shadows(Surface(bump, field), (LedBar(0.0, height_mm=4.0),))
     assert shade[40, 26] > 0.3
     assert shade[40, 60] < 0.01
     assert 0 <= shade.min() <= shade.max() <= 1
-    assert not cast_shadows(Surface(np.zeros((4, 4)), field), (Bar(0.0),))[0].any()
+    assert not cast_shadows(Surface(np.zeros((4, 4)), field), (LedBar(0.0),))[0].any()
 
 
 def test_shadows_are_not_computed_where_nothing_asks_for_them(monkeypatch):
@@ -286,7 +286,7 @@ def test_other_wrong_settings_are_refused():
     with pytest.raises(RobotConfigError, match="modulus"):
         GelSensor(Layer(-0.3))
     with pytest.raises(RobotConfigError, match="LEDs"):
-        Bar(0.0, height_mm=0.0)
+        LedBar(0.0, height_mm=0.0)
     with pytest.raises(RobotConfigError, match="ambient"):
         LedOptics(ambient=1.5)
     with pytest.raises(RobotConfigError, match="mix"):

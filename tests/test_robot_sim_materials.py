@@ -5,7 +5,7 @@ import pytest
 
 from robot.errors import RobotConfigError, UnknownName
 from robot.sim.objects.looks import Label, Looks, Paint, draw_looks
-from robot.sim.objects.materials import MATERIALS, Material, draw_material
+from robot.sim.objects.materials import MATERIALS, ObjectMaterial, draw_material
 
 
 def drawn(name=None, count=200):
@@ -47,7 +47,7 @@ def test_an_unknown_material_lists_the_known_ones():
 def test_impossible_numbers_are_refused(field, value):
     numbers = {"modulus_mpa": 1, "poisson": 0.3, "density_kg_m3": 1000, "friction": 0.5, "gloss": 0.5, "roughness": 1}
     with pytest.raises(RobotConfigError, match=field):
-        Material("x", **{**numbers, field: value})
+        ObjectMaterial("x", **{**numbers, field: value})
 
 
 # Looks -----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from robot.sim.objects.shapes import SHAPES
 from robot.sim.objects.shapes.base import Cylindrical, arctan2, rounded, smooth_min
 from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
 from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Revolution, Rod
-from robot.sim.objects.shapes.solids import Bar, Bars, Brush, Comb, Ring, Superquadric, TwoSided
+from robot.sim.objects.shapes.solids import Brick, Bricks, Brush, Comb, Ring, Superquadric, TwoSided
 
 
 def draw(family, seed):
@@ -68,22 +68,22 @@ def test_the_distance_from_an_ellipsoid_is_exact_for_a_ball_and_never_too_large(
 
 
 def test_slots_and_bristles_are_where_their_pitch_says():
-    slab = Bar((0, 0), (30, 5), 0, 60, 0.5)
+    slab = Brick((0, 0), (30, 5), 0, 60, 0.5)
     comb = Comb(slab, pitch_mm=10, gap_mm=4, slot_mm=-10, lying=False)
     inside = distance(comb, [0, 0, 40], [5, 0, 40], [10, 0, 40], [0, 0, 15], [29, 0, 40])
     np.testing.assert_allclose(inside, [2, -3, 2, -5, -1], atol=1e-5)
-    brush = Brush(Bar((0, 0), (21, 11), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
+    brush = Brush(Brick((0, 0), (21, 11), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
     np.testing.assert_allclose(distance(brush, [0, 0, 50], [8, 8, 50], [4, 0, 50]), [-2, -2, 2], atol=1e-5)
 
 
 def test_an_even_number_of_bristles_stands_astride_the_middle():
-    brush = Brush(Bar((0, 0), (14, 6.5), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
+    brush = Brush(Brick((0, 0), (14, 6.5), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
     assert (distance(brush, [4, 4, 50], [-4, -4, 50], [12, 4, 50]) < 0).all()
     assert distance(brush, [0, 4, 50])[0] > 0
 
 
 def test_a_union_of_bars_is_the_nearer_one():
-    shape = Bars((Bar((0, 5), (20, 2), 0, 40, 0.5), Bar((0, -5), (2, 8), 0, 40, 0.5)))
+    shape = Bricks((Brick((0, 5), (20, 2), 0, 40, 0.5), Brick((0, -5), (2, 8), 0, 40, 0.5)))
     np.testing.assert_allclose(distance(shape, [10, -5, 20], [10, 10, 20]), [8, 3], atol=1e-5)
 
 

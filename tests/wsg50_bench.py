@@ -1,4 +1,4 @@
-"""A WSG-50's driver on an emulated gripper, for tests: lines that damage the frames they are told to."""
+"""A WSG-50's driver on an emulated gripper, for tests: lines that damage the packets they are told to."""
 
 import contextlib
 from unittest.mock import patch
@@ -6,10 +6,10 @@ from unittest.mock import patch
 import pytest
 from serial.urlhandler import protocol_socket
 
-from robot.drivers.wsg50.codec import Frame, encode
+from robot.drivers.wsg50.codec import Packet, encode
 from robot.drivers.wsg50.driver import WSG50
 from robot.emulators.wsg50.faults import Piece
-from robot.emulators.wsg50.server import Emulator, Faults, serve_pty, serve_tcp
+from robot.emulators.wsg50.server import EmulatedWSG50, Faults, serve_pty, serve_tcp
 from robot.errors import DeviceError
 
 SERVE = {"tcp": serve_tcp, "pty": serve_pty}
@@ -21,7 +21,7 @@ PORTS = pytest.mark.parametrize("port", SERVE)
 
 
 class Script(Faults):
-    """Does to the frames named by (id, number of the frame with this id) what it is told: the counting starts when
+    """Does to the packets named by (id, number of the packet with this id) what it is told: the counting starts when
     told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
     none comes before it."""
 
@@ -32,17 +32,17 @@ class Script(Faults):
     def tell(self, plan):
         self.plan, self.seen = plan, {}
 
-    def on(self, frame):
-        self.seen[frame.id] = self.seen.get(frame.id, 0) + 1
-        kind = self.plan.get((frame.id, self.seen[frame.id])) or self.plan.get(frame.id)
-        plain = encode(frame)
+    def on(self, packet):
+        self.seen[packet.id] = self.seen.get(packet.id, 0) + 1
+        kind = self.plan.get((packet.id, self.seen[packet.id])) or self.plan.get(packet.id)
+        plain = encode(packet)
         if kind == "long":  # claims 255 bytes: what comes next is taken for them
             return [Piece(plain[:4] + b"\xff\x00" + plain[6:])]
         if kind == "bad sum":
             return [Piece(plain[:-1] + bytes([plain[-1] ^ 0xFF]))]
         if kind == "after a result":
-            return [Piece(encode(Frame(frame.id, bytes(2))) + plain)]
-        return list(self._damaged(kind, frame, plain) if kind else [Piece(plain)])
+            return [Piece(encode(Packet(packet.id, bytes(2))) + plain)]
+        return list(self._damaged(kind, packet, plain) if kind else [Piece(plain)])
 
 
 def quick_close():
@@ -53,7 +53,7 @@ def quick_close():
 @contextlib.contextmanager
 def bench(port="tcp", faults=None, connect=True, emulator=None, **settings):
     """A driver, connected or not, and its emulated gripper."""
-    emulator = emulator or Emulator(referenced=True, speed_up=20.0)
+    emulator = emulator or EmulatedWSG50(referenced=True, speed_up=20.0)
     with SERVE[port](emulator, faults) as address, quick_close():
         gripper = WSG50(port=address, **QUICK | settings)
         if connect:

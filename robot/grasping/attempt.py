@@ -30,7 +30,7 @@ _SIGHT_MM = 150.0
 
 
 @dataclass(frozen=True)
-class Attempt:
+class GraspAttempt:
     """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
 
     outcome: "held", "missed", "slipped" by the gripper after the lift, or "no_plan" for the `reason` given, and then
@@ -60,7 +60,7 @@ class Attempter:
             (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
         )
 
-    def run(self, object_id: str, number: int) -> Attempt:
+    def run(self, object_id: str, number: int) -> GraspAttempt:
         """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
 
         Whatever happens, Ctrl-C included, the jaws are opened, or the error says that they could not be.
@@ -96,7 +96,7 @@ class Attempter:
             return f"; and the jaws could not be opened: {second}"
         return ""
 
-    def _once(self, object_id: str, number: int) -> Attempt:
+    def _once(self, object_id: str, number: int) -> GraspAttempt:
         rig = self.rig
         rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
         rig.gripper.open(rig.gripper.stroke_mm)
@@ -110,14 +110,14 @@ class Attempter:
             plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
         except PlanError as error:
             lasted = round(rig.clock() - start, 3)
-            return Attempt(object_id, number, "no_plan", reason=str(error), lasted_s=lasted)
+            return GraspAttempt(object_id, number, "no_plan", reason=str(error), lasted_s=lasted)
         images = self._pictures(image)
         touches, fields, at = self._grasp(plan)
         outcome = self._outcome()
         if "after" in self.settings.outputs:
             touches |= self._feel("_after", self.settings.hold_s)
         self._put_down(plan, outcome == "held", rng)
-        return Attempt(
+        return GraspAttempt(
             object_id,
             number,
             outcome,

@@ -23,7 +23,7 @@ _FILTER_PX = 5
 
 
 @dataclass(frozen=True)
-class Table:
+class TablePlane:
     """The plane z = a x + b y + c (mm) of the rig's frame, and how far a depth pixel strays along its ray."""
 
     a: float
@@ -75,14 +75,14 @@ class Thing:
     """What stands on the table: (N, 3) points (mm; z above the table), the table, and what was noticed."""
 
     points: Array
-    table: Table
+    table: TablePlane
     missing: float
     """Share of the pixels of its outline that have no depth."""
     cut_off: bool
     """Whether it touches the picture's border, so that a part of it is not seen."""
 
 
-def find_table(depth_mm: Depth, rays: Rays) -> Table:
+def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
     """Fit the table near z = 0, where the calibration has it: RANSAC over three points, then least squares.
 
     Where too little of it is seen, z = 0 is taken, and a note says so.
@@ -90,7 +90,7 @@ def find_table(depth_mm: Depth, rays: Rays) -> Table:
     points = _sample(depth_mm, rays)
     near = points[np.abs(points[:, 2]) < _NEAR_TABLE_MM]
     if len(near) < 100:
-        return Table(0.0, 0.0, 0.0, 2.0, ("hardly any table is seen: z = 0 of the calibration is taken for it",))
+        return TablePlane(0.0, 0.0, 0.0, 2.0, ("hardly any table is seen: z = 0 of the calibration is taken for it",))
     plane = _best_plane(near)
     for _ in range(3):
         off = near[:, 2] - _heights(plane, near)
@@ -100,7 +100,7 @@ def find_table(depth_mm: Depth, rays: Rays) -> Table:
     off = near[:, 2] - _heights(plane, near)
     noise = 1.4826 * float(np.median(np.abs(off))) / max(abs(_steepness(rays)), 0.1)
     a, b, c = map(float, plane)
-    return Table(a, b, c, max(noise, 0.3), _table_notes(a, b, c))
+    return TablePlane(a, b, c, max(noise, 0.3), _table_notes(a, b, c))
 
 
 def _table_notes(a: float, b: float, c: float) -> tuple[str, ...]:
@@ -139,7 +139,7 @@ def _heights(plane: Array, points: Array) -> Array:
     return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
 
 
-def find_thing(depth_mm: Depth, rays: Rays, table: Table, region: Box | None = None) -> Thing:
+def find_thing(depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None = None) -> Thing:
     """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
     above = height_above(depth_mm, rays, table)
     least = max(_LEAST_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
@@ -161,7 +161,7 @@ def find_thing(depth_mm: Depth, rays: Rays, table: Table, region: Box | None = N
     return Thing(points, table, _missing(depth_mm[patch.window], patch.mask), patch.cut_off)
 
 
-def height_above(depth_mm: Depth, rays: Rays, table: Table) -> Depth:
+def height_above(depth_mm: Depth, rays: Rays, table: TablePlane) -> Depth:
     """(H, W) height above the table in mm, NaN where depth is unknown."""
     normal = np.array([-table.a, -table.b, 1.0])
     start = float(normal @ rays.pose[:3, 3]) - table.c

@@ -21,17 +21,17 @@ import numpy.typing as npt
 
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import RGBD, Box
-from robot.sight.cloud import Depth, Rays, Table, Thing, find_table, find_thing
+from robot.sight.cloud import Depth, Rays, TablePlane, Thing, find_table, find_thing
 from robot.sight.silhouette import fit_silhouette
 from robot.sight.solids import (
     CUT,
     Array,
-    Block,
     Circle,
+    Cuboid,
     Solid,
     Upright,
-    fit_block,
     fit_circle,
+    fit_cuboid,
     fit_lying,
     refine_circle,
 )
@@ -126,7 +126,7 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = No
     return _fit(thing, rays)
 
 
-def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: Table, region: Box | None) -> CylinderFit:
+def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None) -> CylinderFit:
     """See robot.sight.silhouette."""
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
     return CylinderFit(
@@ -157,7 +157,7 @@ def _fit(thing: Thing, rays: Rays) -> CylinderFit:
     top = _top(thing.points, noise)
     points = thing.points[thing.points[:, 2] < top + CUT * noise]
     eye = rays.pose[:2, 3]
-    box = fit_block(points, top, eye)
+    box = fit_cuboid(points, top, eye)
     lying = (fit_lying(points, box, along, eye) for along in (True, False))
     candidates = [
         _upright(points, top, noise, rays, box),
@@ -177,7 +177,7 @@ def _loss(solid: Solid, points: Array, noise: float) -> float:
     return float((np.minimum(solid.distance(points) / (CUT * noise), 1.0) ** 2).mean())
 
 
-def _boxed(points: Array, box: Block, top: float, noise: float) -> _Candidate:
+def _boxed(points: Array, box: Cuboid, top: float, noise: float) -> _Candidate:
     """A box, whose far side is where its top ends: without a top in sight it is a guess."""
     if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _LEAST_TOP:
         return _Candidate(box, "box", _CRUDE_MM)
@@ -229,7 +229,7 @@ def _top(points: Array, noise: float) -> float:
     return float(np.quantile(z[layer <= last], 0.99))
 
 
-def _upright(points: Array, top: float, noise: float, rays: Rays, box: Block) -> _Candidate:
+def _upright(points: Array, top: float, noise: float, rays: Rays, box: Cuboid) -> _Candidate:
     """An upright cylinder from its visible side; where that says too little, from all points."""
     side = points[points[:, 2] < top - max(4.0, noise), :2]
     if len(side) < LEAST_SIDE_POINTS:

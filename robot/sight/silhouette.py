@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from robot.errors import PlanError
 from robot.readings import Box
-from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, Table, height_above, largest_patch
+from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, TablePlane, height_above, largest_patch
 
 _COLOUR_LEVELS = 12.0
 _LEAST_PX = 60
@@ -35,7 +35,7 @@ class Outline:
 
 
 def fit_silhouette(
-    colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table, region: Box | None = None
+    colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None = None
 ) -> Outline:
     """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
     patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
@@ -44,7 +44,7 @@ def fit_silhouette(
     return _cylinder(directions, rows, rays.pose[:3, 3] - [0.0, 0.0, table.c], region)
 
 
-def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: Table) -> Mask:
+def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane) -> Mask:
     """Pixels whose colour is far from that of the pixels that depth puts on the table."""
     flat = np.abs(height_above(depth_mm, rays, table)) < max(5.0, 3 * table.noise_mm)
     if flat.sum() < 100:

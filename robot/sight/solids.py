@@ -94,7 +94,7 @@ class Upright(Solid):
 
 
 @dataclass(frozen=True)
-class Block(Solid):
+class Cuboid(Solid):
     """A box that stands on a face."""
 
     x: float
@@ -284,7 +284,7 @@ def _through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
 # Boxes and cylinders on their side --------------------------------------------------------------------------
 
 
-def fit_block(points: Array, height: float, eye: Array) -> Block:
+def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
     """The box whose side faces the points below its top lie nearest to. eye (2,): the camera's foot on the table.
 
     Faces that the camera sees lie at the median of their points, the others where the points in plan end.
@@ -301,7 +301,7 @@ def fit_block(points: Array, height: float, eye: Array) -> Block:
     x, y = turned(middle[None], -yaw)[0] + centre
     if half[0] < half[1]:
         half, yaw = half[::-1], yaw + math.pi / 2
-    return Block(float(x), float(y), float(half[0]), float(half[1]), height, yaw % math.pi)
+    return Cuboid(float(x), float(y), float(half[0]), float(half[1]), height, yaw % math.pi)
 
 
 def _seen_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
@@ -342,7 +342,7 @@ def _thinned(points: Array, most: int = 300) -> Array:
     return points[:: max(1, len(points) // most)]
 
 
-def fit_lying(points: Array, box: Block, along_length: bool, eye: Array) -> Lying | None:
+def fit_lying(points: Array, box: Cuboid, along_length: bool, eye: Array) -> Lying | None:
     """A cylinder on its side, begun at the box's long or short direction; None where the steps run away.
 
     Gauss-Newton with Tukey's weights on sqrt(v^2 + (z - r)^2) - r, where v is the distance across the axis: unknown

@@ -49,7 +49,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Camera:
+class PinholeCamera:
     """A pinhole camera of square pixels that looks at `target_mm` with the rig's z upward in its picture."""
 
     px: int = 256
@@ -115,7 +115,7 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """What the camera meets: `distance_mm` along each ray, and which pixels are the object's; both (px * px,).
 
     `detail_mm`: the size of a pixel on the object.
@@ -123,14 +123,14 @@ class View:
 
     obj: SimObject
     placement: Placement
-    camera: Camera
+    camera: PinholeCamera
     detail_mm: float
     distance_mm: Array
     is_object: npt.NDArray[np.bool_]
     points: Array = field(repr=False)
 
 
-def look(obj: SimObject, placement: Placement, camera: Camera) -> View:
+def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraView:
     """The geometry pass: the nearest of object and table along each ray."""
     origin, rays = np.asarray(camera.position_mm), camera.rays
     if not rays[:, 2].max() < 0:
@@ -141,13 +141,13 @@ def look(obj: SimObject, placement: Placement, camera: Camera) -> View:
     hit = obj.body.cast(origins, rays @ placement.rotation(), detail_mm)
     is_object = hit < table
     distance = np.where(is_object, hit, table)
-    return View(obj, placement, camera, detail_mm, distance, is_object, origin + distance[:, None] * rays)
+    return CameraView(obj, placement, camera, detail_mm, distance, is_object, origin + distance[:, None] * rays)
 
 
 # Photo ------------------------------------------------------------------------------------------------------
 
 
-def photo(view: View, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
+def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
     """(px, px, 3) RGB."""
     px = view.camera.px
     light = np.asarray(lighting.direction)
@@ -162,13 +162,13 @@ def photo(view: View, lighting: Lighting, noise_seed: int, shadow: bool = True) 
     return _develop(linear, noise_seed)
 
 
-def _object_normals(view: View) -> Array:
+def _object_normals(view: CameraView) -> Array:
     """Normals of the object's pixels, taken across about one pixel so that finer relief does not flicker."""
     points = view.placement.to_object(view.points[view.is_object])
     return view.obj.body.normals(points, 0.4 * view.detail_mm) @ view.placement.rotation().T
 
 
-def _lamp_seen(view: View, normals: Array, light: Array) -> Array:
+def _lamp_seen(view: CameraView, normals: Array, light: Array) -> Array:
     """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size."""
     px = view.camera.px
     starts = view.placement.to_object(view.points + _OFF_SURFACE_MM * normals)
@@ -179,14 +179,14 @@ def _lamp_seen(view: View, normals: Array, light: Array) -> Array:
     return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
 
 
-def _sky(view: View, normals: Array) -> Array:
+def _sky(view: CameraView, normals: Array) -> Array:
     """0..1: the sky seen by each point: the half above, dimmer on the table close to the object."""
     px = view.camera.px
     beside = cv2.GaussianBlur(view.is_object.reshape(px, px).astype(np.float64), (0, 0), 0.03 * px).ravel()
     return (0.6 + 0.4 * normals[:, 2]) * np.where(view.is_object, 1.0, 1.0 - 0.45 * beside)
 
 
-def _highlight(view: View, normals: Array, light: Array, lit: Array) -> Array:
+def _highlight(view: CameraView, normals: Array, light: Array, lit: Array) -> Array:
     """Blinn's highlight of the object's pixels; the rougher the material, the wider and weaker."""
     half = light - view.camera.rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -197,7 +197,7 @@ def _highlight(view: View, normals: Array, light: Array, lit: Array) -> Array:
     return np.asarray(strength * cosine**sharpness * (lit > 0))
 
 
-def _albedo(view: View, lighting: Lighting) -> Array:
+def _albedo(view: CameraView, lighting: Lighting) -> Array:
     """Linear reflectance of each pixel, 0..1."""
     albedo = _table(lighting.table_seed, view.points) ** _GAMMA
     albedo[view.is_object] = view.obj.looks.albedo(view.placement.to_object(view.points[view.is_object]))
@@ -227,7 +227,7 @@ def _develop(linear: Array, noise_seed: int) -> Picture:
 # Depth ------------------------------------------------------------------------------------------------------
 
 
-def depth(view: View, noise_seed: int) -> npt.NDArray[np.float32]:
+def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     """(px, px) metres along the camera's axis, NaN where the sensor gives nothing.
 
     Noise of 1.5 mm at 0.7 m that grows with the square of the distance, pixels that fly between an edge and what is
@@ -250,7 +250,7 @@ def _flying(exact: Array, rng: np.random.Generator) -> Array:
     return np.where((far - near > 12.0) & (rng.uniform(size=exact.shape) < 0.35), mixed, exact)
 
 
-def _holes(view: View, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _holes(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
     """Where nothing comes back: steep surfaces, glossy ones now and then, and single pixels anywhere."""
     px = view.camera.px
     steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))

@@ -12,8 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Arm, Gripper, TactileSensor
-from robot.devices import Camera as CameraDevice
+from robot.devices import Arm, Camera, Gripper, TactileSensor
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
 from robot.grasping.settings import attempt_of
@@ -21,7 +20,7 @@ from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.settings import check_range
-from robot.sim.camera import Camera, Placement
+from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.marks import Markers
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
@@ -126,7 +125,7 @@ class SimRig(Rig):
             }
             for pair in drawn
         ]
-        self._camera = Camera()
+        self._camera = PinholeCamera()
         clock = SimClock()
         self.world = World(clock)
         super().__init__(
@@ -355,10 +354,10 @@ class SimTactileSensor(TactileSensor):
         return Frame(scene.image(f"touch_{self.finger}{moment}"), self.clock())
 
 
-class SimCamera(CameraDevice):
+class SimCamera(Camera):
     """Looks at the table; it knows where it stands only as well as it was calibrated."""
 
-    def __init__(self, world: World, camera: Camera, error_mm: Array) -> None:
+    def __init__(self, world: World, camera: PinholeCamera, error_mm: Array) -> None:
         believed = camera.to_rig.copy()
         believed[:3, 3] += error_mm
         super().__init__("simulated camera", believed, clock=world.clock)

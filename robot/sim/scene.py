@@ -20,7 +20,7 @@ import numpy.typing as npt
 from robot.errors import SceneError
 from robot.readings import Pose
 from robot.sim import camera as cameras
-from robot.sim.camera import Camera, Lighting, Placement
+from robot.sim.camera import Lighting, PinholeCamera, Placement
 from robot.sim.gel.sensor import GelSensor
 from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.pinch import SIDES, Hand, Pinch
@@ -48,7 +48,7 @@ class Scene:
 
     obj: SimObject
     placement: Placement = field(default_factory=Placement)
-    camera: Camera = field(default_factory=Camera)
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
     sensors: Mapping[str, GelSensor] = field(default_factory=dict)
     hand: Hand = field(default_factory=Hand)
     grip: Grip | None = None
@@ -94,7 +94,7 @@ class Scene:
         return cameras.photo(self._view, lighting, self._noise(0, 0), self.shadow)
 
     @cached_property
-    def _view(self) -> cameras.View:
+    def _view(self) -> cameras.CameraView:
         """What the camera meets; photo and depth share it."""
         self.passes["view"] += 1
         return cameras.look(self.obj, self.placement, self.camera)

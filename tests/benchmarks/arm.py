@@ -8,7 +8,7 @@ import numpy as np
 from robot.drivers.sawyer import messages
 from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.sawyer.straight_line import way_points
-from robot.emulators.sawyer.server import Emulator, serve
+from robot.emulators.sawyer.server import EmulatedSawyer, serve
 from robot.readings import Box, Pose
 from tests.benchmarks.common import Line, duration
 
@@ -18,7 +18,7 @@ LOW, HIGH = Pose(0.0, 0.0, 40.0, 0.0), Pose(0.0, 0.0, 220.0, 0.0)
 
 def measure(calls: int = 300) -> Iterator[Line]:
     """Over the emulator on a local websocket: the network of a real robot and its solver come on top."""
-    with serve(Emulator()) as url, _arm(url) as arm:
+    with serve(EmulatedSawyer()) as url, _arm(url) as arm:
         yield _round_trip(arm, calls)
         yield _planning(arm)
         yield from _motion(arm)

@@ -9,7 +9,7 @@ from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.commands import Command
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import Link
-from robot.emulators.wsg50.server import Emulator, serve_pty, serve_tcp
+from robot.emulators.wsg50.server import EmulatedWSG50, serve_pty, serve_tcp
 from tests.benchmarks.common import Line, duration
 
 PORTS = {"TCP": serve_tcp, "pty": serve_pty}
@@ -22,7 +22,7 @@ def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterat
     The emulator looks at its port at once when bytes come, and every millisecond at what it has to say unasked.
     """
     for port, serve in PORTS.items():
-        with serve(Emulator(object_mm=40.0, referenced=True, speed_up=SPEED_UP)) as address:
+        with serve(EmulatedWSG50(object_mm=40.0, referenced=True, speed_up=SPEED_UP)) as address:
             link = Link(address)
             link.open()
             try:

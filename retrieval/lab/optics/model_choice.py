@@ -27,7 +27,7 @@ from retrieval.lab.optics.least_squares import (
     solve,
 )
 from retrieval.lab.optics.real_presses import BALLS_MM, CROP, Presses
-from robot.sim.gel.fitted_optics import FittedOptics, Limits, place_powers
+from robot.sim.gel.fitted_optics import FittedLimits, FittedOptics, place_powers
 
 # The Mini was pressed in the middle alone, and lightly: what place, neighbourhood and fourth powers do to its colours
 # cannot be known elsewhere and for other objects, where they draw rings and false colours.
@@ -131,12 +131,12 @@ def to_optics(presses: Presses, fitted: Fit) -> FittedOptics:
     return FittedOptics(setting.degree, setting.places, setting.reaches_mm, weights, _FLAT_DEGREE, flat, limits)
 
 
-def _limits(presses: Presses, fitted: Fit) -> Limits:
+def _limits(presses: Presses, fitted: Fit) -> FittedLimits:
     """Tilts that half of the presses reached, the crops' places, and what the neighbourhoods were."""
     smoothed = np.concatenate([_neighbourhood(presses, one, pose, fitted) for one, pose in enumerate(fitted.poses)])
     rows, cols = zip(*(presses.crop(index) for index in range(len(presses))), strict=True)
     height, width = presses.untouched.shape[:2]
-    return Limits(
+    return FittedLimits(
         steepest=float(np.median(fitted.poses[:, 2]) / fitted.setting.ball_mm),
         left=2 * min(one.start for one in cols) / width - 1,
         right=2 * max(one.stop for one in cols) / width - 1,

@@ -1,6 +1,6 @@
-"""Bytes of the WSG-50's command interface: frames, their check sum, and how they are found in a stream. No I/O.
+"""Bytes of the WSG-50's command interface: packets, their check sum, and how they are found in a stream. No I/O.
 
-A frame is AA AA AA | id u8 | length u16 | payload | check sum u16, all little-endian. What payloads mean stands in
+A packet is AA AA AA | id u8 | length u16 | payload | check sum u16, all little-endian. What payloads mean stands in
 robot.drivers.wsg50.commands. Facts: command set reference of the gripper (firmware 4.0) and public drivers for it.
 """
 
@@ -26,7 +26,7 @@ class WireError(DeviceError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class Packet:
     """A command or a reply. id: 0 to 255 without AA. Raises WireError for what cannot be sent."""
 
     id: int
@@ -35,7 +35,7 @@ class Frame:
     def __post_init__(self) -> None:
         """Check what the bytes can hold."""
         if not 0 <= self.id <= 255 or self.id == _NO_ID:
-            raise WireError(f"a frame's id must be from 0 to 255 and not {_NO_ID}, got {self.id}")
+            raise WireError(f"a packet's id must be from 0 to 255 and not {_NO_ID}, got {self.id}")
         if len(self.payload) > MAX_PAYLOAD:
             raise WireError(f"a payload must be at most {MAX_PAYLOAD} bytes, got {len(self.payload)}")
 
@@ -52,7 +52,7 @@ _TABLE = tuple(map(_table_row, range(256)))
 
 
 def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
-    """Check sum of `data`; over a frame and its own check sum it is 0. Not CCITT: the register moves the other way."""
+    """Check sum of `data`; over a packet and its own check sum it is 0. Not CCITT: the register moves the other way."""
     value = start
     for byte in data:
         value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
@@ -62,7 +62,7 @@ def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
 class _Sums:
     """Check sums of many stretches of one buffer, going through each of its bytes once.
 
-    A stream of frames that break off claims every byte up to 44 times. The sum is linear: that of a stretch follows
+    A stream of packets that break off claims every byte up to 44 times. The sum is linear: that of a stretch follows
     from the sums, begun at 0, up to its two ends.
     """
 
@@ -96,17 +96,17 @@ def _zeros(most: int) -> tuple[tuple[int, ...], ...]:
 _ZEROS = _zeros(_HEADER + MAX_PAYLOAD + _CHECK)
 
 
-def encode(frame: Frame) -> bytes:
-    """The bytes of a frame."""
-    body = PREAMBLE + struct.pack("<BH", frame.id, len(frame.payload)) + frame.payload
+def encode(packet: Packet) -> bytes:
+    """The bytes of a packet."""
+    body = PREAMBLE + struct.pack("<BH", packet.id, len(packet.payload)) + packet.payload
     return body + struct.pack("<H", checksum(body))
 
 
-def decode(buffer: bytes | bytearray) -> tuple[int, Frame | None]:
-    """The first whole, undamaged frame, and how many bytes to drop from the front; (n, None) where more must come.
+def decode(buffer: bytes | bytearray) -> tuple[int, Packet | None]:
+    """The first whole, undamaged packet, and how many bytes to drop from the front; (n, None) where more must come.
 
-    Whatever is no frame is skipped byte by byte, so that a frame which began inside a damaged one is found. While a
-    frame that has begun is not yet whole, its bytes stay: where none come any more, drop one and decode again.
+    Whatever is no packet is skipped byte by byte, so that a packet which began inside a damaged one is found. While a
+    packet that has begun is not yet whole, its bytes stay: where none come any more, drop one and decode again.
     """
     at = buffer.find(PREAMBLE)
     sums = _Sums(buffer, at)
@@ -116,13 +116,13 @@ def decode(buffer: bytes | bytearray) -> tuple[int, Frame | None]:
             return at, None
         if size and sums.of(at, at + size) == 0:
             payload = bytes(buffer[at + _HEADER : at + size - _CHECK])
-            return at + size, Frame(buffer[at + 3], payload)
+            return at + size, Packet(buffer[at + 3], payload)
         at = buffer.find(PREAMBLE, at + 1)
     return len(buffer) - _preamble_begun(buffer), None
 
 
 def _claimed(buffer: bytes | bytearray, at: int) -> int | None:
-    """Bytes of the frame that begins here, 0 if it can be none, None where that is not yet known."""
+    """Bytes of the packet that begins here, 0 if it can be none, None where that is not yet known."""
     if len(buffer) > at + 3 and buffer[at + 3] == _NO_ID:
         return 0
     if len(buffer) < at + _HEADER:

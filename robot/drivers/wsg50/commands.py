@@ -1,7 +1,7 @@
 """What the WSG-50's commands and replies mean: builders of commands, parsers of replies. No I/O.
 
 A reply bears the id of its command, and its payload begins with a status u16; parameters follow only where the status
-is SUCCESS. A command that moves is answered by PENDING first, and by a second frame of the same id when it has ended.
+is SUCCESS. A command that moves is answered by PENDING first, and by a second packet of the same id when it has ended.
 An automatic update is a reply that nobody asked for.
 
 Facts: as in robot.drivers.wsg50.codec; the commands of fingers (60h to 63h) and of scripts (B0h to B2h) are left out.
@@ -15,7 +15,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from robot.drivers.wsg50.codec import Frame, WireError
+from robot.drivers.wsg50.codec import Packet, WireError
 
 
 class Command(enum.IntEnum):
@@ -142,7 +142,7 @@ class Info:
 
 
 @dataclass(frozen=True)
-class Limits:
+class GripperLimits:
     """What the gripper can do."""
 
     stroke_mm: float
@@ -164,106 +164,106 @@ class Statistics:
     lost: int
 
 
-def loop(token: bytes) -> Frame:
+def loop(token: bytes) -> Packet:
     """Echoes the token."""
-    return Frame(Command.LOOP, token)
+    return Packet(Command.LOOP, token)
 
 
-def home(direction: int = 0) -> Frame:
+def home(direction: int = 0) -> Packet:
     """Find the reference. direction: 0 as configured, 1 outward, 2 inward."""
     if direction not in (0, 1, 2):
         raise WireError(f"the direction of homing must be 0, 1 or 2, got {direction}")
-    return Frame(Command.HOME, bytes([direction]))
+    return Packet(Command.HOME, bytes([direction]))
 
 
-def move(width_mm: float, speed_mm_s: float, *, relative: bool = False, stop_on_block: bool = True) -> Frame:
+def move(width_mm: float, speed_mm_s: float, *, relative: bool = False, stop_on_block: bool = True) -> Packet:
     """Pre-position the fingers: bit 0 relative, bit 1 stop (rather than clamp) when blocked."""
-    return Frame(Command.MOVE, bytes([relative | stop_on_block << 1]) + _floats(width_mm, speed_mm_s))
+    return Packet(Command.MOVE, bytes([relative | stop_on_block << 1]) + _floats(width_mm, speed_mm_s))
 
 
-def stop() -> Frame:
+def stop() -> Packet:
     """Stop, and stay usable."""
-    return Frame(Command.STOP)
+    return Packet(Command.STOP)
 
 
-def fast_stop() -> Frame:
+def fast_stop() -> Packet:
     """Stop at once; nothing moves again before it is acknowledged."""
-    return Frame(Command.FAST_STOP)
+    return Packet(Command.FAST_STOP)
 
 
-def acknowledge() -> Frame:
+def acknowledge() -> Packet:
     """End a FAST STOP."""
-    return Frame(Command.ACKNOWLEDGE, b"ack")
+    return Packet(Command.ACKNOWLEDGE, b"ack")
 
 
-def disconnect() -> Frame:
+def disconnect() -> Packet:
     """Announce the end of the connection, which else raises a FAST STOP."""
-    return Frame(Command.DISCONNECT)
+    return Packet(Command.DISCONNECT)
 
 
-def grasp(width_mm: float, speed_mm_s: float) -> Frame:
+def grasp(width_mm: float, speed_mm_s: float) -> Packet:
     """Grasp a part of this nominal width."""
-    return Frame(Command.GRASP, _floats(width_mm, speed_mm_s))
+    return Packet(Command.GRASP, _floats(width_mm, speed_mm_s))
 
 
-def release(width_mm: float, speed_mm_s: float) -> Frame:
+def release(width_mm: float, speed_mm_s: float) -> Packet:
     """Let go of the part by opening to this width."""
-    return Frame(Command.RELEASE, _floats(width_mm, speed_mm_s))
+    return Packet(Command.RELEASE, _floats(width_mm, speed_mm_s))
 
 
-def set_acceleration(acceleration_mm_s2: float) -> Frame:
+def set_acceleration(acceleration_mm_s2: float) -> Packet:
     """Acceleration of all motions but stops."""
-    return Frame(Command.SET_ACCELERATION, _floats(acceleration_mm_s2))
+    return Packet(Command.SET_ACCELERATION, _floats(acceleration_mm_s2))
 
 
-def set_force_limit(force_n: float) -> Frame:
+def set_force_limit(force_n: float) -> Packet:
     """Force limit, as the gripper counts forces."""
-    return Frame(Command.SET_FORCE_LIMIT, _floats(force_n))
+    return Packet(Command.SET_FORCE_LIMIT, _floats(force_n))
 
 
-def set_soft_limits(minus_mm: float, plus_mm: float) -> Frame:
+def set_soft_limits(minus_mm: float, plus_mm: float) -> Packet:
     """Openings that no motion may leave."""
-    return Frame(Command.SET_SOFT_LIMITS, _floats(minus_mm, plus_mm))
+    return Packet(Command.SET_SOFT_LIMITS, _floats(minus_mm, plus_mm))
 
 
-def overdrive(on: bool) -> Frame:
+def overdrive(on: bool) -> Packet:
     """Allow forces up to the overdrive force."""
-    return Frame(Command.OVERDRIVE, bytes([on]))
+    return Packet(Command.OVERDRIVE, bytes([on]))
 
 
-def statistics(reset: bool = False) -> Frame:
+def statistics(reset: bool = False) -> Packet:
     """Ask for the counts of grasps, and set them to 0."""
-    return Frame(Command.STATISTICS, bytes([reset]))
+    return Packet(Command.STATISTICS, bytes([reset]))
 
 
-def set_tag(tag: bytes) -> Frame:
+def set_tag(tag: bytes) -> Packet:
     """Name of the device."""
-    return Frame(Command.SET_TAG, tag)
+    return Packet(Command.SET_TAG, tag)
 
 
-def ask(command: Command) -> Frame:
+def ask(command: Command) -> Packet:
     """Ask for a value; of an UPDATING one this also ends its automatic updates."""
-    return Frame(command, struct.pack("<BH", 0, 0) if command in UPDATING else b"")
+    return Packet(command, struct.pack("<BH", 0, 0) if command in UPDATING else b"")
 
 
-def update(command: Command, period_ms: int, *, on_change: bool = False) -> Frame:
+def update(command: Command, period_ms: int, *, on_change: bool = False) -> Packet:
     """Ask for a value every `period_ms` (1 to 65535) from now on, or only when it has changed."""
     if command not in UPDATING:
         raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} update themselves, not {command!r}")
     if not 1 <= period_ms <= 0xFFFF:
         raise WireError(f"a period must be from 1 to 65535 ms, got {period_ms}")
-    return Frame(command, struct.pack("<BH", 1 | on_change << 1, period_ms))
+    return Packet(command, struct.pack("<BH", 1 | on_change << 1, period_ms))
 
 
-def reply(frame: Frame) -> tuple[Status, bytes]:
+def reply(packet: Packet) -> tuple[Status, bytes]:
     """Status and parameters of a reply. Raises WireError."""
-    if len(frame.payload) < 2:
-        raise WireError(f"the reply {name_of(frame.id)} must hold a status of 2 bytes, got {len(frame.payload)}")
-    number = int.from_bytes(frame.payload[:2], "little")
+    if len(packet.payload) < 2:
+        raise WireError(f"the reply {name_of(packet.id)} must hold a status of 2 bytes, got {len(packet.payload)}")
+    number = int.from_bytes(packet.payload[:2], "little")
     try:
-        return Status(number), frame.payload[2:]
+        return Status(number), packet.payload[2:]
     except ValueError as error:
-        raise WireError(f"the reply {name_of(frame.id)} has the unknown status {number}") from error
+        raise WireError(f"the reply {name_of(packet.id)} has the unknown status {number}") from error
 
 
 def number(parameters: bytes) -> float:
@@ -277,9 +277,9 @@ def soft_limits(parameters: bytes) -> tuple[float, float]:
     return minus, plus
 
 
-def limits(parameters: bytes) -> Limits:
+def limits(parameters: bytes) -> GripperLimits:
     """What the gripper can do."""
-    return Limits(*_numbers("<8f", parameters))
+    return GripperLimits(*_numbers("<8f", parameters))
 
 
 def info(parameters: bytes) -> Info:

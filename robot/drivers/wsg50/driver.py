@@ -17,7 +17,7 @@ from typing import Any
 
 from robot.devices import Clock, Gripper
 from robot.drivers.wsg50 import commands
-from robot.drivers.wsg50.codec import Frame
+from robot.drivers.wsg50.codec import Packet
 from robot.drivers.wsg50.commands import Command, GraspingState, Info, Statistics, Status, SystemState
 from robot.drivers.wsg50.force import FINGER_SHARE, on_finger
 from robot.drivers.wsg50.link import NoReply
@@ -193,7 +193,7 @@ class WSG50(Gripper):
         with self._use("cannot be tared"):
             if read(self._link).grasping is GraspingState.HOLDING:
                 raise DeviceError(f"{self.name}: nothing may be held when the fingers are tared; open it first")
-            self._link.tell(Frame(Command.TARE))
+            self._link.tell(Packet(Command.TARE))
 
     def set_acceleration(self, acceleration_mm_s2: float) -> float:
         """Set the acceleration; returns what the gripper has then (mm/s^2). Raises DeviceError."""
@@ -283,9 +283,9 @@ class WSG50(Gripper):
         speed = self._speed_of_opening()
         return self._run(commands.move(width_mm, speed), speed, _is_at(width_mm))
 
-    def _run(self, frame: Frame, speed_mm_s: float, done: Done) -> Reading:
+    def _run(self, packet: Packet, speed_mm_s: float, done: Done) -> Reading:
         seconds = self._setup.limits.stroke_mm / speed_mm_s + _SLACK_S + self._wanted.timeout_s
-        return self._motions.run(frame, seconds, done)
+        return self._motions.run(packet, seconds, done)
 
     def _speed_of_opening(self) -> float:
         return min(max(self._wanted.opening_speed_mm_s, self._setup.limits.min_speed_mm_s), self.max_speed_mm_s)

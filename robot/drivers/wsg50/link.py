@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 from robot.drivers.wsg50 import commands
-from robot.drivers.wsg50.codec import MAX_PAYLOAD, Frame, WireError, decode, encode
+from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet, WireError, decode, encode
 from robot.drivers.wsg50.commands import Command, Status, name_of
 from robot.drivers.wsg50.port import LinkLost, Port
 from robot.errors import DeviceError
@@ -25,10 +25,10 @@ from robot.errors import DeviceError
 _T = TypeVar("_T")
 _TRIES = 3
 _GAP_SHARE = 0.25
-"""Share of the time-out after which a frame that has begun is given up: the rest of it is not coming."""
+"""Share of the time-out after which a packet that has begun is given up: the rest of it is not coming."""
 
 _PADDING = bytes(MAX_PAYLOAD + 8)
-"""Ends any frame that the gripper may still be waiting for the rest of, and can begin none."""
+"""Ends any packet that the gripper may still be waiting for the rest of, and can begin none."""
 
 _MOST_LOOKS = 6
 """So often, 4096 bytes at a time, is taken in what has come by the end of a wait: more than gathers in ten seconds in
@@ -96,21 +96,21 @@ class Link:
         if port is not None:
             port.close()
 
-    def call(self, frame: Frame) -> bytes:
+    def call(self, packet: Packet) -> bytes:
         """Send a command once; returns the parameters of its reply."""
-        self.begin(frame)
-        return self._result(frame.id)
+        self.begin(packet)
+        return self._result(packet.id)
 
-    def tell(self, frame: Frame) -> None:
+    def tell(self, packet: Packet) -> None:
         """Send a command that may be said twice: it is said again where no sound reply comes."""
-        self.ask(frame, bytes)
+        self.ask(packet, bytes)
 
-    def ask(self, frame: Frame, parse: Callable[[bytes], _T]) -> _T:
+    def ask(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
         """As `tell`; returns what its reply holds. A reply that cannot be parsed is not sound."""
         until = time.monotonic() + _PATIENCE * self.timeout_s
         for left in reversed(range(_TRIES)):
             try:
-                return parse(self.call(frame))
+                return parse(self.call(packet))
             except NoEcho:
                 raise
             except (NoReply, WireError):
@@ -120,26 +120,26 @@ class Link:
                 self._in_doubt = True
         raise AssertionError("the loop returns or raises")
 
-    def begin(self, frame: Frame) -> None:
+    def begin(self, packet: Packet) -> None:
         """Send a command whose replies `poll` fetches; clears the line first if it is in doubt."""
         self.pump(0.0)
         if self._in_doubt:
             self.sync()
         self._in_doubt = True
-        self._write(frame)
+        self._write(packet)
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
         """Status of the next reply to this command, PENDING too, or None after `timeout_s`. Notes updates."""
-        for frame in self._frames(timeout_s):
-            if self._note(frame, command_id) and (reply := self._reply(frame)):
+        for packet in self._packets(timeout_s):
+            if self._note(packet, command_id) and (reply := self._reply(packet)):
                 return reply[0]
         return None
 
-    def urgent(self, frame: Frame) -> None:
+    def urgent(self, packet: Packet) -> None:
         """Send at once, whatever is under way, and wait for a reply: for stops, of which an older reply does."""
         try:
-            self._write(frame)
-            self._result(frame.id)
+            self._write(packet)
+            self._result(packet.id)
         finally:
             self._in_doubt = True
 
@@ -150,14 +150,14 @@ class Link:
                 self.pad()
             token = next(self._tokens).to_bytes(8, "little")
             self._write(commands.loop(token))
-            if self._echoed(Frame(Command.LOOP, bytes(2) + token)):
+            if self._echoed(Packet(Command.LOOP, bytes(2) + token)):
                 self._in_doubt, self.has_echoed = False, True
                 return
             self.counts["no echo"] += 1
         raise NoEcho(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
 
     def pad(self) -> None:
-        """Free the gripper of a frame whose damaged length swallows what it is told next: before saying it again."""
+        """Free the gripper of a packet whose damaged length swallows what it is told next: before saying it again."""
         self._guarded(lambda port: port.write(_PADDING))
 
     def doubt(self) -> None:
@@ -166,20 +166,20 @@ class Link:
 
     def pump(self, seconds: float) -> None:
         """Note what comes within `seconds`; 0 for what has come."""
-        for frame in self._frames(seconds):
-            self._note(frame, None)
+        for packet in self._packets(seconds):
+            self._note(packet, None)
 
-    def _echoed(self, echo: Frame) -> bool:
-        for frame in self._frames(self.timeout_s):
-            if frame == echo:
+    def _echoed(self, echo: Packet) -> bool:
+        for packet in self._packets(self.timeout_s):
+            if packet == echo:
                 return True
-            self._note(frame, None)
+            self._note(packet, None)
         return False
 
     def _result(self, command_id: int) -> bytes:
         """Parameters of the last reply to the command begun last."""
-        for frame in self._frames(self.timeout_s):
-            reply = self._reply(frame) if self._note(frame, command_id) else None
+        for packet in self._packets(self.timeout_s):
+            reply = self._reply(packet) if self._note(packet, command_id) else None
             if reply is None or reply[0] is Status.CMD_PENDING:
                 continue
             self._in_doubt = False
@@ -190,44 +190,44 @@ class Link:
             return reply[1]
         raise NoReply(f"the gripper must answer {name_of(command_id)} within {self.timeout_s:g} s, and did not")
 
-    def _note(self, frame: Frame, command_id: int | None) -> bool:
-        """Keep an update; says whether the frame is of the command that is waited for. Any other raises doubt."""
-        if frame.id in commands.UPDATING:
-            if frame.payload[:2] == bytes(2):
-                self.updates[frame.id] = (frame.payload[2:], time.monotonic())
-        elif frame.id != command_id:
+    def _note(self, packet: Packet, command_id: int | None) -> bool:
+        """Keep an update; says whether the packet is of the command that is waited for. Any other raises doubt."""
+        if packet.id in commands.UPDATING:
+            if packet.payload[:2] == bytes(2):
+                self.updates[packet.id] = (packet.payload[2:], time.monotonic())
+        elif packet.id != command_id:
             self.counts["unexpected"] += 1
             self._in_doubt = True
-        return frame.id == command_id
+        return packet.id == command_id
 
-    def _reply(self, frame: Frame) -> tuple[Status, bytes] | None:
+    def _reply(self, packet: Packet) -> tuple[Status, bytes] | None:
         try:
-            return commands.reply(frame)
+            return commands.reply(packet)
         except WireError:
             self.counts["no status"] += 1
             return None
 
-    def _frames(self, seconds: float) -> Iterator[Frame]:
-        """What comes within `seconds`, and then what has come by then. A frame that stops half-way is given up."""
+    def _packets(self, seconds: float) -> Iterator[Packet]:
+        """What comes within `seconds`, and then what has come by then. A packet that stops half-way is given up."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            if frame := self._decoded():
-                yield frame
+            if packet := self._decoded():
+                yield packet
             else:
                 self._wait(deadline)
         for _ in range(_MOST_LOOKS):
             if not self._fill(0.0):
                 break
-        while frame := self._decoded():
-            yield frame
+        while packet := self._decoded():
+            yield packet
 
-    def _decoded(self) -> Frame | None:
-        used, frame = decode(self._buffer)
+    def _decoded(self) -> Packet | None:
+        used, packet = decode(self._buffer)
         del self._buffer[:used]
-        return frame
+        return packet
 
     def _wait(self, deadline: float) -> None:
-        """Take in bytes as soon as they come, or give up a frame whose rest does not."""
+        """Take in bytes as soon as they come, or give up a packet whose rest does not."""
         given_up_s = self._last_byte_s + _GAP_SHARE * self.timeout_s if self._buffer else deadline
         came = self._fill(min(deadline, given_up_s) - time.monotonic())
         if not came and self._buffer and time.monotonic() >= given_up_s:
@@ -242,8 +242,8 @@ class Link:
             self._last_byte_s = time.monotonic()
         return bool(data)
 
-    def _write(self, frame: Frame) -> None:
-        self._guarded(lambda port: port.write(encode(frame)))
+    def _write(self, packet: Packet) -> None:
+        self._guarded(lambda port: port.write(encode(packet)))
 
     def _guarded(self, use: Callable[[Port], _T]) -> _T:
         """Use the port, and close it where it is gone."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from robot.drivers.wsg50 import commands
-from robot.drivers.wsg50.codec import Frame, WireError
+from robot.drivers.wsg50.codec import Packet, WireError
 from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState, name_of
 from robot.drivers.wsg50.link import CommandFailed, Link, NoReply
 from robot.errors import DeviceError
@@ -99,14 +99,14 @@ class Motions:
         self.unsettled = self.unsettled and reading.moves
         return reading
 
-    def run(self, frame: Frame, seconds: float, done: Done) -> Reading:
+    def run(self, packet: Packet, seconds: float, done: Done) -> Reading:
         """Send a motion, wait until it has ended, for `seconds` at most, and return what the gripper says then.
 
         Raises DeviceError, and then it may still be moving.
         """
         deadline = time.monotonic() + seconds
         for last_try in (False, True):
-            status = self._watch(frame, deadline)
+            status = self._watch(packet, deadline)
             reading = self._standing(deadline)
             if done(reading, status):
                 return reading
@@ -116,7 +116,7 @@ class Motions:
         answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {causes(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
-            f"the gripper answered {answer} to {name_of(frame.id)} and stands at {reading.opening_mm:.1f} mm, "
+            f"the gripper answered {answer} to {name_of(packet.id)} and stands at {reading.opening_mm:.1f} mm, "
             f"{reading.grasping.name.lower()}{stop}; look at it, then call recover()"
         )
 
@@ -134,31 +134,31 @@ class Motions:
         for command in _WATCHED:
             self.link.tell(commands.ask(command))
 
-    def _say(self, frames: Sequence[Frame]) -> None:
+    def _say(self, packets: Sequence[Packet]) -> None:
         """One after the other, until one is answered."""
-        for number, frame in enumerate(frames, start=1):
-            if frame.id == Command.FAST_STOP:
+        for number, packet in enumerate(packets, start=1):
+            if packet.id == Command.FAST_STOP:
                 _log.warning("the gripper does not stop when told to: telling it to FAST STOP")
             try:
-                self.link.urgent(frame)
+                self.link.urgent(packet)
                 return
             except CommandFailed:
                 return  # heard, and of no use: where it stands is read next
             except NoReply:
-                if number == len(frames):
+                if number == len(packets):
                     raise
                 self.link.pad()
 
-    def _watch(self, frame: Frame, deadline: float) -> Status | None:
+    def _watch(self, packet: Packet, deadline: float) -> Status | None:
         """Send the motion and return its last answer, or None where the gripper stands and has not answered."""
         link = self.link
         for command in _WATCHED:
             link.tell(commands.update(command, self.period_ms))
         self.unsettled, self.kept = True, ~SystemState(0)
-        link.begin(frame)
+        link.begin(packet)
         stands_since = time.monotonic()
         while True:
-            status = link.poll(frame.id, _POLL_S)
+            status = link.poll(packet.id, _POLL_S)
             now = time.monotonic()
             if status not in (None, Status.CMD_PENDING):
                 break
@@ -168,7 +168,7 @@ class Motions:
             if now - stands_since > link.timeout_s:
                 break
             if now > deadline:
-                raise DeviceError(f"the gripper must end {name_of(frame.id)} in time, and still moves")
+                raise DeviceError(f"the gripper must end {name_of(packet.id)} in time, and still moves")
         link.doubt()
         self.quiet()
         return status

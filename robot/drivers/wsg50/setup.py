@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from robot.drivers.wsg50 import commands
-from robot.drivers.wsg50.codec import Frame
-from robot.drivers.wsg50.commands import Command, GraspingState, Limits, Status, SystemState
+from robot.drivers.wsg50.codec import Packet
+from robot.drivers.wsg50.commands import Command, GraspingState, GripperLimits, Status, SystemState
 from robot.drivers.wsg50.force import of_gripper, on_finger
 from robot.drivers.wsg50.link import CommandFailed, Link
 from robot.drivers.wsg50.motion import UPDATE_BYTES, Motions, Reading, causes, read
@@ -44,7 +44,7 @@ _LONGEST_WAIT_S = 5.0
 _ROUNDING = 1e-6
 """How much harder than asked a gripper may clamp, relatively: less than numbers of 32 bits are off."""
 
-TYPICAL = Limits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
+TYPICAL = GripperLimits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
 """Of a WSG-50-110, until the gripper has said its own."""
 
 
@@ -150,14 +150,14 @@ class Setup:
 
     def home(self) -> Reading:
         """Find the reference. That it is there proves homing if it was not before, or not while it moved."""
-        frame = commands.home(_DIRECTIONS[self.settings.home_direction])
+        packet = commands.home(_DIRECTIONS[self.settings.home_direction])
         before = self._system_state()
 
         def done(reading: Reading, status: Status | None) -> bool:
             proven = status is Status.SUCCESS or not SystemState.REFERENCED & before & self.motions.kept
             return proven and bool(reading.system & SystemState.REFERENCED)
 
-        return self.motions.run(frame, self.settings.homing_timeout_s, done)
+        return self.motions.run(packet, self.settings.homing_timeout_s, done)
 
     def stop_if_it_moves(self, stop: Callable[[], None]) -> None:
         """Standing jaws are left as they are: STOP would drop what they hold."""
@@ -275,7 +275,7 @@ class Setup:
 
     def _tare(self) -> None:
         try:
-            self.link.tell(Frame(Command.TARE))
+            self.link.tell(Packet(Command.TARE))
         except CommandFailed as error:
             self.refused["tare"] = f"asked true, but {error}: has it force-measuring fingers, and holds nothing?"
 

@@ -74,7 +74,7 @@ class Client:
             self.socket.socket.shutdown(socket.SHUT_RDWR)
 
 
-class Emulator:
+class EmulatedSawyer:
     """The robot's side. Switches: `silent` topics are not sent, `refuse_ik` that many IK calls, `reply_delay_s`.
 
     commands: the joint commands received, newest last, as (time_s, positions).
@@ -311,7 +311,7 @@ def _header() -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def serve(emulator: Emulator, host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
+def serve(emulator: EmulatedSawyer, host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
     """Serve in threads, port 0 a free one; gives the address, "ws://127.0.0.1:54321". Needs `websockets`."""
     from websockets.sync.server import serve as listen
 
@@ -337,7 +337,7 @@ def main() -> None:
     parser.add_argument("--faults", type=float, default=0.0, help="share of operations that go wrong")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    emulator = Emulator(faults=Faults(asked.faults, seed=asked.seed))
+    emulator = EmulatedSawyer(faults=Faults(asked.faults, seed=asked.seed))
     with until_interrupted(), serve(emulator, asked.host, asked.port) as url:
         print(f"a made-up arm behind rosbridge at {url}; Ctrl-C ends it", flush=True)
         threading.Event().wait()

@@ -1,4 +1,4 @@
-"""Faults for the line of an emulated WSG-50: frames lost, doubled, damaged, late, in pieces, misnamed; the line cut.
+"""Faults for the line of an emulated WSG-50: packets lost, doubled, damaged, late, in pieces, misnamed; the line cut.
 
 A line is a stream: what is late keeps everything behind it waiting, and nothing overtakes.
 """
@@ -7,7 +7,7 @@ import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from robot.drivers.wsg50.codec import Frame, WireError, encode
+from robot.drivers.wsg50.codec import Packet, WireError, encode
 from robot.errors import RobotConfigError
 from robot.settings import check_range
 
@@ -23,9 +23,9 @@ class Piece:
 
 
 class Faults:
-    """Damages frames. rate: share of frames that meet a fault, each of a kind of `kinds` drawn evenly.
+    """Damages packets. rate: share of packets that meet a fault, each of a kind of `kinds` drawn evenly.
 
-    delay_s: how late a delayed frame is, and the pause within a split one. counts: faults made so far, by kind.
+    delay_s: how late a delayed packet is, and the pause within a split one. counts: faults made so far, by kind.
     Raises RobotConfigError.
     """
 
@@ -39,17 +39,17 @@ class Faults:
         self.counts = dict.fromkeys(self.kinds, 0)
         self._random = random.Random(seed)
 
-    def on(self, frame: Frame) -> Iterator[Piece]:
-        """What becomes of a frame on the line."""
-        data = encode(frame)
+    def on(self, packet: Packet) -> Iterator[Piece]:
+        """What becomes of a packet on the line."""
+        data = encode(packet)
         if not self.kinds or self._random.random() >= self.rate:
             yield Piece(data)
             return
         kind = self._random.choice(self.kinds)
         self.counts[kind] += 1
-        yield from self._damaged(kind, frame, data)
+        yield from self._damaged(kind, packet, data)
 
-    def _damaged(self, kind: str, frame: Frame, data: bytes) -> Iterator[Piece]:
+    def _damaged(self, kind: str, packet: Packet, data: bytes) -> Iterator[Piece]:
         if kind == "duplicated":
             yield Piece(data + data)
         elif kind == "corrupted":
@@ -61,7 +61,7 @@ class Faults:
             yield Piece(data[:cut])
             yield Piece(data[cut:], self.delay_s)
         elif kind == "wrong id":
-            yield Piece(self._misnamed(frame))
+            yield Piece(self._misnamed(packet))
         elif kind == "disconnect":
             yield Piece(None)
 
@@ -70,12 +70,12 @@ class Faults:
         damaged[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
         return bytes(damaged)
 
-    def _misnamed(self, frame: Frame) -> bytes:
-        """The same frame with another id, and a check sum that fits."""
+    def _misnamed(self, packet: Packet) -> bytes:
+        """The same packet with another id, and a check sum that fits."""
         while True:
             try:
-                other = Frame(self._random.randrange(256), frame.payload)
+                other = Packet(self._random.randrange(256), packet.payload)
             except WireError:
                 continue
-            if other.id != frame.id:
+            if other.id != packet.id:
                 return encode(other)

@@ -1,7 +1,7 @@
 """What an emulated WSG-50 does with commands, in time. No I/O: robot.emulators.wsg50.server gives it ports.
 
 Written from the protocol's facts (robot.drivers.wsg50.codec names them) with its own packing and numbers, so that it
-and the driver cannot share a misreading; they share framing and check sum, which are tested against printed frames.
+and the driver cannot share a misreading; they share framing and check sum, which are tested against printed packets.
 Where the facts are silent it does the least convenient thing that they allow: it denies what it is not known to allow.
 """
 
@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from robot.drivers.wsg50.codec import MAX_PAYLOAD, Frame
+from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet
 from robot.emulators.wsg50 import numbers as facts
 from robot.emulators.wsg50.mechanics import STROKE_MM, Mechanics
 from robot.emulators.wsg50.updates import Updates
@@ -24,7 +24,7 @@ Answer = int | bytes
 """A status alone, or the parameters of a success."""
 
 
-class Emulator:
+class EmulatedWSG50:
     """A WSG-50. `receive` takes a command, `tick` lets time pass; both return what it says, in order.
 
     object_mm: width of the rigid object between the jaws, or None; may be set at any time, and a held part is lost by
@@ -58,7 +58,7 @@ class Emulator:
         self._tag, self._counts = b"emulated", [0, 0, 0]
         self._running: tuple[int, Callable[[], int | None]] | None = None
         self._updates = Updates(self._value)
-        self._owed: list[Frame] = []
+        self._owed: list[Packet] = []
         self._announced = False
         self._now = clock()
 
@@ -127,38 +127,38 @@ class Emulator:
                 self.fail()
             self._owed.clear()
 
-    def receive(self, frame: Frame) -> list[Frame]:
+    def receive(self, packet: Packet) -> list[Packet]:
         """Do a command; returns what it answers at once."""
         with self._lock:
             self._advance()
-            self.heard.append(frame.id)
+            self.heard.append(packet.id)
             del self.heard[:-_MOST_HEARD]
-            forced = self.next_status.pop(frame.id, None)
-            answer = self._answer(frame.id, frame.payload) if forced is None else forced
+            forced = self.next_status.pop(packet.id, None)
+            answer = self._answer(packet.id, packet.payload) if forced is None else forced
             if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:
                 answer = facts.RANGE  # no room for it beside the status
             self._owed.append(
-                Frame(frame.id, _status(answer) if isinstance(answer, int) else _status(facts.OK) + answer)
+                Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(facts.OK) + answer)
             )
             return self._say()
 
-    def receive_damaged(self, command: int) -> list[Frame]:
+    def receive_damaged(self, command: int) -> list[Packet]:
         """What it says to a command whose check sum does not hold."""
         with self._lock:
             if self.answers_bad_checksum:
-                self._owed.append(Frame(command, _status(facts.DAMAGED)))
+                self._owed.append(Packet(command, _status(facts.DAMAGED)))
             return self._say()
 
-    def tick(self) -> list[Frame]:
+    def tick(self) -> list[Packet]:
         """Let time pass up to now; returns results of motions, and automatic updates."""
         with self._lock:
             self._advance()
             self._owed += self._ended()
             due = list(self._updates.due(self._now))
-            self._owed += [] if self.mute_updates else [Frame(each, _status(facts.OK) + value) for each, value in due]
+            self._owed += [] if self.mute_updates else [Packet(each, _status(facts.OK) + value) for each, value in due]
             return self._say()
 
-    def _say(self) -> list[Frame]:
+    def _say(self) -> list[Packet]:
         said, self._owed = self._owed, []
         return [] if self.silent else said
 
@@ -167,7 +167,7 @@ class Emulator:
         self._jaws.stand()
         self._bits.discard(facts.FORCE_BIT)
         if self._running:
-            self._owed.append(Frame(self._running[0], _status(facts.ABORTED)))
+            self._owed.append(Packet(self._running[0], _status(facts.ABORTED)))
             self._running = None
 
     def _advance(self) -> None:
@@ -176,11 +176,11 @@ class Emulator:
         if not self.jammed:
             self._jaws.advance(passed * self.speed_up)
 
-    def _ended(self) -> Iterator[Frame]:
+    def _ended(self) -> Iterator[Packet]:
         """The result of a motion that has ended; a held part that is gone."""
         if self._running and (status := self._running[1]()) is not None:
             command, self._running = self._running[0], None
-            yield Frame(command, _status(status))
+            yield Packet(command, _status(status))
         if self.grasping == facts.HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
             self.grasping = facts.PART_LOST
             self._bits.discard(facts.FORCE_BIT)
@@ -370,29 +370,29 @@ def _status(number: int) -> bytes:
     return struct.pack("<H", number)
 
 
-_ACTIONS: dict[int, Callable[[Emulator, bytes], Answer]] = {
+_ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x06: lambda _, payload: payload,
-    0x07: Emulator._announce,
-    0x20: Emulator._home,
-    0x21: Emulator._move,
-    0x22: Emulator._stop,
-    0x23: Emulator._fast_stop,
-    0x24: Emulator._acknowledge,
-    0x25: Emulator._grasp,
-    0x26: Emulator._release,
-    0x30: Emulator._set_acceleration,
+    0x07: EmulatedWSG50._announce,
+    0x20: EmulatedWSG50._home,
+    0x21: EmulatedWSG50._move,
+    0x22: EmulatedWSG50._stop,
+    0x23: EmulatedWSG50._fast_stop,
+    0x24: EmulatedWSG50._acknowledge,
+    0x25: EmulatedWSG50._grasp,
+    0x26: EmulatedWSG50._release,
+    0x30: EmulatedWSG50._set_acceleration,
     0x31: lambda own, _: struct.pack("<f", own._jaws.acceleration_mm_s2),
-    0x32: Emulator._set_force,
+    0x32: EmulatedWSG50._set_force,
     0x33: lambda own, _: struct.pack("<f", own.force_limit_n),
-    0x34: Emulator._set_soft_limits,
-    0x35: Emulator._get_soft_limits,
-    0x36: Emulator._clear_soft_limits,
+    0x34: EmulatedWSG50._set_soft_limits,
+    0x35: EmulatedWSG50._get_soft_limits,
+    0x36: EmulatedWSG50._clear_soft_limits,
     0x37: lambda _, payload: facts.OK if payload[0] < 2 else facts.INVALID,
-    0x38: Emulator._tare,
-    0x42: Emulator._statistics,
+    0x38: EmulatedWSG50._tare,
+    0x42: EmulatedWSG50._statistics,
     0x46: lambda _, payload: struct.pack("<h", 253),
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
-    0x51: Emulator._set_tag,
+    0x51: EmulatedWSG50._set_tag,
     0x52: lambda own, _: own._tag,
     0x53: lambda _, payload: struct.pack(
         "<8f", STROKE_MM, *facts.SPEEDS, *facts.ACCELERATIONS, *facts.FORCES, facts.OVERDRIVE_N

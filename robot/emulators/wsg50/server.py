@@ -5,7 +5,7 @@
 
 or in a program:
 
-    with serve_tcp(Emulator(object_mm=40.0)) as url, WSG50(port=url) as gripper:
+    with serve_tcp(EmulatedWSG50(object_mm=40.0)) as url, WSG50(port=url) as gripper:
         gripper.grasp(10.0)
 """
 
@@ -24,13 +24,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from robot.drivers.wsg50.codec import PREAMBLE, Frame, decode, encode
+from robot.drivers.wsg50.codec import PREAMBLE, Packet, decode, encode
 from robot.emulators.wsg50.faults import Faults
-from robot.emulators.wsg50.gripper import Emulator
+from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.emulators.wsg50.numbers import UPDATES
 from robot.interrupts import until_interrupted
 
-__all__ = ["Emulator", "Faults", "main", "serve_pty", "serve_tcp"]
+__all__ = ["EmulatedWSG50", "Faults", "main", "serve_pty", "serve_tcp"]
 
 _log = logging.getLogger(__name__)
 _TICK_S = 0.001
@@ -51,7 +51,7 @@ class _Line(Protocol):
 
 
 @contextlib.contextmanager
-def serve_tcp(emulator: Emulator, faults: Faults | None = None, *, port: int = 0) -> Iterator[str]:
+def serve_tcp(emulator: EmulatedWSG50, faults: Faults | None = None, *, port: int = 0) -> Iterator[str]:
     """Serve one client at a time on 127.0.0.1; gives the URL for the driver. port 0: any free one."""
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(0.02)
@@ -69,7 +69,7 @@ def serve_tcp(emulator: Emulator, faults: Faults | None = None, *, port: int = 0
 
 
 @contextlib.contextmanager
-def serve_pty(emulator: Emulator, faults: Faults | None = None) -> Iterator[str]:
+def serve_pty(emulator: EmulatedWSG50, faults: Faults | None = None) -> Iterator[str]:
     """Serve a pseudo-terminal; gives a path that stays the same when the line was cut. A serial line that is cut or
     closed raises no FAST STOP: the gripper does not notice."""
     with tempfile.TemporaryDirectory() as folder:
@@ -143,7 +143,7 @@ def _thread(work: Callable[[threading.Event], None]) -> Iterator[None]:
 
 
 def _serve(
-    emulator: Emulator,
+    emulator: EmulatedWSG50,
     faults: Faults,
     wait_for_client: Callable[[threading.Event], _Line | None],
     stop: threading.Event,
@@ -165,7 +165,7 @@ def _serve(
 class _Session:
     """One client's time with the gripper."""
 
-    def __init__(self, emulator: Emulator, faults: Faults, line: _Line) -> None:
+    def __init__(self, emulator: EmulatedWSG50, faults: Faults, line: _Line) -> None:
         self.emulator, self.faults, self.line = emulator, faults, line
         self._arrived, self._heard = bytearray(), bytearray()
 
@@ -174,18 +174,18 @@ class _Session:
         while not stop.is_set():
             if select.select([self.line.fileno()], [], [], _TICK_S)[0]:
                 self._hear()
-            for frame in self.emulator.tick():
-                if frame.id in UPDATES:  # faults are for commands and what answers them
-                    self._write(frame)
+            for packet in self.emulator.tick():
+                if packet.id in UPDATES:  # faults are for commands and what answers them
+                    self._write(packet)
                 else:
-                    self._say(frame)
+                    self._say(packet)
 
     def _hear(self) -> None:
         data = self.line.read()
         if not data:
             raise _Cut
         self._arrived += data
-        for noise, command in _frames(self._arrived):
+        for noise, command in _packets(self._arrived):
             self._take(noise)
             for piece in self.faults.on(command) if command else ():
                 time.sleep(piece.pause_s)
@@ -196,35 +196,35 @@ class _Session:
     def _take(self, data: bytes) -> None:
         """What is left of what was sent, after its faults."""
         self._heard += data
-        for noise, command in _frames(self._heard):
+        for noise, command in _packets(self._heard):
             answers = [answer for each in _damaged(noise) for answer in self.emulator.receive_damaged(each)]
             for answer in answers + (self.emulator.receive(command) if command else []):
                 self._say(answer)
 
-    def _say(self, frame: Frame) -> None:
-        for piece in self.faults.on(frame):
+    def _say(self, packet: Packet) -> None:
+        for piece in self.faults.on(packet):
             time.sleep(piece.pause_s)
             if piece.data is None:
                 raise _Cut
             self.line.write(piece.data)
 
-    def _write(self, frame: Frame) -> None:
-        self.line.write(encode(frame))
+    def _write(self, packet: Packet) -> None:
+        self.line.write(encode(packet))
 
 
-def _frames(buffer: bytearray) -> Iterator[tuple[bytes, Frame | None]]:
-    """Take the whole frames out of a buffer, each with the noise before it; at last the noise behind them."""
+def _packets(buffer: bytearray) -> Iterator[tuple[bytes, Packet | None]]:
+    """Take the whole packets out of a buffer, each with the noise before it; at last the noise behind them."""
     while True:
-        used, frame = decode(buffer)
-        noise = bytes(buffer[: used - len(encode(frame))] if frame else buffer[:used])
+        used, packet = decode(buffer)
+        noise = bytes(buffer[: used - len(encode(packet))] if packet else buffer[:used])
         del buffer[:used]
-        yield noise, frame
-        if frame is None:
+        yield noise, packet
+        if packet is None:
             return
 
 
 def _damaged(noise: bytes) -> Iterator[int]:
-    """Ids of the frames that have begun in noise."""
+    """Ids of the packets that have begun in noise."""
     for begun in noise.split(PREAMBLE)[1:]:
         yield from begun.lstrip(PREAMBLE)[:1]
 
@@ -237,10 +237,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     port.add_argument("--pty", action="store_true", help="make a pseudo-terminal")
     parser.add_argument("--object-mm", type=float, help="width of an object between the jaws")
     parser.add_argument("--speed-up", type=float, default=1.0, help="how much faster its time runs")
-    parser.add_argument("--faults", type=float, default=0.0, metavar="RATE", help="share of frames that meet a fault")
+    parser.add_argument("--faults", type=float, default=0.0, metavar="RATE", help="share of packets that meet a fault")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
-    emulator = Emulator(object_mm=options.object_mm, speed_up=options.speed_up)
+    emulator = EmulatedWSG50(object_mm=options.object_mm, speed_up=options.speed_up)
     faults = Faults(options.faults, seed=options.seed)
     serving = serve_pty(emulator, faults) if options.pty else serve_tcp(emulator, faults, port=options.tcp)
     try:

@@ -38,7 +38,7 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Problem:
+class ContactProblem:
     """`gap` (rows, cols), +inf where there is nothing; `load` None for depth control."""
 
     operator: Operator
@@ -78,7 +78,7 @@ def _dot(a: Floats, b: Floats) -> float:
 class _Run:
     """One descent: the pressure, what follows from it, and the direction last gone along."""
 
-    def __init__(self, problem: Problem, start: Floats) -> None:
+    def __init__(self, problem: ContactProblem, start: Floats) -> None:
         self.problem = problem
         self.there = np.isfinite(problem.gap)
         self.gap = np.where(self.there, problem.gap, 0.0)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from robot.errors import RobotConfigError, SceneError
 from robot.sim.contact.constrained_cg import Solution
 from robot.sim.contact.kernels import Floats
-from robot.sim.contact.scaled_problem import Surface, Task
+from robot.sim.contact.scaled_problem import ElasticSurface, Task
 
 STRAIN_LIMIT = 0.5  # of displacement over thickness, and of slope, that linear elasticity may claim
 _SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
@@ -100,7 +100,7 @@ def press(
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
         return _untouched(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    surface = Surface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded)
+    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded)
     if depth_mm is not None and not surface.loses_volume() and depth_mm > gap.mean():
         return _untouched(gap, math.inf, depth_mm, ("rigid_volume",))
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
@@ -132,7 +132,7 @@ def _untouched(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple
 
 
 def _contact(
-    solution: Solution, surface: Surface, layer: Layer, pixel_mm: float, scale: float, lowest_mm: float
+    solution: Solution, surface: ElasticSurface, layer: Layer, pixel_mm: float, scale: float, lowest_mm: float
 ) -> Contact:
     """Back in the caller's units, with flags."""
     pressure, displacement = solution.pressure, solution.displacement

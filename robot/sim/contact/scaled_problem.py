@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.sim.contact.constrained_cg import GAP_WEIGHT, Problem, Solution
+from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, Solution
 from robot.sim.contact.kernels import Floats, Operator, Quadrant, influence, layer_compliance, periodic_influence
 
 _COARSER = 4
@@ -26,7 +26,7 @@ Window = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
-class Surface:
+class ElasticSurface:
     """A layer `thickness` pixels thick; `softness` is its E* over the object's, 0 for a rigid object."""
 
     thickness: float
@@ -60,7 +60,7 @@ def _operator(grid: Quadrant, window: Quadrant, thickness: float, poisson: float
 class Task:
     """Press with `load` (sum of pressures), or where it is None to `depth`; `gap` (rows, cols) is inf where empty."""
 
-    surface: Surface
+    surface: ElasticSurface
     gap: Floats
     load: float | None
     depth: float
@@ -74,9 +74,9 @@ class Task:
             start = self._problem(_whole(self.gap.shape)).guess()
         return self._refine(start)
 
-    def _problem(self, window: Window) -> Problem:
+    def _problem(self, window: Window) -> ContactProblem:
         gap = self.gap[window]
-        return Problem(self.surface.both(self.gap.shape, gap.shape), gap, self.load, self.depth)
+        return ContactProblem(self.surface.both(self.gap.shape, gap.shape), gap, self.load, self.depth)
 
     def _coarse_start(self) -> Floats | None:
         """The coarse grid's pressure on the fine one; None if the coarse grid does not touch."""

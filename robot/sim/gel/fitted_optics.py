@@ -33,7 +33,7 @@ _COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach i
 Matrix = NDArray[np.float64]
 
 
-class Limits(NamedTuple):
+class FittedLimits(NamedTuple):
     """What the fitted presses showed; everything is held inside."""
 
     steepest: float  # of |n|, the sine of the tilt
@@ -58,7 +58,7 @@ class FittedOptics(Optics):
     weights: tuple[tuple[float, ...], ...]
     flat_degree: int
     flat: tuple[tuple[float, ...], ...]
-    limits: Limits
+    limits: FittedLimits
 
     def __post_init__(self) -> None:
         wanted = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
@@ -194,7 +194,7 @@ def optics_from_json(content: dict[str, Any]) -> FittedOptics:
             weights=_rows(model["weights"]),
             flat_degree=int(model["flat_degree"]),
             flat=_rows(model["flat"]),
-            limits=Limits(
+            limits=FittedLimits(
                 steepest=float(limits["steepest"]),
                 left=float(limits["left"]),
                 right=float(limits["right"]),

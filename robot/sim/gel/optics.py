@@ -40,7 +40,7 @@ class Optics(ABC):
 
 
 @dataclass(frozen=True)
-class Bar:
+class LedBar:
     """LEDs of one colour beside the gel: `points` of them along a line that faces the middle of the field.
 
     `angle_rad` is where it stands, counted from the right of the image, counter-clockwise as seen on screen;
@@ -93,7 +93,7 @@ class Glow:
 
 
 # Like a GelSight Mini: blue from above, red from below on the left, green from the right; a pink middle.
-MINI_BARS = (Bar(math.radians(234)), Bar(math.radians(346)), Bar(math.radians(122)))
+MINI_BARS = (LedBar(math.radians(234)), LedBar(math.radians(346)), LedBar(math.radians(122)))
 MINI_GLOWS = (
     Glow(64, 99, 0.0, -0.12, 1.09, 0.98, 0.0, -6.0),
     Glow(50, 76, 0.2, -0.13, 1.4, 1.9, -14.0, -1.0),
@@ -112,7 +112,7 @@ class LedOptics(Optics):
     Raises RobotConfigError for shares outside 0 to 1 or mixes that do not add up to 1.
     """
 
-    bars: tuple[Bar, Bar, Bar] = MINI_BARS
+    bars: tuple[LedBar, LedBar, LedBar] = MINI_BARS
     glows: tuple[Glow, Glow, Glow] = MINI_GLOWS
     mix: tuple[Triple, Triple, Triple] = MINI_MIX
     ambient: float = 0.38
@@ -140,11 +140,11 @@ class LedOptics(Optics):
 
 
 @lru_cache(maxsize=6)
-def _bar_rays(bars: tuple[Bar, ...], field: Field) -> tuple[list[tuple[Array, Array, Array]], ...]:
+def _bar_rays(bars: tuple[LedBar, ...], field: Field) -> tuple[list[tuple[Array, Array, Array]], ...]:
     return tuple(led_rays(bar, field) for bar in bars)
 
 
-def led_rays(bar: Bar, field: Field) -> list[tuple[Array, Array, Array]]:
+def led_rays(bar: LedBar, field: Field) -> list[tuple[Array, Array, Array]]:
     """For each LED the vector (x, y, z maps) whose product with the normal is its share of w / w_flat."""
     middle = np.array([0.0, 0.0, 0.0])
     x, y = (axis.astype(np.float64) for axis in field.positions())
@@ -183,7 +183,7 @@ _REACHES_MM = (0.4, 0.8, 1.4, 2.2)  # how far towards the bar a higher surface i
 _PENUMBRA_MM = 0.5  # how far a surface must stand into the light to take all of it: bars are long, light soft
 
 
-def cast_shadows(surface: Surface, bars: tuple[Bar, ...]) -> list[Array]:
+def cast_shadows(surface: Surface, bars: tuple[LedBar, ...]) -> list[Array]:
     """For each bar the share (0 to 1) of its light that the surface itself keeps from each pixel."""
     heights = surface.coarse(_SHADOW_STEP)
     full = (surface.field.rows, surface.field.cols)
@@ -200,7 +200,7 @@ def cast_shadows(surface: Surface, bars: tuple[Bar, ...]) -> list[Array]:
 
 @lru_cache(maxsize=6)
 def _shadow_looks(
-    bars: tuple[Bar, ...], field: Field, shape: tuple[int, int]
+    bars: tuple[LedBar, ...], field: Field, shape: tuple[int, int]
 ) -> tuple[list[tuple[Array, Array, Array]], ...]:
     """For each bar and reach: where to look (x, y maps) and how high the light's ray is there (mm)."""
     grid = Field(shape[0], shape[1], 1.0)

@@ -23,7 +23,7 @@ from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.fitted_optics import load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
-from robot.sim.gel.optics import MINI_BARS, MINI_GLOWS, Bar, Glow, LedOptics, Optics, Triple
+from robot.sim.gel.optics import MINI_BARS, MINI_GLOWS, Glow, LedBar, LedOptics, Optics, Triple
 from robot.sim.gel.surface import Array, Field, Surface
 
 Picture = NDArray[np.uint8]
@@ -216,7 +216,7 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
     )
 
 
-def _draw_bar(bar: Bar, rng: np.random.Generator) -> Bar:
+def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
     turn, out, up = rng.standard_normal(3) * (math.radians(5), 0.8, 0.35)
     return replace(
         bar,

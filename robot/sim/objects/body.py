@@ -23,7 +23,7 @@ _MOST_STEPS = 600
 
 
 @dataclass(frozen=True)
-class Rays:
+class ClippedRays:
     """Rays cut to the bounding box: they start `near_mm` from where they were asked for and end after `far_mm`."""
 
     origins: Vectors
@@ -57,7 +57,9 @@ class Body(ABC):
         if len(inside):
             start, along, near = start[inside], along[inside], near[inside]
             entry = start + near[:, None] * along
-            distances[inside] = near + self._cast(Rays(entry, along, near, far[inside] - near, step_mm, beyond_mm))
+            distances[inside] = near + self._cast(
+                ClippedRays(entry, along, near, far[inside] - near, step_mm, beyond_mm)
+            )
         return distances
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
@@ -74,7 +76,7 @@ class Body(ABC):
         """Volume of the solid, and of its outermost `shell_mm` alone."""
 
     @abstractmethod
-    def _cast(self, rays: Rays) -> Vectors:
+    def _cast(self, rays: ClippedRays) -> Vectors:
         """Distances from the rays' origins on the bounding box; inf for a miss."""
 
     @abstractmethod
@@ -159,7 +161,7 @@ class SdfBody(Body):
             total += self.field(x + a, y + b, z + c, step_mm)[:, None] * np.array(corner, np.float64)
         return total
 
-    def _cast(self, rays: Rays) -> Vectors:
+    def _cast(self, rays: ClippedRays) -> Vectors:
         lines = np.ascontiguousarray(np.concatenate([rays.origins, rays.directions], axis=1).T, np.float32)
         brackets = self._march(lines, rays)
         hits = np.flatnonzero(np.isfinite(brackets[0]))
@@ -167,7 +169,7 @@ class SdfBody(Body):
         distances[hits] = self._refine(lines[:, hits], brackets[:, hits], rays.step_mm)
         return distances
 
-    def _march(self, lines: Floats, rays: Rays) -> Floats:
+    def _march(self, lines: Floats, rays: ClippedRays) -> Floats:
         """Sphere tracing until f changes sign: rows t and f just inside (inf: a miss), t and f just outside.
 
         Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds

@@ -15,7 +15,7 @@ import numpy as np
 from robot.errors import RobotConfigError, UnknownName
 from robot.sim.objects.body import Body, SdfBody
 from robot.sim.objects.looks import Looks, draw_looks
-from robot.sim.objects.materials import Material, draw_material
+from robot.sim.objects.materials import ObjectMaterial, draw_material
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes import SHAPES
 
@@ -33,7 +33,7 @@ class SimObject:
     object_id: str
     family: str
     relief: Relief
-    material: Material
+    material: ObjectMaterial
     looks: Looks
     body: Body = field(repr=False)
 

@@ -14,7 +14,7 @@ from robot.settings import check_range
 
 
 @dataclass(frozen=True)
-class Material:
+class ObjectMaterial:
     """Isotropic linear elasticity, density, friction against gel, and two numbers for shading (0 to 1)."""
 
     name: str
@@ -40,24 +40,24 @@ class Material:
 
 _TABLE = (
     #        name              MPa   Poisson kg/m3 friction gloss roughness
-    Material("silicone-foam", 0.015, 0.30, 250, 1.00, 0.02, 0.95),
-    Material("soft-rubber", 0.8, 0.48, 1050, 1.10, 0.10, 0.80),
-    Material("hard-rubber", 8.0, 0.47, 1200, 0.95, 0.20, 0.65),
-    Material("cork", 20.0, 0.05, 200, 0.80, 0.04, 0.92),
-    Material("cardboard", 150.0, 0.20, 650, 0.60, 0.06, 0.90),
-    Material("leather", 80.0, 0.40, 900, 0.75, 0.25, 0.60),
-    Material("wood", 9e3, 0.35, 650, 0.55, 0.15, 0.75),
-    Material("polyethylene", 900.0, 0.44, 950, 0.45, 0.40, 0.45),
-    Material("abs", 2.2e3, 0.37, 1050, 0.55, 0.55, 0.35),
-    Material("ceramic", 7e4, 0.23, 2300, 0.60, 0.80, 0.15),
-    Material("glass", 7e4, 0.22, 2500, 0.50, 0.95, 0.05),
-    Material("aluminium", 7e4, 0.33, 2700, 0.50, 0.75, 0.30),
-    Material("steel", 2e5, 0.29, 7850, 0.45, 0.85, 0.20),
+    ObjectMaterial("silicone-foam", 0.015, 0.30, 250, 1.00, 0.02, 0.95),
+    ObjectMaterial("soft-rubber", 0.8, 0.48, 1050, 1.10, 0.10, 0.80),
+    ObjectMaterial("hard-rubber", 8.0, 0.47, 1200, 0.95, 0.20, 0.65),
+    ObjectMaterial("cork", 20.0, 0.05, 200, 0.80, 0.04, 0.92),
+    ObjectMaterial("cardboard", 150.0, 0.20, 650, 0.60, 0.06, 0.90),
+    ObjectMaterial("leather", 80.0, 0.40, 900, 0.75, 0.25, 0.60),
+    ObjectMaterial("wood", 9e3, 0.35, 650, 0.55, 0.15, 0.75),
+    ObjectMaterial("polyethylene", 900.0, 0.44, 950, 0.45, 0.40, 0.45),
+    ObjectMaterial("abs", 2.2e3, 0.37, 1050, 0.55, 0.55, 0.35),
+    ObjectMaterial("ceramic", 7e4, 0.23, 2300, 0.60, 0.80, 0.15),
+    ObjectMaterial("glass", 7e4, 0.22, 2500, 0.50, 0.95, 0.05),
+    ObjectMaterial("aluminium", 7e4, 0.33, 2700, 0.50, 0.75, 0.30),
+    ObjectMaterial("steel", 2e5, 0.29, 7850, 0.45, 0.85, 0.20),
 )
-MATERIALS: Mapping[str, Material] = MappingProxyType({material.name: material for material in _TABLE})
+MATERIALS: Mapping[str, ObjectMaterial] = MappingProxyType({material.name: material for material in _TABLE})
 
 
-def draw_material(rng: np.random.Generator, name: str | None = None) -> Material:
+def draw_material(rng: np.random.Generator, name: str | None = None) -> ObjectMaterial:
     """One of the table (or the one named), its numbers jittered. Raises UnknownName."""
     chosen = str(rng.choice(list(MATERIALS))) if name is None else name
     if chosen not in MATERIALS:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from robot.errors import SceneError
-from robot.sim.objects.body import Body, Rays, Vectors
+from robot.sim.objects.body import Body, ClippedRays, Vectors
 from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.objects.looks import draw_looks
 from robot.sim.objects.materials import draw_material
@@ -139,7 +139,7 @@ class MeshBody(Body):
         """Exact volume; the shell's is area times thickness, at most the whole."""
         return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
 
-    def _cast(self, rays: Rays) -> Vectors:
+    def _cast(self, rays: ClippedRays) -> Vectors:
         # A face that lies in the bounding box would be missed by rays that start on it.
         back = np.minimum(rays.near_mm, _BACK_MM)
         face, distance = self._first(rays.origins - back[:, None] * rays.directions, rays.directions)
@@ -161,7 +161,7 @@ class MeshBody(Body):
         offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
 
-    def _lift(self, face: Faces, rays: Rays, chosen: Faces, distance: Vectors) -> Vectors:
+    def _lift(self, face: Faces, rays: ClippedRays, chosen: Faces, distance: Vectors) -> Vectors:
         """How much earlier (or, engraved, later) rays meet the relief than the mesh."""
         if self.wall is None:
             return np.zeros(len(face))

@@ -8,7 +8,7 @@ import numpy as np
 from robot.sim.objects.shapes.base import Shape
 from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
 from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Fluted, Revolution, Rod
-from robot.sim.objects.shapes.solids import Bar, Bars, Blobs, Brush, Comb, Mug, Ring, Superquadric
+from robot.sim.objects.shapes.solids import Blobs, Brick, Bricks, Brush, Comb, Mug, Ring, Superquadric
 
 Rng = np.random.Generator
 
@@ -212,9 +212,11 @@ def bracket(rng: Rng) -> Shape:
     """An angle, a T or a channel, standing on end."""
     x, y, wall = _between(rng, 16, 45), _between(rng, 10, 30), _between(rng, 4, 10)
     height, rim = _between(rng, 35, 120), _between(rng, 0.6, 1.6)
-    web = Bar((0, y - wall / 2), (x, wall / 2), 0, height, rim)
+    web = Brick((0, y - wall / 2), (x, wall / 2), 0, height, rim)
     places = ((x - wall / 2,), (0.0,), (wall / 2 - x, x - wall / 2))[int(rng.integers(3))]
-    return Bars((web, *(Bar((place, 0), (wall / 2, y), 0, height * _between(rng, 0.6, 1), rim) for place in places)))
+    return Bricks(
+        (web, *(Brick((place, 0), (wall / 2, y), 0, height * _between(rng, 0.6, 1), rim) for place in places))
+    )
 
 
 def steps(rng: Rng) -> Shape:
@@ -224,15 +226,16 @@ def steps(rng: Rng) -> Shape:
     shares = np.sort(rng.uniform(0.35, 1, count))[::-1] / 1.0
     x, y, rim = _between(rng, 20, 44), _between(rng, 16, 40), _between(rng, 0.8, 2.5)
     bars = [
-        Bar((0, 0), (x * s / shares[0], y * s / shares[0]), 0, float(t), rim) for s, t in zip(shares, tops, strict=True)
+        Brick((0, 0), (x * s / shares[0], y * s / shares[0]), 0, float(t), rim)
+        for s, t in zip(shares, tops, strict=True)
     ]
-    return Bars(tuple(bars))
+    return Bricks(tuple(bars))
 
 
 def comb(rng: Rng) -> Shape:
     """A slab with slots: a comb, a grate, a heat sink."""
     height, thick, pitch = _between(rng, 50, 120), _between(rng, 4.5, 14), _skewed(rng, 4, 13)
-    slab_ = Bar((0, 0), (_between(rng, 24, 50), thick), 0, height, _between(rng, 0.6, 1.5))
+    slab_ = Brick((0, 0), (_between(rng, 24, 50), thick), 0, height, _between(rng, 0.6, 1.5))
     lying = bool(rng.random() < 0.4)
     slot = -slab_.half_mm[0] * _between(rng, -0.2, 0.6) if lying else height * _between(rng, -0.35, 0.0)
     return Comb(slab_, pitch_mm=pitch, gap_mm=pitch * _between(rng, 0.35, 0.6), slot_mm=slot, lying=lying)
@@ -241,7 +244,7 @@ def comb(rng: Rng) -> Shape:
 def brush(rng: Rng) -> Shape:
     """Bristles or pins on a block."""
     pitch, top = _skewed(rng, 4, 10), _between(rng, 60, 130)
-    block = Bar((0, 0), (_between(rng, 18, 46), _between(rng, 9, 28)), 0, top * _between(rng, 0.2, 0.5), 1.5)
+    block = Brick((0, 0), (_between(rng, 18, 46), _between(rng, 9, 28)), 0, top * _between(rng, 0.2, 0.5), 1.5)
     return Brush(block, bristle_mm=pitch * _between(rng, 0.26, 0.4), pitch_mm=pitch, top_mm=top)
 
 

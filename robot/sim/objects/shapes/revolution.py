@@ -8,7 +8,7 @@ import numpy as np
 from robot.sim.objects.shapes.base import Cylindrical, Floats, Shape, bounds, length, relief_limit, rounded, smooth_min
 
 
-class Part(ABC):
+class Profile(ABC):
     """A flat signed distance in the half-plane r >= 0."""
 
     top_mm: float
@@ -20,7 +20,7 @@ class Part(ABC):
 
 
 @dataclass(frozen=True)
-class Drum(Part):
+class Drum(Profile):
     """A cylinder from `bottom_mm` to `top_mm` whose edges are rounded by `rim_mm`."""
 
     radius_mm: float
@@ -34,7 +34,7 @@ class Drum(Part):
 
 
 @dataclass(frozen=True)
-class Ball(Part):
+class Ball(Profile):
     """A sphere centred on the axis; with `ring_mm`, a torus of that radius lying flat."""
 
     size_mm: float
@@ -54,7 +54,7 @@ class Ball(Part):
 
 
 @dataclass(frozen=True)
-class Cone(Part):
+class Cone(Profile):
     """A frustum: radius `base_mm` at the bottom, `head_mm` at the top; `rim_mm` rounds its edges."""
 
     base_mm: float
@@ -81,7 +81,7 @@ class Revolution(Shape):
     """Union of `parts`, seams rounded over `blend_mm`, minus `hollow`; cut flat at z = 0 and at `height_mm`."""
 
     def __init__(
-        self, parts: tuple[Part, ...], height_mm: float, *, blend_mm: float = 0.0, hollow: Part | None = None
+        self, parts: tuple[Profile, ...], height_mm: float, *, blend_mm: float = 0.0, hollow: Profile | None = None
     ) -> None:
         self.parts, self.height_mm, self.blend_mm, self.hollow = parts, height_mm, blend_mm, hollow
         # A blend may bulge by a quarter of its width.
@@ -120,7 +120,7 @@ class Rod(Revolution):
     """A cylinder with a screw thread cut by `depth_mm` (profile: a trapezoid), and a plain foot of `foot_mm`."""
 
     def __init__(
-        self, radius_mm: float, height_mm: float, *, pitch_mm: float, depth_mm: float, starts: int, foot: Part
+        self, radius_mm: float, height_mm: float, *, pitch_mm: float, depth_mm: float, starts: int, foot: Profile
     ) -> None:
         super().__init__((Drum(radius_mm, 0, height_mm, rim_mm=min(1.5, radius_mm / 4)), foot), height_mm, blend_mm=1)
         self.chart = Cylindrical(radius_mm, height_mm, self.radius_mm + 1)

@@ -134,7 +134,7 @@ class Mug(Revolution):
 
 
 @dataclass(frozen=True)
-class Bar:
+class Brick:
     """An upright box: middle (x, y), half sizes (x, y), from `bottom_mm` to `top_mm`, edges rounded."""
 
     middle_mm: tuple[float, float]
@@ -151,10 +151,10 @@ class Bar:
         return rounded(rounded(p, q, self.rim_mm), rise - np.float32((self.top_mm - self.bottom_mm) / 2), self.rim_mm)
 
 
-class Bars(Shape):
+class Bricks(Shape):
     """Union of upright boxes: brackets, steps, crosses."""
 
-    def __init__(self, bars: tuple[Bar, ...]) -> None:
+    def __init__(self, bars: tuple[Brick, ...]) -> None:
         self.bars = bars
         middle, half = np.array([bar.middle_mm for bar in bars]), np.array([bar.half_mm for bar in bars])
         low, high = (middle - half).min(axis=0), (middle + half).max(axis=0)
@@ -177,7 +177,7 @@ class Comb(Shape):
     They begin `slot_mm` above (to the right of) the slab's middle.
     """
 
-    def __init__(self, slab: Bar, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
+    def __init__(self, slab: Brick, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
         self.slab, self.pitch_mm, self.gap_mm, self.slot_mm, self.lying = slab, pitch_mm, gap_mm, slot_mm, lying
         self.lower, self.upper = bounds(*slab.half_mm, slab.top_mm)
         self.chart = TwoSided(slab.half_mm[0], slab.top_mm, slab.half_mm[1])
@@ -196,7 +196,7 @@ class Comb(Shape):
 class Brush(Shape):
     """A block with upright bristles of radius `bristle_mm` every `pitch_mm`, up to `top_mm`."""
 
-    def __init__(self, block: Bar, *, bristle_mm: float, pitch_mm: float, top_mm: float) -> None:
+    def __init__(self, block: Brick, *, bristle_mm: float, pitch_mm: float, top_mm: float) -> None:
         self.block, self.bristle_mm, self.pitch_mm, self.top_mm = block, bristle_mm, pitch_mm, top_mm
         self.lower, self.upper = bounds(*block.half_mm, top_mm)
         self.chart = TwoSided(block.half_mm[0], top_mm, block.half_mm[1])

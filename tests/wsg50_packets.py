@@ -1,4 +1,4 @@
-"""Frames of the WSG-50 as its manual and a public driver's tests print them: the truth both sides share."""
+"""Packets of the WSG-50 as its manual and a public driver's tests print them: the truth both sides share."""
 
 MANUAL_REPLIES = {
     # what it is: (bytes, id, payload)
@@ -32,9 +32,9 @@ COMMANDS = {
     ),
     "set tag abcd": ("AA AA AA 51 04 00 61 62 63 64 87 85", 0x51, "61 62 63 64"),
 }
-FRAMES = {**MANUAL_REPLIES, **COMMANDS}
+PACKETS = {**MANUAL_REPLIES, **COMMANDS}
 
 
 def bytes_of(name):
-    """The whole frame."""
-    return bytes.fromhex(FRAMES[name][0])
+    """The whole packet."""
+    return bytes.fromhex(PACKETS[name][0])
