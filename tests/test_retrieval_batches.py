@@ -9,7 +9,7 @@ import torch
 
 from retrieval.data.dataset import PairSampler, load_grasps
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses import match_loss
+from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import TrainedFeatures
 from retrieval.training.step import batch_loss
 from retrieval.training.train import set_training_mode
@@ -19,7 +19,7 @@ from tests.conftest import TINY
 PAPER = dataclasses.replace(
     TINY,
     matcher=dataclasses.replace(TINY.matcher, dropout=0.0),
-    training=dataclasses.replace(TINY.training, contrastive_weight=0.0, freeze_batch_norm=True),
+    training=dataclasses.replace(TINY.training, weights={}, freeze_batch_norm=True),
 )
 
 

@@ -13,7 +13,8 @@ from retrieval.methods.base import Setting
 from retrieval.methods.contrastive import Contrastive, ContrastiveSigmoid, Projections, SigmoidProjections
 from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
-from retrieval.model.losses import LOG_SCALE_MAX, SIGMOID_BIAS_INIT
+from retrieval.model.losses.contrastive import LOG_SCALE_MAX
+from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT
 from retrieval.training.features import Features
 
 CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(iterations=80))

@@ -230,9 +230,9 @@ def test_judging_every_photo_is_late_fusion(fitted, parts):
 
 
 def test_a_model_without_trained_embeddings_judges_every_photo(parts, tmp_path):
-    method = fit(PruneRerank, parts, tmp_path, with_training(FROZEN, contrastive_weight=0.0))
+    method = fit(PruneRerank, parts, tmp_path, with_training(FROZEN, weights={}))
     assert method.chosen["judged_share"] == 1.0
-    late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, contrastive_weight=0.0))
+    late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
     np.testing.assert_array_equal(method.score(*codes(method, parts[2])), late.score(*codes(late, parts[2])))
 
 

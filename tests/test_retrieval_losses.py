@@ -5,16 +5,10 @@ import math
 import pytest
 import torch
 
-from retrieval.model.losses import (
-    LOG_SCALE_MAX,
-    SIGMOID_BIAS_INIT,
-    SIGMOID_LOG_SCALE_INIT,
-    _pick_loss,
-    contrastive_loss,
-    listwise_loss,
-    match_loss,
-    sigmoid_loss,
-)
+from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
+from retrieval.model.losses.listwise import listwise_loss, pick_loss
+from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
 
 
 def unit(*shape, seed=0):
@@ -67,7 +61,7 @@ def test_a_batch_of_one_object_has_no_contrast_and_no_nan():
 def test_a_row_of_positives_alone_has_nothing_to_pick_from_and_does_not_thin_the_mean():
     """Rows: two positives; a positive at 1 beside a negative at 3; two negatives. Only the second one counts."""
     scores = torch.tensor([[5.0, -5.0], [1.0, 3.0], [0.0, 0.0]], requires_grad=True)
-    loss = _pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
+    loss = pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
     loss.backward()
     assert loss.item() == pytest.approx(math.log(1 + math.exp(2)), rel=1e-6)
     assert torch.equal(scores.grad[[0, 2]], torch.zeros(2, 2))

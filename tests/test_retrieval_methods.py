@@ -26,7 +26,7 @@ CONFIG = Config(
         touches_per_batch=12,
         learning_rate=3e-3,
         schedule="cosine",
-        contrastive_weight=1.0,
+        weights={"contrastive": 1.0},
         freeze_towers=True,
         validate_every=40,
     ),

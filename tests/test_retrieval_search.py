@@ -319,7 +319,7 @@ def test_the_candidates_are_the_nearest_photos_of_each_grasp(
 
 
 def test_a_model_without_trained_embeddings_never_runs_a_candidate_stage(catalogue, model, touch, tmp_path, searches):
-    checkpoint = variant(model, tmp_path / "paper.safetensors", training__contrastive_weight=0.0)
+    checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
     build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
     result = Searcher.open(tmp_path / "index").query([touch], candidates=2, top=1)
     assert searches == []

@@ -14,7 +14,9 @@ from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses import match_loss
+from retrieval.model.losses.contrastive import contrastive_loss
+from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.match import match_loss
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.judgement import with_verdicts
@@ -55,7 +57,7 @@ def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, mo
 
 def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
     """Without the contrastive term and dropout: exactly the paper's loss."""
-    config = with_training(TINY, contrastive_weight=0.0, precision="float32")
+    config = with_training(TINY, weights={}, precision="float32")
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, standardise=False, dropout=0.0))
     torch.manual_seed(0)
     matcher = build_matcher(config)
@@ -74,9 +76,27 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording
     torch.testing.assert_close(loss, match_loss(one_by_one, torch.from_numpy(batch.labels)), rtol=1e-5, atol=1e-6)
 
 
+def test_each_loss_of_the_table_is_added_with_its_weight(recording):
+    config = with_training(TINY, weights={"contrastive": 0.3, "listwise": 0.7}, precision="float32")
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, dropout=0.0))
+    torch.manual_seed(0)
+    matcher = build_matcher(config)
+    with TrainedFeatures(config, CPU) as source:
+        loaded = source.prepare(matcher, PairSampler(load_grasps(recording), seed=0).batch(0, 3)).result()
+        features = [part.detach() for part in source.train_features(matcher, loaded)]
+    matcher.eval()
+    loss, logits = batch_loss(matcher, config.training, loaded.batch, *features)
+    touch, photo = matcher.touch_code(features[0]), matcher.photo_code(features[1])
+    objects = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
+    expected = match_loss(logits, torch.from_numpy(loaded.batch.labels))
+    expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
+    expected = expected + 0.7 * listwise_loss(matcher.head(touch.half[:, None], photo.half[None]), *objects)
+    assert loss.item() == expected.item()
+
+
 def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording, tmp_path):
     out = tmp_path / "m.safetensors"
-    train(recording, out, with_training(TINY, contrastive_weight=0.0), quiet=True)
+    train(recording, out, with_training(TINY, weights={}), quiet=True)
     torch.manual_seed(TINY.training.seed)
     first = build_matcher(TINY).state_dict()
     last = load_checkpoint(out).matcher.state_dict()
@@ -339,7 +359,7 @@ from pathlib import Path
 from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import PairSampler, load_grasps
-from retrieval.model.losses import contrastive_loss
+from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.training.step import batch_loss
 from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY

@@ -12,14 +12,8 @@ from retrieval.methods.base import Array, Method
 from retrieval.methods.optimise import Best, ObjectDraws, Optimisation, optimise, seeded, standardised
 from retrieval.methods.selection import Judge, judge
 from retrieval.methods.standardise import Standardiser
-from retrieval.model.losses import (
-    LOG_SCALE_INIT,
-    LOG_SCALE_MAX,
-    SIGMOID_BIAS_INIT,
-    SIGMOID_LOG_SCALE_INIT,
-    contrastive_loss,
-    sigmoid_loss,
-)
+from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
+from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features

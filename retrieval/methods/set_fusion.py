@@ -17,7 +17,7 @@ from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seed
 from retrieval.methods.selection import judge, neighbours
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.fusion import FusionHead
-from retrieval.model.losses import match_loss
+from retrieval.model.losses.match import match_loss
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features

@@ -13,6 +13,7 @@ from typing import Any
 from indexes.store.regular import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
+from retrieval.model.losses import LOSSES
 
 # How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
 
@@ -50,16 +51,15 @@ class TrainingConfig:
     """How a matcher is trained.
 
     init: "random", "imagenet" or the path of a state dict. iterations: optimiser steps. touches_per_batch times
-    (positives_per_touch + negatives_per_touch) pairs make a batch. contrastive_weight: weight of the contrastive
-    term; 0 is exactly the paper's loss, and leaves the embeddings untrained. listwise_weight: weight of a term that
-    asks each touch of a batch to pick its object's photos by match logit out of all photos of the batch; 0 in the
-    paper. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way round would; not in
-    the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the paper; "batch" from the
-    photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is "batch" where towers are
-    trained. freeze_batch_norm: keep the batch statistics of the initial weights. freeze_towers: train only what comes
-    after the towers; every image is then encoded once for the whole training. distil_steps: steps of teaching the
-    pruner after training, where the matcher has one (`retrieval.training.distil`). validation_fraction, test_fraction:
-    shares of the objects.
+    (positives_per_touch + negatives_per_touch) pairs make a batch. weights: of the losses that are added to the match
+    loss (`retrieval.model.losses.LOSSES`), in files `contrastive_weight` and so on; 0 for each is exactly the paper's
+    loss, and without "contrastive" the embeddings stay untrained. shuffle_fingers: feed the fingers of a touch in a
+    random order, as gripping the other way round would; not in the paper. negatives: "dataset" draws a touch's from
+    all photos of other objects, as in the paper; "batch" from the photos that stand in the batch anyway, half as many
+    to encode (`PairSampler`); "auto" is "batch" where towers are trained. freeze_batch_norm: keep the batch statistics
+    of the initial weights. freeze_towers: train only what comes after the towers; every image is then encoded once for
+    the whole training. distil_steps: steps of teaching the pruner after training, where the matcher has one
+    (`retrieval.training.distil`). validation_fraction, test_fraction: shares of the objects.
     """
 
     init: str = "imagenet"
@@ -69,8 +69,7 @@ class TrainingConfig:
     negatives_per_touch: int = 4
     learning_rate: float = 1e-4
     schedule: str = "constant"
-    contrastive_weight: float = 0.0
-    listwise_weight: float = 0.0
+    weights: Mapping[str, float] = field(default_factory=dict)
     shuffle_fingers: bool = False
     negatives: str = "auto"
     freeze_batch_norm: bool = False
@@ -93,9 +92,10 @@ class TrainingConfig:
         ):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
         _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
-        for name in ("contrastive_weight", "listwise_weight"):
-            weight = getattr(self, name)
-            _require(0 <= weight < math.inf, f"{name} must be a number from 0; got {weight}")
+        for name, weight in self.weights.items():
+            _require(name in LOSSES, f"the weight of a loss must be of one of {', '.join(LOSSES)}; got {name!r}")
+            _require(0 <= weight < math.inf, f"{name}_weight must be a number from 0; got {weight}")
+        object.__setattr__(self, "weights", {name: self.weights.get(name, 0.0) for name in LOSSES})
         _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
@@ -105,6 +105,26 @@ class TrainingConfig:
             min(held_out) >= 0 and sum(held_out) < 1,
             f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
         )
+
+    @property
+    def trains_embeddings(self) -> bool:
+        """Whether the contrastive projections learn anything."""
+        return self.weights["contrastive"] > 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary, as in a TOML file: each weight is a setting of its own, `<loss>_weight`."""
+        table: dict[str, Any] = {}
+        for name, value in dataclasses.asdict(self).items():
+            table |= (
+                {f"{loss}_weight": weight for loss, weight in value.items()} if name == "weights" else {name: value}
+            )
+        return table
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> "TrainingConfig":
+        """Inverse of `to_dict`; a setting left out keeps its default."""
+        weights = {loss: table[f"{loss}_weight"] for loss in LOSSES if f"{loss}_weight" in table}
+        return cls(**{name: value for name, value in table.items() if not name.endswith("_weight")}, weights=weights)
 
     def of_steps(self, iterations: int) -> "TrainingConfig":
         """The same with so many optimiser steps, and at most as many to teach the pruner."""
@@ -127,7 +147,7 @@ class Config:
     @property
     def has_embeddings(self) -> bool:
         """Whether embeddings are trained, so that candidates can be searched by them."""
-        return self.matcher.pruner_width > 0 or self.training.contrastive_weight > 0
+        return self.matcher.pruner_width > 0 or self.training.trains_embeddings
 
     def without_pruner(self) -> "Config":
         """The same with no pruner to be taught."""
@@ -135,16 +155,21 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, as in a TOML file."""
-        return dataclasses.asdict(self)
+        return dataclasses.asdict(self) | {"training": self.training.to_dict()}
 
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
         """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
         if not isinstance(tables, Mapping):
             raise ConfigError(f"a configuration must be tables of settings; got {tables!r}")
-        parts = {"matcher": MatcherConfig, "training": TrainingConfig, "preprocessing": Preprocessing}
-        _refuse_unknown("configuration", tables, parts)
-        return cls(**{name: _build(name, parts[name], table) for name, table in tables.items()})
+        defaults = cls().to_dict()
+        _refuse_unknown("configuration", tables, defaults)
+        typed = {name: _typed_settings(name, table, defaults[name]) for name, table in tables.items()}
+        return cls(
+            MatcherConfig(**typed.get("matcher", {})),
+            TrainingConfig.from_dict(typed.get("training", {})),
+            Preprocessing(**typed.get("preprocessing", {})),
+        )
 
 
 def load_config(name_or_path: str) -> Config:
@@ -170,15 +195,14 @@ def preset_names() -> list[str]:
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
 
 
-def _build(table_name: str, cls: type[Any], table: Any) -> Any:
+def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
-    fields = {item.name: item for item in dataclasses.fields(cls)}
-    _refuse_unknown(f"[{table_name}]", table, fields)
-    return cls(**{key: _typed(f"{table_name}.{key}", fields[key].type, value) for key, value in table.items()})
+    _refuse_unknown(f"[{table_name}]", table, defaults)
+    return {name: _typed(f"{table_name}.{name}", type(defaults[name]), value) for name, value in table.items()}
 
 
-def _typed(name: str, wanted: Any, value: Any) -> Any:
+def _typed(name: str, wanted: type[Any], value: Any) -> Any:
     if wanted is float and type(value) is int and abs(value) < 2**63:
         return float(value)
     if type(value) is not wanted:

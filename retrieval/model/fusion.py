@@ -17,7 +17,7 @@ from torch.nn import functional
 from retrieval.errors import BadInput
 from retrieval.model.config import MatcherConfig
 from retrieval.model.judge import Judge
-from retrieval.model.losses import LOG_SCALE_INIT, LOG_SCALE_MAX
+from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.pruner import Pruner
 from retrieval.model.towers import build_tower
 

@@ -1,7 +1,5 @@
 """One step of training: the loss of a batch from its features, and the match logits of pairs."""
 
-from typing import Any
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -10,7 +8,8 @@ from torch import Tensor
 from retrieval.data.dataset import PairBatch
 from retrieval.model.config import TrainingConfig
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses import contrastive_loss, listwise_loss, match_loss
+from retrieval.model.losses import EncodedBatch, load_loss
+from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import FeatureSource
 
 
@@ -22,18 +21,14 @@ def batch_loss(
     photo_features: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Loss (scalar) and match logits (P,) of a batch from the features of its distinct touches and photos."""
-    device = touch_features.device
+    arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
+    touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
     touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-    touch_index, photo_index = _on(device, batch.touch_index), _on(device, batch.photo_index)
     logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
-    loss = match_loss(logits, _on(device, batch.labels))
-    objects = _on(device, batch.touch_objects), _on(device, batch.photo_objects)
-    if settings.contrastive_weight > 0:
-        apart = contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
-        loss = loss + settings.contrastive_weight * apart
-    if settings.listwise_weight > 0:
-        every = matcher.head(touch.half[:, None], photo.half[None])
-        loss = loss + settings.listwise_weight * listwise_loss(every, *objects)
+    loss = match_loss(logits, labels)
+    for name, weight in settings.weights.items():
+        if weight > 0:
+            loss = loss + weight * load_loss(name)(EncodedBatch(matcher, touch, photo, *objects))
     return loss, logits
 
 
@@ -42,10 +37,6 @@ def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
     each = touch_features.view(len(touch_features), fingers, -1)
     order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
     return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)
-
-
-def _on(device: torch.device, array: Any) -> Tensor:
-    return torch.from_numpy(array).to(device)
 
 
 @torch.inference_mode()

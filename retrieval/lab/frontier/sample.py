@@ -164,7 +164,7 @@ class Sample:
         if matcher.pruner is not None:
             by_pruner = matcher.pruner.photo(code.half) if photo else matcher.pruner.touch(code.half)
             codes["pruner"] = by_pruner.numpy()
-        if config.training.contrastive_weight > 0:
+        if config.training.trains_embeddings:
             codes["contrastive embedding"] = code.embedding.numpy()
         return codes
 

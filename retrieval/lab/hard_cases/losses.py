@@ -9,7 +9,10 @@ from torch.nn import functional
 from retrieval.lab.hard_cases.case import HardCase
 from retrieval.methods.contrastive import Projections
 from retrieval.methods.set_fusion import SetHead
-from retrieval.model.losses import contrastive_loss, listwise_loss, match_loss, sigmoid_loss
+from retrieval.model.losses.contrastive import contrastive_loss
+from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.sigmoid import sigmoid_loss
 from retrieval.model.towers.base import stage_statistics
 from retrieval.training.distil import order_loss
 

@@ -1,0 +1,30 @@
+"""Each touch picks the photos of its object out of all photos of a batch, and each photo its touches."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from retrieval.model.losses import EncodedBatch
+
+
+def of_batch(batch: EncodedBatch) -> Tensor:
+    """Of the match logits of every touch with every photo."""
+    logits = batch.matcher.head(batch.touch.half[:, None], batch.photo.half[None])
+    return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
+
+
+def listwise_loss(scores: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
+    """`contrastive_loss` of any scores (T, N) of touches with photos, such as match logits: it asks for order alone."""
+    same = touch_objects[:, None] == photo_objects[None, :]
+    return (pick_loss(scores.float(), same) + pick_loss(scores.float().T, same.T)) / 2
+
+
+def pick_loss(scores: Tensor, same: Tensor) -> Tensor:
+    """Mean over rows of the mean over a row's positives of -log softmax(positive among itself and the negatives)."""
+    negatives = torch.logsumexp(scores.masked_fill(same, -torch.inf), dim=1, keepdim=True)
+    # log(1 + exp(negatives - positive)) without overflow, for every cell; cells that are no positives weigh nothing.
+    losses = functional.softplus(negatives - scores)
+    usable = same & torch.isfinite(negatives)
+    per_row = torch.where(usable, losses, 0.0).sum(1) / usable.sum(1).clamp(min=1)
+    rows = usable.any(1)
+    return per_row.sum() / rows.sum().clamp(min=1)
