@@ -1,12 +1,11 @@
-"""What the README tells people to run does run; the notebooks have tests/test_notebooks.py."""
+"""What README and docs/ tell people to run does run; the notebooks have tests/test_notebooks.py."""
 
 import json
-import re
 import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
+import tomllib
 
 import cv2
 import pytest
@@ -16,25 +15,42 @@ from retrieval.search.answer import EXIT_CODES
 from robot.emulators.wsg50.server import EmulatedWSG50
 from robot.rig import load_rig
 from tests import synthetic
+from tests.documents import PAGES, README, ROOT, blocks, text_of
 from tests.replay_rig import replay_file
 from tests.test_retrieval_rig_commands import POINTS
 
-ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text("utf-8")
+SHORTER = {
+    "demo": ["--objects", "4", "--jobs", "1"],
+    "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
+    "rig": [],
+    "import": [],
+    "check": [],
+    "train": ["--iterations", "2"],
+    "build-index": [],
+    "query": [],
+    "export": [],
+    "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
+    "frontier": ["--quick", "--only", "closing"],
+}
+"""The commands, and what makes each of them quick."""
 
 
-def commands(first_word):
-    """Lines of the README's shell blocks that begin with a word, comments taken off."""
-    blocks = re.findall(r"```sh\n(.*?)```", README, flags=re.S)
-    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    return [shlex.split(line, comments=True) for line in lines if line.split()[:1] == [first_word]]
+def commands(*pages):
+    """Lines of shell blocks as words, comments taken off."""
+    lines = [line for block in blocks("sh", *pages) for line in block.replace("\\\n", " ").splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def of_program(name, *pages):
+    return [words for words in commands(*pages) if words[0] == name]
 
 
 @pytest.fixture
-def home(tmp_path, recording, catalogue, monkeypatch):
-    """Everything that the README's commands name: catalog/, gel images, recording/, billets/."""
+def home(tmp_path, recording, catalogue, model, monkeypatch):
+    """Everything that the commands name: catalog/, gel images, recording/, model.safetensors, billets/, rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
+    shutil.copy(model, tmp_path / "model.safetensors")
     objects = synthetic.make_objects(1, seed=9)
     pairs = synthetic.write_queries(tmp_path / "drawn", objects, touches_per_object=2)[objects[0].object_id]
     for number, pair in enumerate(pairs):
@@ -52,54 +68,56 @@ def home(tmp_path, recording, catalogue, monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_retrieve_command_of_the_readme_runs(home):
-    found = commands("retrieve")
-    shorter = {
-        "demo": ["--objects", "4", "--jobs", "1"],
-        "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
-        "rig": [],
-        "train": ["--iterations", "2"],
-        "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
-        "frontier": ["--quick", "--only", "closing"],
-    }
-    assert {line[1] for line in found} == {"import", *shorter, "check", "build-index", "query", "export"}
-    for line in found:
+@pytest.mark.parametrize("page", [page for page in PAGES if of_program("retrieve", page)], ids=lambda page: page.stem)
+def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
+    for line in of_program("retrieve", page):
         # An export that is not the faster one on this machine is refused, with exit code 1.
         accepted = {"export": {0, 1}, "query": set(EXIT_CODES.values())}.get(line[1], {0})
-        assert cli.main([*line[1:], *shorter.get(line[1], [])]) in accepted, line
+        assert cli.main([*line[1:], *SHORTER[line[1]]]) in accepted, line
 
 
-def test_the_settings_in_the_readme_make_a_rig(tmp_path, monkeypatch):
+def test_every_retrieve_command_stands_in_a_block_that_is_run():
+    assert {line[1] for line in of_program("retrieve")} == set(SHORTER)
+
+
+def test_nothing_stands_in_a_shell_block_that_no_test_runs():
+    assert {line[0] for line in commands()} == {"make", "retrieve", "python", "pip"}
+
+
+def test_the_settings_of_the_pages_make_a_rig(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text(POINTS)
     assert cli.main(["rig", "calibrate", "points.csv"]) == 0
-    for number, block in enumerate(re.findall(r"```toml\n(.*?)```", README, flags=re.S)):
+    kinds = []
+    for number, block in enumerate(blocks("toml")):
         (tmp_path / f"{number}.toml").write_text(block)
         rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)
         assert len(rig.object_ids(1)) == 1
+        kinds.append(tomllib.loads(block)["rig"])
+    assert sorted(kinds) == ["real", "sim"]
 
 
-def test_the_two_make_commands_exist_and_the_first_lines_name_them():
-    for line in commands("make"):
+def test_the_make_commands_exist_and_the_first_lines_name_two_of_them():
+    for line in of_program("make"):
         dry = subprocess.run(["make", "-n", *line[1:]], cwd=ROOT, capture_output=True, check=False)
         assert dry.returncode == 0, line
-    assert [line[1] for line in commands("make")][:2] == ["demo", "test"]
+    assert [line[1] for line in of_program("make", README)][:2] == ["demo", "test"]
 
 
 @pytest.mark.slow
-def test_every_python_command_of_the_readme_exists():
-    for line in commands("python"):
+def test_every_python_command_exists():
+    for line in of_program("python"):
         module = line[line.index("-m") + 1]
         asked = [sys.executable, "-m", module, "--help"]
         assert subprocess.run(asked, cwd=ROOT, capture_output=True, check=False).returncode == 0, line
 
 
 @pytest.mark.skipif(sys.version_info[:2] != (3, 11), reason="the layout of argparse's help differs between Pythons")
-def test_the_help_in_the_readme_is_what_the_program_prints(monkeypatch, capsys):
+def test_the_help_in_the_pages_is_what_the_program_prints(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit):
         cli.main(["--help"])
-    assert capsys.readouterr().out.strip() in README
+    assert capsys.readouterr().out.strip() in text_of(ROOT / "docs" / "commands.md")
 
 
 class FakeGel:
@@ -114,7 +132,7 @@ class FakeGel:
 
 def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, model, monkeypatch, capsys):
     """Two grasps, the next object, one grasp of it."""
-    (program,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    (program,) = blocks("python", README)
     assert cli.main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
     keys = iter(["", "", "n", "", "q"])
     monkeypatch.setattr(cv2, "VideoCapture", FakeGel)
@@ -130,6 +148,5 @@ def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, mo
         assert line == f"{document['verdict']} {best['object_id']}, {best['probability']:.2f}"
 
 
-def test_every_file_that_the_readme_links_to_exists():
-    for link in re.findall(r"\]\(([^)#]+)\)", README):
-        assert link.startswith("http") or (ROOT / link).exists(), link
+def test_programs_stand_in_the_readme_and_in_the_reference_whose_examples_run():
+    assert {page.stem for page in PAGES if blocks("python", page)} == {"README", "reference"}

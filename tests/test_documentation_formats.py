@@ -1,0 +1,81 @@
+"""docs/formats.md names the keys that are written, all of them and no others."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from retrieval.commands import cli
+from retrieval.model.stored import read_header
+from retrieval.search.answer import EXIT_CODES
+from robot.recording.folder import RecordingWriter, read_recording
+from tests.documents import ROOT, text_of
+
+PAGE = ROOT / "docs" / "formats.md"
+
+
+def keys_said(table):
+    """The keys in the first column of the n-th table of the page."""
+    tables = re.findall(r"^\| key \|.*\n\|.*\n((?:\|.*\n)+)", text_of(PAGE), re.M)
+    return {key for row in tables[table].splitlines() for key in re.findall(r"`([\w.]+)`", row.split("|")[1])}
+
+
+def keys_of(document, said):
+    """The keys of a document, of what `said` looks into with those inside."""
+    inside = {key.partition(".")[0] for key in said if "." in key}
+    return {key for key in document if key not in inside} | {
+        f"{key}.{own}" for key in inside & set(document) for own in document[key]
+    }
+
+
+def check(table, document):
+    said = keys_said(table)
+    assert said == keys_of(document, said)
+
+
+def test_a_recording(tmp_path, recording):
+    picture = next(recording.glob("images/*"))
+    names = ("photo", "touch_a", "touch_b", "touch_a_before", "touch_a_after", "depth")
+    with RecordingWriter(tmp_path / "recording", {"source": "drawn", "sensor": "none"}) as writer:
+        writer.append("1", "mug", dict.fromkeys(names, picture))
+    read = read_recording(tmp_path / "recording")
+    check(0, read.info)
+    numbers = dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), 1.0)
+    check(1, replace(read.grasps[0], **numbers, pose=(0.0,), grasped=True, outcome="held", sequence_id="s").to_row())
+
+
+def test_an_index_and_the_answer_to_a_query(tmp_path, catalogue, model, touch, capsys):
+    index = tmp_path / "index"
+    assert cli.main(["build-index", str(catalogue), "--model", str(model), "--out", str(index)]) == 0
+    generation = index / (index / "CURRENT").read_text().strip()
+    check(2, json.loads((generation / "manifest.json").read_text()))
+    check(3, json.loads(next(generation.glob("rows-*.jsonl")).read_text().splitlines()[0]))
+    named = {re.sub(r"-\d+", "-000005", path.name) for path in generation.iterdir()}
+    assert named <= set(re.findall(r"^ {0,2}(\S+\.\w+) ", text_of(PAGE), re.M))
+    capsys.readouterr()
+    cli.main(["query", "--gelsight", *map(str, touch), "--index", str(index), "--json"])
+    document = json.loads(capsys.readouterr().out)
+    check(5, document)
+    check(6, document["results"][0])
+
+
+def test_a_checkpoint(model):
+    check(4, read_header(model))
+
+
+def test_the_exit_codes_of_a_query():
+    rows = re.findall(r"^\| (\d) \| (.*) \|$", text_of(PAGE), re.M)
+    assert {verdict: int(code) for code, said in rows for verdict in re.findall("`(.*?)`", said)} == EXIT_CODES
+
+
+@pytest.mark.slow
+def test_the_results_of_an_evaluation(tmp_path, recording):
+    quick = ["--preset", "tiny", "--iterations", "2", "--methods", "late_fusion,chance"]
+    assert cli.main(["evaluate", str(recording), "--out", str(tmp_path), *quick]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    check(7, results)
+    method = results["methods"]["late_fusion"]
+    check(8, method)
+    said = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
+    assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_accuracy"])
