@@ -20,23 +20,12 @@ from typing import TYPE_CHECKING, Any
 from indexes.errors import ParameterError
 
 if TYPE_CHECKING:
-    from indexes.errors import IndexesError
-    from indexes.kinds.base import VectorIndex
-    from indexes.kinds.choice import choose_kind
-    from indexes.kinds.measure import recall_against_exact
-    from indexes.store.folder import IndexStore
-    from indexes.store.generation import Generation
-
-__all__ = [
-    "KINDS",
-    "Generation",
-    "IndexStore",
-    "IndexesError",
-    "VectorIndex",
-    "choose_kind",
-    "load_kind",
-    "recall_against_exact",
-]
+    from indexes.errors import IndexesError as IndexesError
+    from indexes.kinds.base import VectorIndex as VectorIndex
+    from indexes.kinds.choice import choose_kind as choose_kind
+    from indexes.kinds.measure import recall_against_exact as recall_against_exact
+    from indexes.store.folder import IndexStore as IndexStore
+    from indexes.store.generation import Generation as Generation
 
 KINDS = {
     "exact": "indexes.kinds.exact:ExactIndex",
@@ -75,6 +64,8 @@ _PLACES = {
 }
 """Public name -> its module in this package, imported when it is used."""
 
+__all__ = ["KINDS", "load_kind", *_PLACES]
+
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
@@ -84,4 +75,4 @@ if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anyth
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *_PLACES})

@@ -15,33 +15,20 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from retrieval.errors import BadInput, RetrievalError
-    from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-    from retrieval.model.touches import Encoded
-    from retrieval.search.answer import Match, QueryResult
-    from retrieval.search.build import build_index
-    from retrieval.search.build_report import BuildReport
-    from retrieval.search.defaults import shipped_model
-    from retrieval.search.embeddings import embed_photos
-    from retrieval.search.searcher import Searcher
+    from retrieval.errors import BadInput as BadInput
+    from retrieval.errors import RetrievalError as RetrievalError
+    from retrieval.model.checkpoint import Checkpoint as Checkpoint
+    from retrieval.model.checkpoint import load_checkpoint as load_checkpoint
+    from retrieval.model.touches import Encoded as Encoded
+    from retrieval.search.answer import Match as Match
+    from retrieval.search.answer import QueryResult as QueryResult
+    from retrieval.search.build import build_index as build_index
+    from retrieval.search.build_report import BuildReport as BuildReport
+    from retrieval.search.defaults import shipped_model as shipped_model
+    from retrieval.search.embeddings import embed_photos as embed_photos
+    from retrieval.search.searcher import Searcher as Searcher
 
     open = Searcher.open
-
-__all__ = [
-    "BadInput",
-    "BuildReport",
-    "Checkpoint",
-    "Encoded",
-    "Match",
-    "QueryResult",
-    "RetrievalError",
-    "Searcher",
-    "build_index",
-    "embed_photos",
-    "load_checkpoint",
-    "open",
-    "shipped_model",
-]
 
 _PLACES = {
     "BadInput": "errors:BadInput",
@@ -60,6 +47,8 @@ _PLACES = {
 }
 """Public name -> where it stands in this package."""
 
+__all__ = list(_PLACES)
+
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
@@ -70,4 +59,4 @@ if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anyth
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *_PLACES})

@@ -12,27 +12,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robot.devices import TactileSensor
-    from robot.errors import RobotError
-    from robot.importers import load_importer
-    from robot.readings import Frame, Pose
-    from robot.recording.folder import Recording, RecordingWriter, read_recording
-    from robot.recording.grasp import RecordedGrasp
-    from robot.rig import Rig, load_rig
-
-__all__ = [
-    "Frame",
-    "Pose",
-    "RecordedGrasp",
-    "Recording",
-    "RecordingWriter",
-    "Rig",
-    "RobotError",
-    "TactileSensor",
-    "load_importer",
-    "load_rig",
-    "read_recording",
-]
+    from robot.devices import TactileSensor as TactileSensor
+    from robot.errors import RobotError as RobotError
+    from robot.importers import load_importer as load_importer
+    from robot.readings import Frame as Frame
+    from robot.readings import Pose as Pose
+    from robot.recording.folder import Recording as Recording
+    from robot.recording.folder import RecordingWriter as RecordingWriter
+    from robot.recording.folder import read_recording as read_recording
+    from robot.recording.grasp import RecordedGrasp as RecordedGrasp
+    from robot.rig import Rig as Rig
+    from robot.rig import load_rig as load_rig
 
 _PLACES = {
     "Frame": "readings",
@@ -49,6 +39,8 @@ _PLACES = {
 }
 """Public name -> its module in this package."""
 
+__all__ = list(_PLACES)
+
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
@@ -58,4 +50,4 @@ if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anyth
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *_PLACES})
