@@ -260,7 +260,7 @@ def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
 def test_rows_are_in_the_catalogues_order_and_name_content_and_place(own, checkpoint, index):
     build_index(own, checkpoint, index, quiet=True)
     rows = IndexStore(index).open().rows
-    assert [row["id"] for row in rows] == [photo.photo_id for photo in list_catalogue(own).photos]
+    assert [row["id"] for row in rows] == [photo.path for photo in list_catalogue(own).photos]
     assert set(rows[0]) == {"id", "object_id", "path", "digest", "metadata"}
 
 
@@ -339,7 +339,7 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, own, checkpoint, 
         return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
 
     for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(spoil)
-    with pytest.raises((NumericalError, VectorError), match=list_catalogue(own).photos[3].photo_id):
+    with pytest.raises((NumericalError, VectorError), match=list_catalogue(own).photos[3].path):
         build_index(own, checkpoint, index, quiet=True)
     assert IndexStore(index).current() == "gen-000001"
     assert np.isfinite(IndexStore(index).open().arrays["halves"]).all()

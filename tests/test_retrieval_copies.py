@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.data.check.copies import PX, Pictures, as_jpeg, brighter, flipped, shapes, shifted, thumbnail
+from retrieval.data.check.copies import PX, PictureSet, as_jpeg, brighter, flipped, shapes, shifted, thumbnail
 
 
 def scene(seed, size=(120, 160)):
@@ -16,7 +16,7 @@ def scene(seed, size=(120, 160)):
 
 
 def pictures(images):
-    return Pictures([thumbnail(b"", image) for image in images], [f"object {row}" for row in range(len(images))])
+    return PictureSet([thumbnail(b"", image) for image in images], [f"object {row}" for row in range(len(images))])
 
 
 def test_a_shape_forgets_a_constant_and_any_multiple_of_the_common_picture():

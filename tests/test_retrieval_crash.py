@@ -70,7 +70,7 @@ def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=ma
 def content(catalogue):
     """What the rows of an index over this folder must be: {id: digest}."""
     listed = list_catalogue(catalogue)
-    return {photo.photo_id: read_photo(listed, photo).digest for photo in listed.photos}
+    return {photo.path: read_photo(listed, photo).digest for photo in listed.photos}
 
 
 def changed_copy(catalogue, path):

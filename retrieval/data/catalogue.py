@@ -6,7 +6,7 @@
                                     catalogue) or `object_id` (all its photos) and any other keys; where both
                                     give a key, the photo's own wins
 
-Names that start with a dot are not looked at. A photo's stable id is its path in the catalogue, forward slashes.
+Names that start with a dot are not looked at. A photo's path in the catalogue, forward slashes, is its stable id.
 Listing opens no photo; `read_photo` reads one, and one broken file never stops the rest.
 """
 
@@ -14,9 +14,10 @@ import hashlib
 import json
 import math
 import os
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn
+from typing import Any
 
 from indexes.store.regular import read_regular
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
@@ -34,11 +35,10 @@ _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 @dataclass(frozen=True)
 class CataloguePhoto:
-    """One photo: `photo_id` is its `path`, relative to the catalogue; `metadata` is the user's own."""
+    """One photo: its `path` is relative to the catalogue; `metadata` is the user's own."""
 
-    photo_id: str
-    object_id: str
     path: str
+    object_id: str
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
 
 
@@ -78,10 +78,6 @@ class PhotoBytes:
     data: bytes = field(repr=False)
     digest: str
 
-    def decode(self) -> RgbImage:
-        """(H, W, 3) float32 RGB in 0..1 from these bytes. Raises ImageError."""
-        return decode_rgb(self.data, self.photo.path)
-
 
 def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
     """List the photos below `folder`, by id. naming: which object each shows; by folder where None.
@@ -92,28 +88,49 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    walk = _Walk(root)
-    objects = {path: naming.object_of(path) for path in sorted(walk.files) if _ending(path) in EXTENSIONS | UNREAD}
-    listed = [
-        CataloguePhoto(path, name, path)
-        for path, name in objects.items()
-        if name is not None and _ending(path) in EXTENSIONS
-    ]
-    skipped = [
-        SkippedPhoto(path, reason) for path, name in objects.items() if (reason := _unusable(path, name, naming))
-    ]
-    ignored = sorted(set(walk.files) - set(objects) - {METADATA_FILE})
-    skipped = [*walk.skipped, *skipped]
-    if not listed and (unfit := [path for path in objects if _ending(path) in EXTENSIONS]):
+    found = list(_walk(root, "", Path(os.path.realpath(root)), set()))
+    skipped = [item for item in found if isinstance(item, SkippedPhoto)]
+    files = sorted(item for item in found if isinstance(item, str))
+    photos: list[CataloguePhoto] = []
+    unread: set[str] = set()
+    for path in files:
+        ending = _ending(path)
+        if ending not in EXTENSIONS | UNREAD:
+            continue
+        name = naming.object_of(path)
+        if ending in UNREAD:
+            skipped.append(SkippedPhoto(path, f"{ending} pictures are not read: save it as PNG or JPEG"))
+            unread |= {name} if name else set()
+        elif name is None:
+            why = ": a number alone" if naming.text == STEM else ""
+            skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
+        else:
+            photos.append(CataloguePhoto(path, name))
+    ignored = [path for path in files if _ending(path) not in EXTENSIONS | UNREAD and path != METADATA_FILE]
+    if not photos and (unfit := [path for path in files if _ending(path) in EXTENSIONS]):
         raise DatasetError(
             f"no photo in {root} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
             "Give folder, stem, or a pattern for paths like this one"
         )
-    if not listed:
-        raise DatasetError(_no_photos(root, ignored, skipped))
-    listed, notes = _with_metadata(listed, root / METADATA_FILE, naming)
-    unread = {name for path, name in objects.items() if name is not None and _ending(path) in UNREAD}
-    return Catalogue(root, tuple(listed), tuple(ignored), tuple(skipped), tuple(notes), tuple(sorted(unread)))
+    if not photos:
+        others = f"{len(ignored)} other files" + (f" such as {ignored[0]}" if ignored else "")
+        left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
+        kinds = ", ".join(sorted(EXTENSIONS))
+        raise DatasetError(f"no photo ({kinds}) in the catalogue {root}, only {others}{left_out}: {_LAYOUT}")
+    by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
+    strange = sorted(by_photo.keys() - {photo.path for photo in photos})
+    strange += sorted(by_object.keys() - {photo.object_id for photo in photos})
+    return Catalogue(
+        root,
+        tuple(
+            replace(photo, metadata={**by_object.get(photo.object_id, {}), **by_photo.get(photo.path, {})})
+            for photo in photos
+        ),
+        tuple(ignored),
+        tuple(skipped),
+        tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
+        tuple(sorted(unread)),
+    )
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
@@ -125,117 +142,73 @@ def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | Skip
     return PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())
 
 
-def decode_photo(item: PhotoBytes | SkippedPhoto) -> RgbImage | SkippedPhoto:
-    """Decode what `read_photo` gave to (H, W, 3) float32, or say why it is left out."""
-    if isinstance(item, SkippedPhoto):
-        return item
+def decode_photo(file: PhotoBytes) -> RgbImage | SkippedPhoto:
+    """Decode what `read_photo` gave to (H, W, 3) float32 in 0..1, or say why it is left out."""
     try:
-        return item.decode()
+        return decode_rgb(file.data, file.photo.path)
     except ImageError as error:
-        return SkippedPhoto(item.photo.path, error.reason)
+        return SkippedPhoto(file.photo.path, error.reason)
 
 
 def _ending(path: str) -> str:
     return os.path.splitext(path)[1].lower()
 
 
-def _unusable(path: str, name: str | None, naming: Naming) -> str:
-    """Why a picture is left out by its path; empty for all else."""
-    if _ending(path) in UNREAD:
-        return f"{_ending(path)} pictures are not read: save it as PNG or JPEG"
-    if name is None:
-        return f"does not fit --objects-from {naming.text}" + (": a number alone" if naming.text == STEM else "")
-    return ""
-
-
-def _no_photos(root: Path, ignored: list[str], skipped: list[SkippedPhoto]) -> str:
-    found = f"{len(ignored)} other files" + (f" such as {ignored[0]}" if ignored else "")
-    left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
-    kinds = ", ".join(sorted(EXTENSIONS))
-    return f"no photo ({kinds}) in the catalogue {root}, only {found}{left_out}: {_LAYOUT}"
-
-
-class _Walk:
-    """All files below a folder as relative posix paths.
+def _walk(folder: Path, prefix: str, root: Path, followed: set[Path]) -> Iterator[str | SkippedPhoto]:
+    """All files below a folder as relative posix paths, and what is passed over.
 
     A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
     """
-
-    def __init__(self, root: Path) -> None:
-        self.files: list[str] = []
-        self.skipped: list[SkippedPhoto] = []
-        self._root = Path(os.path.realpath(root))
-        self._followed: set[Path] = set()
-        self._folder(root, "")
-
-    def _folder(self, folder: Path, prefix: str) -> None:
+    try:
+        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+    except OSError as error:
+        raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
+    for entry in entries:
+        path = prefix + entry.name
+        if entry.name.startswith("."):
+            continue
         try:
-            entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-        except OSError as error:
-            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
-        for entry in entries:
-            if not entry.name.startswith("."):
-                self._entry(entry, prefix + entry.name)
-
-    def _entry(self, entry: "os.DirEntry[str]", path: str) -> None:
-        if reason := _bad_name(entry.name) or self._bad_link(entry):
-            self.skipped.append(SkippedPhoto(os.fsencode(path).decode(errors="backslashreplace"), reason))
-        elif _is_dir(entry):
-            self._folder(Path(entry.path), path + "/")
-        else:
-            self.files.append(path)
-
-    def _bad_link(self, entry: "os.DirEntry[str]") -> str:
-        """Why a link to a folder is not followed; empty for all else. Remembers what is followed."""
-        if not (entry.is_symlink() and _is_dir(entry)):
-            return ""
+            path.encode()
+        except UnicodeEncodeError:
+            named = os.fsencode(path).decode(errors="backslashreplace")
+            yield SkippedPhoto(named, "the name is not valid UTF-8; rename it")
+            continue
+        try:
+            is_folder = entry.is_dir()
+        except OSError:  # a link that leads to itself
+            is_folder = False
+        if not is_folder:
+            yield path
+            continue
         target = Path(os.path.realpath(entry.path))
-        if target.is_relative_to(self._root) or self._root.is_relative_to(target):
-            return "a link into or around the catalogue itself is not followed"
-        if target in self._followed:
-            return f"a link to {target}, which another link has listed already"
-        self._followed.add(target)
-        return ""
-
-
-def _is_dir(entry: "os.DirEntry[str]") -> bool:
-    try:
-        return entry.is_dir()
-    except OSError:  # a link that leads to itself
-        return False
-
-
-def _bad_name(name: str) -> str:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return "the name is not valid UTF-8; rename it"
-    return ""
+        if not entry.is_symlink():
+            yield from _walk(Path(entry.path), path + "/", root, followed)
+        elif target.is_relative_to(root) or root.is_relative_to(target):
+            yield SkippedPhoto(path, "a link into or around the catalogue itself is not followed")
+        elif target in followed:
+            yield SkippedPhoto(path, f"a link to {target}, which another link has listed already")
+        else:
+            followed.add(target)
+            yield from _walk(Path(entry.path), path + "/", root, followed)
 
 
 # The user's own metadata -----------------------------------------------------------------------------------
-
-
-def _with_metadata(photos: list[CataloguePhoto], path: Path, naming: Naming) -> tuple[list[CataloguePhoto], list[str]]:
-    """Add what metadata.jsonl says of each photo and its object; remark on lines that fit no photo."""
-    by_object, by_photo = _read_metadata(path, naming)
-    listed = []
-    for photo in photos:
-        metadata = {**by_object.get(photo.object_id, {}), **by_photo.get(photo.path, {})}
-        listed.append(CataloguePhoto(photo.photo_id, photo.object_id, photo.path, metadata))
-    unknown = sorted(set(by_photo) - {photo.path for photo in photos})
-    unknown += sorted(set(by_object) - {photo.object_id for photo in photos})
-    return listed, [f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in unknown]
 
 
 _Table = dict[str, dict[str, Any]]
 
 
 def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
-    """Return (by object_id, by photo path) without the two keys. Raises DatasetError with the line number."""
+    """The other keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
     by_object: _Table = {}
     by_photo: _Table = {}
-    for number, line in enumerate(_lines(path), start=1):
+    try:
+        lines = read_regular(path).split(b"\n")
+    except FileNotFoundError:
+        return by_object, by_photo
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+    for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
@@ -249,18 +222,9 @@ def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
     return by_object, by_photo
 
 
-def _lines(path: Path) -> list[bytes]:
-    try:
-        return read_regular(path).split(b"\n")
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-
-
 def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys). Raises ValueError."""
-    row = json.loads(line.decode(), parse_constant=_refuse_number, parse_float=_finite)
+    row = json.loads(line.decode(), parse_constant=_finite, parse_float=_finite)
     if not isinstance(row, dict):
         raise ValueError("must hold one JSON object in braces")
     keys = [key for key in ("file_name", "object_id") if key in row]
@@ -279,9 +243,8 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
 
 
 def _finite(text: str) -> float:
+    """A number of JSON, or "NaN" and "Infinity", which Python takes for numbers too."""
     number = float(text)
-    return number if math.isfinite(number) else _refuse_number(text)
-
-
-def _refuse_number(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a finite number")
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a finite number")
+    return number

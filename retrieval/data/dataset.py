@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from indexes.store.regular import read_regular
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
-from robot.recording.folder import RecordedGrasp, read_info, read_recording
+from robot.recording.folder import read_info, read_recording
 
 log = logging.getLogger(__name__)
 
@@ -72,14 +72,31 @@ class Attempt:
 
 def load_all(folder: Path) -> list[Attempt]:
     """Read every line of a recording, in the order of collection. Raises DatasetError for an unreadable one."""
+    try:
+        recording = read_recording(folder)
+    except RobotError as error:
+        raise DatasetError(str(error)) from error
+    for note in recording.notes:
+        log.warning("%s", note)
+
+    def in_finger_order(files: Mapping[str, str]) -> tuple[Path, ...]:
+        return tuple(folder / files[finger] for finger in sorted(files))
+
     return [
         Attempt(
-            _as_grasp(folder, grasp),
-            _outcome(grasp),
-            grasp.grasped is not False,
-            _in_finger_order(folder, grasp.touches_after),
+            Grasp(
+                grasp_id=line.grasp_id,
+                object_id=line.object_id,
+                sequence_id=line.sequence_id,
+                photo=folder / line.photo,
+                touches=in_finger_order(line.touches),
+                backgrounds=in_finger_order(line.touches_before),
+            ),
+            outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
+            accepted=line.grasped is not False,
+            after=in_finger_order(line.touches_after),
         )
-        for grasp in _recorded(folder)
+        for line in recording.grasps
     ]
 
 
@@ -94,33 +111,6 @@ def load_attempts(folder: Path) -> list[Attempt]:
         raise DatasetError(f"{folder} must say of its grasps whether they succeeded (grasped, outcome); none says so")
     finger_count([attempt.grasp for attempt in attempts])
     return attempts
-
-
-def _outcome(grasp: RecordedGrasp) -> str:
-    if grasp.outcome is not None:
-        return grasp.outcome
-    return "unknown" if grasp.grasped is None else "held" if grasp.grasped else "failed"
-
-
-def _recorded(folder: Path) -> tuple[RecordedGrasp, ...]:
-    try:
-        recording = read_recording(folder)
-    except RobotError as error:
-        raise DatasetError(str(error)) from error
-    for note in recording.notes:
-        log.warning("%s", note)
-    return recording.grasps
-
-
-def _as_grasp(folder: Path, grasp: RecordedGrasp) -> Grasp:
-    return Grasp(
-        grasp_id=grasp.grasp_id,
-        object_id=grasp.object_id,
-        sequence_id=grasp.sequence_id,
-        photo=folder / grasp.photo,
-        touches=_in_finger_order(folder, grasp.touches),
-        backgrounds=_in_finger_order(folder, grasp.touches_before),
-    )
 
 
 def recording_source(folder: Path) -> str:
@@ -138,10 +128,6 @@ def finger_count(grasps: Sequence[Grasp]) -> int:
                 f"{grasp.grasp_id} has {len(grasp.touches)}; keep the sensors in recordings of their own"
             )
     return len(first.touches)
-
-
-def _in_finger_order(folder: Path, files: Any) -> tuple[Path, ...]:
-    return tuple(folder / files[finger] for finger in sorted(files or {}))
 
 
 def data_digest(grasps: Iterable[Grasp]) -> str:
@@ -340,7 +326,9 @@ class PairSampler:
         )
 
     def _drawn(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_Drawn]]:
-        """For the object of each touch the photos to pair it with: (object, photo, label)."""
+        """For the object of each touch the photos to pair it with: (object, photo, label). Shared negatives are of the
+        batch's other objects, in turn in a random order, one of the photos shown of each; of all objects where the
+        batch holds no other."""
         if not share:
             for index in objects:
                 matches = [(index, photo, 1.0) for photo in self._positives(index, rng)]
@@ -351,18 +339,14 @@ class PairSampler:
         for index, drawn in zip(objects, positives, strict=True):
             shown[index] += drawn
         for index, drawn in zip(objects, positives, strict=True):
-            yield [(index, photo, 1.0) for photo in drawn] + self._shared_negatives(index, shown, rng)
-
-    def _shared_negatives(self, index: int, shown: Mapping[int, list[Path]], rng: np.random.Generator) -> list[_Drawn]:
-        """Of the batch's other objects, in turn in a random order, one of the photos shown of each; of all objects
-        where the batch holds no other."""
-        others = sorted(set(shown) - {index})
-        if not others:
-            return [(*self._negative(index, rng), 0.0) for _ in range(self.negatives)]
-        turns = [
-            others[turn] for _ in range(-(-self.negatives // len(others))) for turn in rng.permutation(len(others))
-        ]
-        return [(other, shown[other][int(rng.integers(len(shown[other])))], 0.0) for other in turns[: self.negatives]]
+            others = sorted(set(shown) - {index})
+            if others:
+                rounds = [rng.permutation(len(others)) for _ in range(-(-self.negatives // len(others)))]
+                chosen = [others[turn] for turn in np.concatenate(rounds)[: self.negatives]]
+                negatives = [(other, shown[other][int(rng.integers(len(shown[other])))]) for other in chosen]
+            else:
+                negatives = [self._negative(index, rng) for _ in range(self.negatives)]
+            yield [(index, photo, 1.0) for photo in drawn] + [(*negative, 0.0) for negative in negatives]
 
     def _positives(self, index: int, rng: np.random.Generator) -> list[Path]:
         """Without replacement where the object has enough photos."""

@@ -9,7 +9,6 @@ import io
 import struct
 import threading
 import warnings
-from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -91,7 +90,20 @@ def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
     if not data:
         raise ImageError(name, "the file is empty")
     try:
-        return _decode(data, name)
+        check_pixels(_webp_size(data), name)
+        decoder = _other_decoder(data, name)
+        with _quiet:
+            try:
+                image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
+            except Image.DecompressionBombError:
+                raise ImageError(name, _too_large("far more")) from None
+            with image:
+                _reduce(image)
+                check_pixels(image.size, name)
+                image.load()
+                orientation = _orientation(image)
+                rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
+        return np.ascontiguousarray(_upright(rgb, orientation))
     except ImageError:
         raise
     except UnidentifiedImageError:
@@ -113,23 +125,6 @@ def _reason(error: BaseException) -> str:
     return f"{' '.join(text.split())} ({type(error).__name__})"
 
 
-def _decode(data: bytes, name: str | Path) -> RgbImage:
-    check_pixels(_webp_size(data), name)
-    decoder = _other_decoder(data, name)
-    with _quiet:
-        try:
-            image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
-        except Image.DecompressionBombError:
-            raise ImageError(name, _too_large("far more")) from None
-        with image:
-            _reduce(image)
-            check_pixels(image.size, name)
-            image.load()
-            orientation = _orientation(image)
-            rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
-    return np.ascontiguousarray(_upright(rgb, orientation))
-
-
 def _other_decoder(data: bytes, name: str | Path) -> str | None:
     """Pillow's name of the decoder for these bytes, "HEIF" or "AVIF", made known to it; None for any other picture.
 
@@ -146,20 +141,12 @@ def _other_decoder(data: bytes, name: str | Path) -> str | None:
         return "AVIF"
     if not brands & _HEIC_BRANDS:
         return None  # a film
-    if not _heif_is_registered():
-        raise ImageError(name, "a HEIC picture, which needs pillow-heif: pip install 'touch-retrieval[heif]'")
-    return "HEIF"
-
-
-@cache
-def _heif_is_registered() -> bool:
-    """Whether Pillow reads HEIC; tells it of the package that does."""
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
-        return False
+        raise ImageError(name, "a HEIC picture, which needs pillow-heif: pip install 'touch-retrieval[heif]'") from None
     register_heif_opener()
-    return True
+    return "HEIF"
 
 
 def _reduce(image: Image.Image) -> None:

@@ -43,8 +43,18 @@ class Naming:
     text: str = FOLDER
 
     def __post_init__(self) -> None:
-        if self.text not in (FOLDER, STEM):
-            _require_pattern(self.text)
+        if self.text in (FOLDER, STEM):
+            return
+        words, example = _FIELD.findall(self.text), "such as {split}/{object}/{photo}"
+        if OBJECT not in words:
+            raise BadInput(
+                f"objects must be named from folder, stem, or a pattern with {{object}} {example}; got {self.text!r}"
+            )
+        rest = _FIELD.sub("/", self.text)
+        if "{" in rest or "}" in rest or any(not word.isidentifier() for word in words):
+            raise BadInput(f"braces in a pattern must hold one word each, {example}; got {self.text!r}")
+        if "}{" in self.text:
+            raise BadInput(f"two words of a pattern must have text between them, {example}; got {self.text!r}")
 
     def object_of(self, path: str) -> str | None:
         """The object of the photo at `path`, forward slashes; None where the path does not fit the rule."""
@@ -73,18 +83,6 @@ class Naming:
 def without_number(name: str) -> str:
     """The name without the number that it ends with, and without what joins the two: "mug" of "mug_12"."""
     return _NUMBER.sub("", name)
-
-
-def _require_pattern(text: str) -> None:
-    words = _FIELD.findall(text)
-    example = "such as {split}/{object}/{photo}"
-    if OBJECT not in words:
-        raise BadInput(f"objects must be named from folder, stem, or a pattern with {{object}} {example}; got {text!r}")
-    rest = _FIELD.sub("/", text)
-    if "{" in rest or "}" in rest or any(not word.isidentifier() for word in words):
-        raise BadInput(f"braces in a pattern must hold one word each, {example}; got {text!r}")
-    if "}{" in text:
-        raise BadInput(f"two words of a pattern must have text between them, {example}; got {text!r}")
 
 
 def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.console.progress import Bar
-from retrieval.data.check.copies import Pictures, Thumbnail, look_at
+from retrieval.data.check.copies import PictureSet, Thumbnail, look_at
 from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Grasp, Split, finger_count
 
@@ -32,7 +32,7 @@ class _Frames:
 
     kind: str
     digests: list[str]
-    pictures: Pictures
+    pictures: PictureSet
 
 
 def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
                 seen[path] = found
                 bar.advance()
             frames = [seen[path] for path in paths]
-            yield _Frames(kind, [frame.digest for frame in frames], Pictures(frames, objects))
+            yield _Frames(kind, [frame.digest for frame in frames], PictureSet(frames, objects))
 
 
 def _identical(grasps: Sequence[Grasp], parts: NDArray[np.str_], kinds: Iterable[_Frames]) -> dict[str, Any]:

@@ -126,8 +126,8 @@ class Embedder:
         read = [item for item in items if isinstance(item, PhotoBytes)]
         known: set[str] = set()
         if self.parent is not None:
-            known.update(self.parent.reusable({item.photo.photo_id: item.digest for item in read}))
-        codes = self._made_before([item.digest for item in read if item.photo.photo_id not in known])
+            known.update(self.parent.reusable({item.photo.path: item.digest for item in read}))
+        codes = self._made_before([item.digest for item in read if item.photo.path not in known])
         return [item if isinstance(item, SkippedPhoto) else _found(item, known, codes) for item in items]
 
     def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
@@ -215,7 +215,7 @@ def layouts(checkpoint: Checkpoint) -> Layouts:
 
 
 def _found(item: PhotoBytes, known: Container[str], codes: Mapping[str, _Code]) -> _Found:
-    if item.photo.photo_id in known:
+    if item.photo.path in known:
         return _Found(_row(item))
     code = codes.get(item.digest)
     return _Found(_row(item), item if code is None else None, code)
@@ -239,7 +239,7 @@ def _full(found: Iterable[_Found | SkippedPhoto]) -> Iterator[list[_Found | Skip
 def _row(item: PhotoBytes) -> dict[str, Any]:
     photo = item.photo
     return {
-        "id": photo.photo_id,
+        "id": photo.path,
         "object_id": photo.object_id,
         "path": photo.path,
         "digest": item.digest,

@@ -128,7 +128,7 @@ class Nearest:
     copy: NDArray[np.bool_]
 
 
-class Pictures:
+class PictureSet:
     """All pictures of one kind, such as the photos or the touches of one finger, and the objects that they are of."""
 
     def __init__(self, thumbnails: Sequence[Thumbnail], objects: Sequence[str]) -> None:

@@ -12,11 +12,10 @@ from pathlib import Path
 from string import ascii_lowercase
 
 import numpy as np
-from numpy.typing import NDArray
 
-from retrieval.data.check.copies import Pictures, Thumbnail, is_copy
+from retrieval.data.check.copies import PictureSet, Thumbnail, is_copy
 from retrieval.data.check.findings import Files, Finding, named, some
-from retrieval.data.check.looks import Looks, exchanged_photos, named_by, swapped_fingers, swapped_moments
+from retrieval.data.check.looks import Looks, distance, exchanged_photos, named_by, swapped_fingers, swapped_moments
 from retrieval.data.dataset import Grasp
 
 _LEAST_GRASPS = 4
@@ -34,7 +33,8 @@ def swapped(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     if len(grasps) < 3:
         return
     touches, photos = _small(seen, [one.touches[0] for one in grasps]), _small(seen, [one.photo for one in grasps])
-    if _spread(photos) < _spread(touches) / 2:
+    spread = [float(np.median(distance(images, np.median(images, axis=0)))) for images in (photos, touches)]
+    if spread[0] < spread[1] / 2:
         yield Finding(
             "error",
             "swapped",
@@ -43,7 +43,7 @@ def swapped(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
         )
         return
     look = np.median(touches, axis=0)
-    closer = _distance(photos, look) < _distance(touches, look) / 2
+    closer = distance(photos, look) < distance(touches, look) / 2
     names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
     yield from named("error", "swapped", "touch and photo look swapped", names, grasps)
 
@@ -176,15 +176,14 @@ def copies(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
         kinds[f"touch {ascii_lowercase[finger]}"] = [(grasp, grasp.touches[finger]) for grasp in grasps]
     for kind, frames in kinds.items():
         one_each = list({path: (grasp, path) for grasp, path in frames}.values())  # grasps may share a photo
-        pictures = Pictures([_thumbnail(seen, path) for _, path in one_each], [one.object_id for one, _ in one_each])
+        pictures = PictureSet([_thumbnail(seen, path) for _, path in one_each], [one.object_id for one, _ in one_each])
         rows = np.arange(len(one_each))
         found = pictures.nearest(rows, rows)
-        pairs = {
-            tuple(sorted((row, int(found.row[row])))): f"{one_each[row][0].grasp_id} and {other.grasp_id}"
-            for row in np.flatnonzero(found.copy).tolist()
-            if seen[one_each[row][1]].digest != seen[(near := one_each[found.row[row]])[1]].digest
-            for other in (near[0],)
-        }
+        pairs: dict[tuple[int, ...], str] = {}
+        for row in np.flatnonzero(found.copy).tolist():
+            (grasp, path), (other, near) = one_each[row], one_each[found.row[row]]
+            if seen[path].digest != seen[near].digest:
+                pairs[tuple(sorted((row, int(found.row[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
         if pairs:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
             yield Finding("error", "near-copy", f"{text}: {some(list(pairs.values()))}")
@@ -208,11 +207,3 @@ def _thumbnail(seen: Files, path: Path) -> Thumbnail:
     found = seen[path].thumbnail
     assert found is not None  # made of every photo and touch of the accepted grasps
     return found
-
-
-def _spread(images: Looks) -> float:
-    return float(np.median(_distance(images, np.median(images, axis=0))))
-
-
-def _distance(images: Looks, centre: Looks) -> NDArray[np.float32]:
-    return np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3)))  # type: ignore[no-any-return]

@@ -56,18 +56,19 @@ class Moments:
 def swapped_moments(before: Looks, during: Looks) -> Moments:
     """Frames of the untouched gel are all alike, touches are not: what lies far from the median of the frames before
     belongs among the touches."""
-    spread = [float(np.median(_from(frames, np.median(frames, axis=0)))) for frames in (before, during)]
+    spread = [float(np.median(distance(frames, np.median(frames, axis=0)))) for frames in (before, during)]
     if spread[0] > max(2 * spread[1], _NOISE_TIMES * _LEAST_NOISE):
         return Moments(np.zeros(0, np.int64), True, 0)
-    untouched, touched = (_from(frames, np.median(before, axis=0)) for frames in (before, during))
+    untouched, touched = (distance(frames, np.median(before, axis=0)) for frames in (before, during))
     noise = max(float(np.quantile(untouched, 0.25)), _LEAST_NOISE)
     far = _NOISE_TIMES * noise
     swapped = np.flatnonzero((untouched > far) & (touched < untouched / 2))
     return Moments(swapped, False, int(((untouched <= far) & (touched <= far)).sum()))
 
 
-def _from(images: Looks, centre: Looks) -> NDArray[np.float64]:
-    return np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3), dtype=np.float64))
+def distance(images: Looks, centre: Looks) -> NDArray[np.float64]:
+    """Root mean square (n,) of how far each image is from `centre` (h, w, 3)."""
+    return np.asarray(np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3), dtype=np.float64)))
 
 
 # Light -------------------------------------------------------------------------------------------------------
@@ -95,9 +96,9 @@ def named_by(values: NDArray[np.floating], objects: NDArray[np.int64]) -> Named:
     squares = (flat**2).sum(axis=1)
     right = []
     for row in range(len(flat)):
-        distance = squares - 2 * (flat @ flat[row])
-        distance[row] = np.inf
-        right.append(objects[distance.argmin()] == objects[row])
+        far = squares - 2 * (flat @ flat[row])
+        far[row] = np.inf
+        right.append(objects[far.argmin()] == objects[row])
     others = np.bincount(objects)[objects] - 1
     some = others > 0
     if not some.any():
@@ -131,12 +132,10 @@ def exchanged_photos(photos: Looks, objects: NDArray[np.int64]) -> Exchanges:
     names = np.flatnonzero(counts >= 4)
     members = [np.flatnonzero(objects == name) for name in names]
     colours = _colours(photos)
-    distance = (
-        np.stack([_to_object(colours, own) for own in members], axis=1) if members else np.zeros((len(photos), 0))
-    )
+    far = np.stack([_to_object(colours, own) for own in members], axis=1) if members else np.zeros((len(photos), 0))
     worst, second, which = (np.zeros((len(names), len(names))) for _ in range(3))
     for at, own in enumerate(members):
-        nearer = np.log(distance[own, at][:, None] / distance[own])
+        nearer = np.log(far[own, at][:, None] / far[own])
         order = np.argsort(nearer, axis=0, kind="stable")
         second[at] = np.take_along_axis(nearer, order[-2:-1], 0)[0]
         worst[at], which[at] = np.take_along_axis(nearer, order[-1:], 0)[0], own[order[-1]]
@@ -152,9 +151,9 @@ def exchanged_photos(photos: Looks, objects: NDArray[np.int64]) -> Exchanges:
 def _to_object(colours: NDArray[np.float64], own: Rows) -> NDArray[np.float64]:
     """Median distance (n,) of every photo to an object's photos, without the one that is farthest, or itself."""
     squares = 2 - 2 * colours @ colours[own].T
-    distance = np.sqrt(np.maximum(squares, 1e-9))
-    distance[own, np.arange(len(own))] = np.inf
-    return np.asarray(np.median(np.sort(distance, axis=1)[:, :-1], axis=1))
+    far = np.sqrt(np.maximum(squares, 1e-9))
+    far[own, np.arange(len(own))] = np.inf
+    return np.asarray(np.median(np.sort(far, axis=1)[:, :-1], axis=1))
 
 
 def _colours(photos: Looks) -> NDArray[np.float64]:

@@ -34,7 +34,19 @@ def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = F
     accepted = require_accepted(folder, attempts)
     seen = _look_at_all(attempts, quiet)
     grasps = [attempt.grasp for attempt in attempts]
-    findings = [*_broken(folder, seen), *_single(accepted), *_duplicates(folder, grasps, seen)]
+    findings = [
+        Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
+        for path, image in seen.items()
+        if image.broken
+    ]
+    counts = Counter(grasp.object_id for grasp in accepted)
+    if single := sorted(name for name, count in counts.items() if count == 1):
+        text = (
+            f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
+            f"the same moment: {some(single)}"
+        )
+        findings.append(Finding("warning", "one-grasp", text))
+    findings += _duplicates(folder, grasps, seen)
     whole = [one.grasp for one in attempts if all(not seen[path].broken for path in _pictures(one))]
     trained_on = {grasp.grasp_id for grasp in accepted}
     of_all: tuple[_Check, ...] = (_same_images, doubts.swapped, doubts.fingers, doubts.moments)
@@ -54,29 +66,20 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
     for part, objects in parts.items():
         for name in objects:
             part_of[name].add(part)
-    shared = sorted(name for name, on in part_of.items() if len(on) > 1)
-    if shared:
+    if shared := sorted(name for name, on in part_of.items() if len(on) > 1):
         yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {some(shared)}")
     sides: dict[str, set[str]] = defaultdict(set)
     for grasp in grasps:
         if grasp.sequence_id is not None:
             sides[grasp.sequence_id] |= part_of.get(grasp.object_id, set())
-    leaking = sorted(name for name, on in sides.items() if len(on) > 1)
-    if leaking:
-        yield Finding(
-            "error",
-            "split-sequences",
-            f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides: "
-            f"{some(leaking)}",
-        )
+    if leaking := sorted(name for name, on in sides.items() if len(on) > 1):
+        text = f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides"
+        yield Finding("error", "split-sequences", f"{text}: {some(leaking)}")
     recorded = {grasp.object_id for grasp in grasps}
-    unknown = sorted(set(part_of) - recorded)
-    if unknown:
-        yield Finding(
-            "warning", "split-unknown", f"the split names {len(unknown)} object(s) not recorded: {some(unknown)}"
-        )
-    absent = sorted(recorded - set(part_of))
-    if absent:
+    if unknown := sorted(set(part_of) - recorded):
+        text = f"the split names {len(unknown)} object(s) not recorded: {some(unknown)}"
+        yield Finding("warning", "split-unknown", text)
+    if absent := sorted(recorded - set(part_of)):
         yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {some(absent)}")
 
 
@@ -125,24 +128,6 @@ def _look_at_all(attempts: Sequence[Attempt], quiet: bool) -> Files:
             seen[path] = found
             bar.advance()
     return seen
-
-
-def _broken(folder: Path, seen: Files) -> Iterator[Finding]:
-    for path, image in seen.items():
-        if image.broken:
-            yield Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
-
-
-def _single(grasps: Sequence[Grasp]) -> Iterable[Finding]:
-    counts = Counter(grasp.object_id for grasp in grasps)
-    single = sorted(name for name, count in counts.items() if count == 1)
-    if single:
-        yield Finding(
-            "warning",
-            "one-grasp",
-            f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
-            f"the same moment: {some(single)}",
-        )
 
 
 def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
