@@ -6,7 +6,6 @@ how high, how wide, in which direction, how drawn out and how sharp, and whether
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from threading import Lock
 from types import MappingProxyType
 
 import cv2
@@ -106,22 +105,10 @@ class Sheet:
             np.rint(u).astype(int).ravel() % self.columns,
         ] = 0
         wide = cv2.copyMakeBorder(mask, 0, 0, pad, pad, cv2.BORDER_WRAP)
-        distance = _distances(wide)[pad:-pad, pad:-pad]
+        rough = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[pad:-pad, pad:-pad]
+        # OpenCV's last bits hang on where memory lies and on its threads; squares of distances are whole numbers.
+        distance = np.sqrt(np.rint(rough * rough))
         return np.asarray(cv2.resize(distance, (self.columns, self.rows)) * np.float32(self.pixel_mm[1]), np.float32)
-
-
-_one_thread = Lock()
-
-
-def _distances(mask: NDArray[np.uint8]) -> Floats:
-    """Of each pixel to the nearest 0. OpenCV gives other last digits in several threads; recordings are made in one."""
-    with _one_thread:
-        threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-        try:
-            return np.asarray(cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
-        finally:
-            cv2.setNumThreads(threads)
 
 
 def _crest(wave: Floats, sharpness: float) -> Floats:
