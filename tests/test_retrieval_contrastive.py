@@ -1,17 +1,13 @@
 """The two towers of projections: what is kept of training, and how logits are made of cosines."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
-from retrieval.console.progress import Bar
-from retrieval.errors import NumericalError
 from retrieval.methods import contrastive as module
 from retrieval.methods.base import Setting
 from retrieval.methods.contrastive import Contrastive, ContrastiveSigmoid, Projections, SigmoidProjections
-from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded
+from retrieval.methods.draws import ObjectDraws, seeded
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX
 from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT
@@ -91,38 +87,6 @@ def test_fitting_leaves_the_random_stream_of_others_alone():
     torch.manual_seed(3)
     Contrastive(Setting(CONFIG)).fit(TRAIN, VALIDATION)
     assert torch.equal(torch.rand(4), expected)
-
-
-def test_the_best_judged_step_is_kept_not_the_last():
-    """The worth falls again after step 4: its weights must come back, in evaluation mode."""
-    weight = torch.nn.Linear(1, 1, bias=False)
-    worths, seen = iter([0.6, 0.9, 0.9, 0.3]), []
-
-    def value():
-        seen.append(weight.weight.item())
-        return next(worths)
-
-    with Bar("fit", 8, "steps", quiet=True) as bar:
-        best = optimise(weight, Optimisation(8, 2, 0.1), lambda: weight.weight.sum(), value, bar=bar)
-    assert (best.step, best.value) == (4, 0.9)
-    assert weight.weight.item() == seen[1] != seen[3]
-    assert not weight.training
-
-
-def test_a_loss_that_is_not_finite_stops_the_fit():
-    weight = torch.nn.Linear(1, 1)
-    with Bar("fit", 2, "steps", quiet=True) as bar, pytest.raises(NumericalError, match="loss must stay finite"):
-        optimise(weight, Optimisation(2, 1, 0.1), lambda: weight.weight.sum() * math.inf, lambda: 0.0, bar=bar)
-
-
-def test_only_matrices_decay():
-    layer = torch.nn.Linear(2, 2)
-    before = layer.weight.detach().clone(), layer.bias.detach().clone()
-    with Bar("fit", 1, "steps", quiet=True) as bar:
-        plan = Optimisation(1, 1, 0.1, weight_decay=1.0)
-        optimise(layer, plan, lambda: (0 * layer(torch.ones(1, 2))).sum(), lambda: 0.0, bar=bar)
-    assert torch.allclose(layer.weight, 0.9 * before[0])
-    assert torch.equal(layer.bias, before[1])
 
 
 def draws(owner, seed=0):

@@ -194,13 +194,13 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch,
 
 
 def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch):
-    step = Trainer.train_step
+    loss = Trainer.loss
 
     def interrupted(self, loaded):
         signal.raise_signal(signal.SIGINT)
-        return step(self, loaded)
+        return loss(self, loaded)
 
-    monkeypatch.setattr(Trainer, "train_step", interrupted)
+    monkeypatch.setattr(Trainer, "loss", interrupted)
     with pytest.raises(Interrupted, match="the same command goes on with it"):
         run(tmp_path / "out", methods=("late_fusion",))
 

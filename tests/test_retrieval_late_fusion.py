@@ -124,15 +124,15 @@ def test_another_setting_or_other_features_are_trained_anew(parts, tmp_path):
 
 def stopped(parts, folder, monkeypatch, config=FROZEN):
     """A fit that a power cut ends in its fourth step, after the state of the third is on disk."""
-    step = Trainer.train_step
+    loss = Trainer.loss
 
     def failing(self, loaded):
         if self.step == 3:
             raise Interrupted("power cut")
-        return step(self, loaded)
+        return loss(self, loaded)
 
     with monkeypatch.context() as during:
-        during.setattr(Trainer, "train_step", failing)
+        during.setattr(Trainer, "loss", failing)
         with pytest.raises(Interrupted):
             fit(LateFusion, parts, folder, config)
     assert state_path(unfinished(folder / "late_fusion-0.safetensors")).is_file()

@@ -51,7 +51,7 @@ def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, mo
             lambda _, images, __, name=name: counts.update({name: counts[name] + len(images[0])})
         )
     with trainer.features as features:
-        trainer.train_step(features.prepare(trainer.matcher, batch).result())
+        trainer.loss(features.prepare(trainer.matcher, batch).result())
     assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
 
 
@@ -248,14 +248,14 @@ def test_a_power_cut_while_the_posterior_is_fitted_changes_no_bit(recording, tmp
 
 def stop_after(trainer, steps):
     """Run, and fail like a power cut in the step after `steps`, once the state of that step is on disk."""
-    train_step = trainer.train_step
+    loss = trainer.loss
 
     def failing(loaded):
         if trainer.step == steps:
             raise RuntimeError("power cut")
-        return train_step(loaded)
+        return loss(loaded)
 
-    trainer.train_step = failing
+    trainer.loss = failing
     trainer.run(quiet=True)
 
 
@@ -281,14 +281,14 @@ def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, 
     trainer = trainer_for(
         recording, tmp_path / "m.safetensors", with_training(TINY, iterations=1000, validate_every=900)
     )
-    train_step = trainer.train_step
+    loss = trainer.loss
 
     def interrupted(loaded):
         if trainer.step == 1:
             os.kill(os.getpid(), signal.SIGINT)
-        return train_step(loaded)
+        return loss(loaded)
 
-    trainer.train_step = interrupted
+    trainer.loss = interrupted
     with pytest.raises(Interrupted, match="stopped at step 2 of 1000"):
         trainer.run(quiet=True)
     assert load_checkpoint(tmp_path / "m.safetensors").provenance["step"] == 2
@@ -584,7 +584,7 @@ def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
 def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(recording, tmp_path, monkeypatch, name):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
-    monkeypatch.setattr(Trainer, "train_step", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
     with pytest.raises(CheckpointError, match=r"is a folder; name the file|model card goes|cannot be written"):
         train(recording, tmp_path / name, TINY, quiet=True)
 

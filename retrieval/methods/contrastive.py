@@ -9,11 +9,12 @@ from torch.nn import functional
 
 from retrieval.console.progress import Bar
 from retrieval.methods.base import Array, Method
-from retrieval.methods.optimise import Best, ObjectDraws, Optimisation, optimise, seeded, standardised
+from retrieval.methods.draws import ObjectDraws, seeded
 from retrieval.methods.selection import Judge, judge
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
 from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
+from retrieval.training.fit import Best, Plan, fit_best
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -100,17 +101,20 @@ class Contrastive(Method):
         with seeded(self.setting.seed) as generator:
             dim = self.setting.config.matcher.embedding_dim
             module = self.projections(len(self._touch.kept), len(self._photo.kept), dim, dropout)
-            plan = Optimisation(steps, JUDGE_EVERY, LEARNING_RATE, weight_decay)
+            plan = Plan(steps, LEARNING_RATE, validate_every=JUDGE_EVERY)
             loss, worth = self._training_loss(module, train, generator), self._worth(module, judged)
-            return module, optimise(module, plan, loss, worth, bar=bar, after_step=module.clamp_scale)
+            best = fit_best(
+                module, plan, loss, worth, bar=bar, weight_decay=weight_decay, after_step=lambda _: module.clamp_scale()
+            )
+        return module, best
 
     def _training_loss(
         self, module: Projections, train: "Features", generator: torch.Generator
-    ) -> Callable[[], Tensor]:
-        touch, photo = standardised(self._touch, train.touch), standardised(self._photo, train.photo)
+    ) -> Callable[[int], Tensor]:
+        touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
         draws = ObjectDraws(torch.from_numpy(train.owner), generator)
 
-        def loss() -> Tensor:
+        def loss(_: int) -> Tensor:
             objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(EACH)
             touches = module(touch[draws.rows(objects)], module.touch)
             photos = module(photo[draws.rows(objects)], module.photo)
@@ -119,18 +123,18 @@ class Contrastive(Method):
         return loss
 
     def _worth(self, module: Projections, judged: Judge) -> Callable[[], float]:
-        touch = standardised(self._touch, judged.features.touch)
-        photo = standardised(self._photo, judged.features.photo)
+        touch = self._touch.tensor(judged.features.touch)
+        photo = self._photo.tensor(judged.features.photo)
         return lambda: judged.touches((module(touch, module.touch) @ module(photo, module.photo).T).numpy())
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        embeddings: Array = self._module(standardised(self._touch, touch), self._module.touch).numpy()
+        embeddings: Array = self._module(self._touch.tensor(touch), self._module.touch).numpy()
         return embeddings
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        embeddings: Array = self._module(standardised(self._photo, photo), self._module.photo).numpy()
+        embeddings: Array = self._module(self._photo.tensor(photo), self._module.photo).numpy()
         return embeddings
 
     def _score(self, touch_codes: Array, photo_codes: Array) -> Array:

@@ -13,11 +13,12 @@ from torch import Tensor, nn
 
 from retrieval.console.progress import Bar
 from retrieval.methods.base import Array, Method
-from retrieval.methods.optimise import ObjectDraws, Optimisation, optimise, seeded, standardised
+from retrieval.methods.draws import ObjectDraws, seeded
 from retrieval.methods.selection import judge, neighbours
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.fusion import FusionHead
 from retrieval.model.losses.match import match_loss
+from retrieval.training.fit import Plan, fit_best
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -64,21 +65,21 @@ class SetFusion(Method):
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
         config = self.setting.config
         steps = min(config.training.iterations, MOST_STEPS)
-        plan = Optimisation(steps, JUDGE_EVERY, config.training.learning_rate)
+        plan = Plan(steps, config.training.learning_rate, validate_every=JUDGE_EVERY)
         with seeded(self.setting.seed) as generator:
             features = len(self._touch.kept), len(self._photo.kept)
             self._head = SetHead(*features, config.matcher.hidden, config.matcher.dropout)
             loss, worth = self._training_loss(train, generator), self._worth(validation)
             with Bar("fit set_fusion", steps, "steps", quiet=self.setting.quiet) as bar:
-                best = optimise(self._head, plan, loss, worth, bar=bar)
+                best = fit_best(self._head, plan, loss, worth, bar=bar)
         self.chosen = {"steps": best.step, "validation_auc": best.value}
 
-    def _training_loss(self, train: "Features", generator: torch.Generator) -> Callable[[], Tensor]:
+    def _training_loss(self, train: "Features", generator: torch.Generator) -> Callable[[int], Tensor]:
         """The loss of a fresh batch: each set with as many photos of its own object as of others."""
-        touch, photo = standardised(self._touch, train.touch), standardised(self._photo, train.photo)
+        touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
         draws = ObjectDraws(torch.from_numpy(train.owner), generator)
 
-        def loss() -> Tensor:
+        def loss(_: int) -> Tensor:
             objects = draws.distinct_objects(OBJECTS_PER_BATCH)
             rows, held = draws.sets(objects, MOST_GRASPS)
             pooled = self._head.pool(self._head.touch_half(touch[rows]), held)
@@ -101,12 +102,12 @@ class SetFusion(Method):
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        halves: Array = self._head.touch_half(standardised(self._touch, touch)).numpy()
+        halves: Array = self._head.touch_half(self._touch.tensor(touch)).numpy()
         return halves
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        halves: Array = self._head.photo_half(standardised(self._photo, photo)).numpy()
+        halves: Array = self._head.photo_half(self._photo.tensor(photo)).numpy()
         return halves
 
     def _score(self, touch_codes: Array, photo_codes: Array) -> Array:

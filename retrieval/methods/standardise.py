@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from retrieval.errors import BadInput
 
@@ -22,7 +24,7 @@ class Standardiser:
 
     @classmethod
     def fit(cls, x: NDArray[Any]) -> "Standardiser":
-        """Statistics of x (n, ...), flattened to (n, F) and reckoned in float64. Raises BadInput where none varies."""
+        """Statistics of x (n, ...), flattened to (n, F) and computed in float64. Raises BadInput where none varies."""
         x = _flat(x)
         mean, scale = x.mean(0), x.std(0)
         kept = np.flatnonzero(scale > CONSTANT * np.abs(x).max(0))
@@ -35,6 +37,10 @@ class Standardiser:
     def __call__(self, x: NDArray[Any]) -> NDArray[np.float64]:
         """Standardised features (n, F') of x (n, ...)."""
         return (_flat(x)[:, self.kept] - self.mean) / self.scale
+
+    def tensor(self, x: NDArray[Any]) -> Tensor:
+        """The same as a float32 tensor."""
+        return torch.from_numpy(self(x)).float()
 
 
 def _flat(x: NDArray[Any]) -> NDArray[np.float64]:

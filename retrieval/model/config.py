@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -131,7 +131,12 @@ class TrainingConfig:
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
-SCHEDULES = ("constant", "cosine")
+SCHEDULES: dict[str, Callable[[int, int], float]] = {
+    "constant": lambda step, steps: 1.0,
+    "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
+    "halving": lambda step, steps: 0.5 ** (4 * step // steps),
+}
+"""Name -> the share of the learning rate that a step, from 0, of so many takes; halving: after each quarter."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 

@@ -7,7 +7,6 @@ blend of features, and a few thousand recorded photos stand for the crowd that a
 """
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,13 +17,14 @@ from torch.nn import functional
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
-from retrieval.errors import Interrupted, NumericalError
+from retrieval.errors import Interrupted
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import FusionHead, Matcher
 from retrieval.model.pruner import Pruner, Spread
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.features import Features
+from retrieval.training.fit import Plan, fit
 
 TOUCHES, PHOTOS = 32, 2048
 """In a batch; every touch is judged with every photo."""
@@ -61,44 +61,21 @@ def distil(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         pruner = Pruner(config.hidden, width, config.embedding_dim).to(touch_halves.device)
-    lesson = _Lesson(matcher.head, touch_halves, photo_halves, torch.Generator().manual_seed(seed))
-    optimizer = torch.optim.Adam(pruner.parameters())
+    touch_spread, photo_spread = Spread.of(touch_halves), Spread.of(photo_halves)
+    generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
+
+    def loss(_: int) -> Tensor:
+        touches = blend(touch_halves, TOUCHES, generator)
+        photos = blend(photo_halves, PHOTOS, generator)
+        scores = pruner.scores(touch_spread(touches), photo_spread(photos))
+        return order_loss(scores, all_logits(head, touches, photos))
+
+    optimizer, plan = torch.optim.Adam(pruner.parameters()), Plan(steps, LEARNING_RATE)
     with Bar("teach pruner", steps, "steps", quiet=quiet) as bar:
-        for step in range(steps):
-            _require_going_on(stopped)
-            loss = _step(optimizer, LEARNING_RATE * (1 + math.cos(math.pi * step / steps)) / 2, lesson, pruner)
-            bar.advance(note=f"loss {loss:.3f}")
-    pruner.take_in(*lesson.spreads)
+        if fit(optimizer, plan, range(steps), loss, bar=bar, stopped=stopped) < steps:
+            raise Interrupted("stopped before the pruner was taught")
+    pruner.take_in(touch_spread, photo_spread)
     matcher.config, matcher.pruner = config, pruner.eval()
-
-
-def _require_going_on(stopped: Callable[[], bool]) -> None:
-    if stopped():
-        raise Interrupted("stopped before the pruner was taught")
-
-
-def _step(optimizer: torch.optim.Optimizer, rate: float, lesson: "_Lesson", pruner: Pruner) -> float:
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-    optimizer.zero_grad(set_to_none=True)
-    loss = lesson.loss(pruner)
-    loss.backward()  # type: ignore[no-untyped-call]
-    optimizer.step()
-    return loss.item()
-
-
-class _Lesson:
-    """Batches of blends, judged by the head."""
-
-    def __init__(self, head: FusionHead, touches: Tensor, photos: Tensor, generator: torch.Generator) -> None:
-        self.head, self.touches, self.photos, self.generator = head.eval(), touches, photos, generator
-        self.spreads = Spread.of(touches), Spread.of(photos)
-
-    def loss(self, pruner: Pruner) -> Tensor:
-        touches = blend(self.touches, TOUCHES, self.generator)
-        photos = blend(self.photos, PHOTOS, self.generator)
-        scores = pruner.scores(self.spreads[0](touches), self.spreads[1](photos))
-        return order_loss(scores, all_logits(self.head, touches, photos))
 
 
 def order_loss(scores: Tensor, logits: Tensor) -> Tensor:
@@ -111,10 +88,7 @@ def order_loss(scores: Tensor, logits: Tensor) -> Tensor:
     )
     centred = logits - logits.mean(1, keepdim=True)
     error = (scores - scores.mean(1, keepdim=True) - centred).square().mean() / logits.var().clamp(min=1e-6)
-    loss = divergence + SPREAD_WEIGHT * error
-    if not bool(torch.isfinite(loss)):
-        raise NumericalError(f"the pruner's loss must stay finite; got {loss.item()}; the head's logits are too large")
-    return loss
+    return divergence + SPREAD_WEIGHT * error
 
 
 def blend(halves: Tensor, count: int, generator: torch.Generator) -> Tensor:

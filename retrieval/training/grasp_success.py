@@ -16,7 +16,6 @@ A gate chooses the touches that a matcher later trains on, so it makes them easi
 """
 
 import dataclasses
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,20 +27,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Attempt, ImageCache, Split, data_digest, load_attempts, make_split, recording_source
-from retrieval.errors import ConfigError, DatasetError, NumericalError
+from retrieval.errors import ConfigError, DatasetError
 from retrieval.metrics.guesses import grouped_interval
 from retrieval.metrics.intervals import FEW_OBJECTS
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
+from retrieval.model.losses.match import match_loss
+from retrieval.training.fit import Plan, fit
 from retrieval.training.gate import TASK, Gate, GateSettings, GraspNet
 from retrieval.training.gate import load_gate as load_gate
 
 BATCH = 32
-LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as by the authors
+LEARNING_RATE = 3e-3  # and halved after each quarter of the steps, as by the authors
 VALIDATION = 0.25  # share of the objects, as by the authors
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # the lamps may change by so much between two frames
 _GREY_LEVEL = 1 / 255
@@ -184,26 +184,26 @@ def _trained(attempts: list[Attempt], differences: _Differences, iterations: int
         net = GraspNet()
     first = touch_batch(differences(draw_batch(attempts, 0, seed)[0]))
     net.scale.fill_(max(float(first.square().mean().sqrt()), _GREY_LEVEL))
-    optimizer = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
+
+    def loss(step: int) -> Tensor:
+        batch, rng = draw_batch(attempts, step, seed)
+        images = augment(touch_batch(differences(batch)), rng)
+        return gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
+
     with Bar("train", iterations, "steps", quiet=quiet) as bar:
-        for step in range(iterations):
-            for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * 0.5 ** (4 * step // iterations)
-            batch, rng = draw_batch(attempts, step, seed)
-            images = augment(touch_batch(differences(batch)), rng)
-            loss = gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
-            if not math.isfinite(loss.item()):
-                raise NumericalError(f"the loss must stay finite; step {step} gave {loss.item()}; report it")
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            bar.advance(note=f"loss {loss.item():.3f}")
+        fit(
+            torch.optim.Adam(net.parameters()),
+            Plan(iterations, LEARNING_RATE, "halving"),
+            range(iterations),
+            loss,
+            bar=bar,
+        )
     return net
 
 
 def gate_loss(logits: Tensor, held: Tensor) -> Tensor:
     """Cross-entropy of the highest logit of each grasp. logits (B, fingers); held (B,) of 0 and 1."""
-    return binary_cross_entropy_with_logits(logits.amax(1), held)
+    return match_loss(logits.amax(1), held)
 
 
 def draw_batch(attempts: Sequence[Attempt], step: int, seed: int) -> tuple[list[Attempt], np.random.Generator]:

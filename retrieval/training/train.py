@@ -7,13 +7,13 @@ machine ends bit for bit where an unbroken run ends.
 import dataclasses
 import math
 import threading
+from collections.abc import Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
 from retrieval.console.interruption import interruption
@@ -29,7 +29,7 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.errors import CheckpointError, Interrupted, NumericalError
+from retrieval.errors import CheckpointError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
@@ -49,6 +49,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
+from retrieval.training.fit import Plan, fit
 from retrieval.training.judgement import with_verdicts
 from retrieval.training.step import batch_loss, pair_logits, shuffle_fingers
 
@@ -95,14 +96,6 @@ def train(
     return load_checkpoint(out)
 
 
-@dataclass(frozen=True)
-class StepResult:
-    """What one training step reports: loss, and the share of its pairs on the right side."""
-
-    loss: float
-    accuracy: float
-
-
 class Trainer:
     """The state of one training run."""
 
@@ -121,9 +114,9 @@ class Trainer:
         self.data_digest = known.digest if known else data_digest(grasps)
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.untaught = config.without_pruner()
+        self.unpruned = config.without_pruner()
         self.has_images = known is None
-        self.matcher = build_matcher(self.untaught).to(self.device)
+        self.matcher = build_matcher(self.unpruned).to(self.device)
         trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
@@ -158,23 +151,62 @@ class Trainer:
             self._finish(stop, quiet)
 
     def _steps(self, stop: threading.Event, quiet: bool) -> None:
-        total = self.config.training.iterations
-        with Bar("train", total, "steps", done=self.step, quiet=quiet) as bar:
-            upcoming: Future[Loaded] | None = self._prepare(self.step)
-            while upcoming is not None:
-                loaded = upcoming.result()
-                upcoming = self._prepare(self.step + 1) if self.step + 1 < total else None
-                with self.features.stepping():
-                    result = self.train_step(loaded)
-                bar.advance(note=f"loss {result.loss:.3f}  accuracy {result.accuracy:.2f}{self._best_note()}")
+        settings = self.config.training
+        plan = Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every)
+        with Bar("train", plan.steps, "steps", done=self.step, quiet=quiet) as bar:
+            fit(
+                self.optimizer,
+                plan,
+                self._batches(),
+                self.loss,
+                bar=bar,
+                done=self.step,
+                stepping=self.features.stepping,
+                before_step=lambda: distributed.average_gradients(self.matcher),
+                after_step=self._stepped,
+                note=self._note,
+                validate=lambda _: self._validate_and_save(),
                 # All ranks stop after the same step: one that went on would wait for the others for ever.
-                stopped = distributed.any_rank(stop.is_set(), self.device)
-                if stopped or self.step % self.config.training.validate_every == 0 or self.step == total:
-                    self._validate_and_save()
-                if stopped and self.step < total:
-                    raise Interrupted(
-                        f"stopped at step {self.step} of {total}; {self.out} is usable, --resume goes on from here"
-                    )
+                stopped=lambda: distributed.any_rank(stop.is_set(), self.device),
+            )
+        if self.step < plan.steps:
+            raise Interrupted(
+                f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
+            )
+
+    def _batches(self) -> Iterator[Loaded]:
+        """Those of the steps to come; each is prepared while the step before it is computed."""
+        upcoming = self._prepare(self.step)
+        for step in range(self.step + 1, self.config.training.iterations):
+            loaded, upcoming = upcoming.result(), self._prepare(step)
+            yield loaded
+        yield upcoming.result()
+
+    def _prepare(self, step: int) -> "Future[Loaded]":
+        batch = self.sampler.batch(step, self.config.training.touches_per_batch)
+        return self.features.prepare(self.matcher, batch)
+
+    def loss(self, loaded: Loaded) -> Tensor:
+        """Of a prepared batch."""
+        settings, batch = self.config.training, loaded.batch
+        torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
+        touch, photo = self.features.train_features(self.matcher, loaded)
+        if settings.shuffle_fingers:
+            touch = shuffle_fingers(touch, self.matcher.config.fingers)
+        loss, logits = batch_loss(self.matcher, settings, batch, touch, photo)
+        self._judged = logits.detach(), batch.labels
+        return loss
+
+    def _stepped(self, done: int) -> None:
+        # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
+        increment_version(list(self.matcher.parameters()))
+        self.matcher.clamp_scale()
+        self.step = done
+
+    def _note(self) -> str:
+        logits, labels = self._judged
+        best = "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
+        return f"  accuracy {pair_accuracy(logits.cpu().numpy(), labels):.2f}{best}"
 
     def _finish(self, stop: threading.Event, quiet: bool) -> None:
         """Complete the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
@@ -201,42 +233,6 @@ class Trainer:
         if self.has_images:
             made = with_verdicts(made, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
         store_checkpoint(made, self.out)
-
-    def _best_note(self) -> str:
-        return "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
-
-    def _prepare(self, step: int) -> "Future[Loaded]":
-        batch = self.sampler.batch(step, self.config.training.touches_per_batch)
-        return self.features.prepare(self.matcher, batch)
-
-    def train_step(self, loaded: Loaded) -> StepResult:
-        """One optimiser step on a prepared batch."""
-        settings, batch = self.config.training, loaded.batch
-        torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
-        self._set_learning_rate()
-        self.optimizer.zero_grad(set_to_none=True)
-        touch, photo = self.features.train_features(self.matcher, loaded)
-        if settings.shuffle_fingers:
-            touch = shuffle_fingers(touch, self.matcher.config.fingers)
-        loss, logits = batch_loss(self.matcher, settings, batch, touch, photo)
-        if not math.isfinite(loss.item()):
-            raise NumericalError(f"the loss must stay finite; step {self.step} gave {loss.item()}; lower learning_rate")
-        loss.backward()  # type: ignore[no-untyped-call]
-        distributed.average_gradients(self.matcher)
-        self.optimizer.step()
-        # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
-        increment_version(list(self.matcher.parameters()))
-        self.matcher.clamp_scale()
-        self.step += 1
-        return StepResult(loss.item(), pair_accuracy(logits.detach().cpu().numpy(), batch.labels))
-
-    def _set_learning_rate(self) -> None:
-        settings = self.config.training
-        factor = 1.0
-        if settings.schedule == "cosine":
-            factor = 0.5 * (1 + math.cos(math.pi * self.step / settings.iterations))
-        for group in self.optimizer.param_groups:
-            group["lr"] = settings.learning_rate * factor
 
     def _validate_and_save(self) -> None:
         metrics = self.validate()
@@ -270,7 +266,7 @@ class Trainer:
         save_checkpoint(
             self.out,
             self.matcher,
-            self.untaught,
+            self.unpruned,
             split=self.split,
             provenance=provenance,
         )
@@ -321,7 +317,7 @@ class Trainer:
         two writes): the steps since then are repeated to the same end."""
         kept = load_checkpoint(self.out)
         mine = (kept.split, kept.provenance.get("data_digest")) == (self.split, self.data_digest)
-        if not mine or kept.config not in (self.untaught, self.config):  # before and after its pruner is taught
+        if not mine or kept.config not in (self.unpruned, self.config):  # before and after its pruner is taught
             raise CheckpointError(
                 f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
             )

@@ -1,0 +1,127 @@
+"""The training loop: the rate of each step, what is validated when, what stops it, and which step is kept."""
+
+import math
+
+import pytest
+import torch
+
+from retrieval.console.progress import Bar
+from retrieval.errors import NumericalError
+from retrieval.model.config import SCHEDULES
+from retrieval.training.fit import Plan, fit, fit_best
+
+
+def descend(plan, batches=None, loss=None, **given):
+    """Fit one weight, from 0 down a slope of 1; the weight after each step, and what `fit` returns."""
+    weight, seen = torch.nn.Parameter(torch.zeros(1)), []
+    optimizer = torch.optim.SGD([weight])
+    with Bar("fit", plan.steps, "steps", quiet=True) as bar:
+        done = fit(
+            optimizer,
+            plan,
+            range(plan.steps) if batches is None else batches,
+            loss or (lambda _: weight.sum()),
+            bar=bar,
+            after_step=lambda _: seen.append(weight.item()),
+            **given,
+        )
+    return seen, done
+
+
+@pytest.mark.parametrize(
+    ("schedule", "shares"),
+    [
+        ("constant", [1, 1, 1, 1]),
+        ("cosine", [1, (1 + math.sqrt(0.5)) / 2, 0.5, (1 - math.sqrt(0.5)) / 2]),
+        ("halving", [1, 0.5, 0.25, 0.125]),
+    ],
+)
+def test_each_step_has_the_learning_rate_of_its_schedule(schedule, shares):
+    seen, done = descend(Plan(4, 0.1, schedule))
+    moves = [-after + before for before, after in zip([0.0, *seen], seen, strict=False)]
+    assert moves == pytest.approx([0.1 * share for share in shares], rel=1e-5)
+    assert done == 4
+
+
+def test_every_schedule_begins_at_the_whole_rate():
+    assert {name: share(0, 7) for name, share in SCHEDULES.items()} == dict.fromkeys(SCHEDULES, 1.0)
+
+
+def test_validation_comes_after_every_so_many_steps_and_after_the_last():
+    validated = []
+    descend(Plan(7, 0.1, validate_every=3), validate=validated.append)
+    assert validated == [3, 6, 7]
+
+
+def test_a_stop_ends_after_the_step_at_hand_which_is_validated():
+    validated, asked = [], iter([False, True])
+    seen, done = descend(Plan(9, 0.1, validate_every=5), validate=validated.append, stopped=lambda: next(asked))
+    assert (len(seen), done, validated) == (2, 2, [2])
+
+
+def test_a_run_that_goes_on_has_the_rates_and_validations_of_an_unbroken_one():
+    validated = []
+    whole, _ = descend(Plan(6, 0.1, validate_every=2))
+    rest, done = descend(Plan(6, 0.1, validate_every=2), range(3, 6), done=3, validate=validated.append)
+    assert rest == pytest.approx([after - whole[2] for after in whole[3:]], abs=1e-6)
+    assert (done, validated) == (6, [4, 6])
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit_before_the_step():
+    seen = []
+    with pytest.raises(NumericalError, match=r"loss must stay finite; fit, step 0, gave inf; lower learning_rate"):
+        descend(Plan(2, 0.1), loss=lambda _: torch.tensor(math.inf, requires_grad=True), note=lambda: seen.append(1))
+    assert seen == []
+
+
+def test_the_gradients_are_there_before_the_step_and_gone_before_the_next():
+    weight, seen = torch.nn.Parameter(torch.zeros(1)), []
+    with Bar("fit", 2, "steps", quiet=True) as bar:
+        optimizer = torch.optim.SGD([weight])
+        fit(
+            optimizer,
+            Plan(2, 0.1, "constant"),
+            [1.0, 5.0],
+            lambda slope: slope * weight.sum(),
+            bar=bar,
+            before_step=lambda: seen.append(weight.grad.item()),
+        )
+    assert seen == [1.0, 5.0]
+    assert weight.item() == pytest.approx(-0.6)
+
+
+# The best step ---------------------------------------------------------------------------------------------
+
+
+def best_of(module, plan, loss, worth, **given):
+    with Bar("fit", plan.steps, "steps", quiet=True) as bar:
+        return fit_best(module, plan, loss, worth, bar=bar, **given)
+
+
+def test_the_best_judged_step_is_kept_not_the_last():
+    """The worth falls again after step 4: its weights must come back, in evaluation mode."""
+    weight = torch.nn.Linear(1, 1, bias=False)
+    worths, seen, modes = iter([0.6, 0.9, 0.9, 0.3]), [], []
+
+    def loss(_):
+        modes.append(weight.training)
+        return weight.weight.sum()
+
+    def worth():
+        modes.append(weight.training)
+        seen.append(weight.weight.item())
+        return next(worths)
+
+    best = best_of(weight, Plan(8, 0.1, validate_every=2), loss, worth)
+    assert (best.step, best.value) == (4, 0.9)
+    assert weight.weight.item() == seen[1] != seen[3]
+    assert modes == [True, True, False] * 4
+    assert not weight.training
+
+
+def test_only_matrices_decay():
+    layer = torch.nn.Linear(2, 2)
+    before = layer.weight.detach().clone(), layer.bias.detach().clone()
+    best_of(layer, Plan(1, 0.1), lambda _: (0 * layer(torch.ones(1, 2))).sum(), lambda: 0.0, weight_decay=1.0)
+    assert torch.allclose(layer.weight, 0.9 * before[0])
+    assert torch.equal(layer.bias, before[1])
