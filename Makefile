@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Two processes; whoever is done first takes tests from the other, so that a file's tests and what they share stay together.
 PYTEST := python -m pytest -n 2 --dist worksteal
 
-.PHONY: demo test test-slow test-all test-lowest benchmark clean
+.PHONY: demo test test-slow test-all test-lowest benchmark docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/retrieve demo
@@ -30,8 +30,13 @@ test-lowest:
 benchmark: $(VENV)/installed
 	$(BIN)/python -m tests.benchmarks
 
+# Opens from the disk; its search wants a server: `python3 -m http.server -d site`.
+docs: $(VENV)/installed
+	$(BIN)/python -m tests.reference
+	$(BIN)/zensical build --clean --strict
+
 clean:
-	rm -rf .venv .venv-lowest demo .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-lowest .cache demo site .pytest_cache .mypy_cache .ruff_cache
 
 CONSTRAINTS ?= .ci/constraints.txt
 
@@ -43,5 +48,5 @@ $(VENV)/installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv --clear $(VENV)
 # PyTorch first and pinned: an unpinned one may bring gigabytes of CUDA libraries that the tests do not use.
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
-	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,mesh,heif,calibration,evaluation,onnx,gripper,sawyer,realsense]'
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,mesh,heif,calibration,evaluation,onnx,gripper,sawyer,realsense]'
 	@touch $@

@@ -43,7 +43,7 @@ def _public(package: Any, name: str) -> str:
     thing, title = getattr(package, name), f"{package.__name__}.{name}"
     if not callable(thing):
         return f"\n### {title}\n\n{_text(_below(package, name))}"
-    parts = [f"\n### {title}{_arguments(thing)}\n", _text(inspect.getdoc(thing))]
+    parts = [_heading("###", title, thing), _text(inspect.getdoc(thing))]
     if inspect.isclass(thing):
         parts.append(_fields(thing))
         parts += [_member(name, own, member) for own, member in vars(thing).items() if not own.startswith("_")]
@@ -55,19 +55,22 @@ def _member(of: str, name: str, member: Any) -> str:
     function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
     if not inspect.isfunction(function) or not function.__doc__ or getattr(retrieval.open, "__func__", 0) is function:
         return ""
-    arguments = "" if isinstance(member, property) else _arguments(function)
-    return f"\n#### {of}.{name}{arguments}\n\n{_text(inspect.getdoc(function))}"
+    return "\n".join([_heading("####", f"{of}.{name}", member), _text(inspect.getdoc(function))])
 
 
-def _arguments(thing: Any) -> str:
-    """Names and defaults, types left out; nothing for a class that is not made by hand."""
-    if inspect.isclass(thing) and thing not in MADE_BY_HAND:
-        return ""
-    signature = inspect.signature(thing)
+def _heading(level: str, title: str, thing: Any) -> str:
+    """The name, and below it a call with names and defaults of the arguments, types left out. No call of a property, or
+    of a class that is not made by hand."""
+    if isinstance(thing, property) or (inspect.isclass(thing) and thing not in MADE_BY_HAND):
+        return f"\n{level} {title}\n"
+    signature = inspect.signature(getattr(thing, "__func__", thing))
     named = [item for item in signature.parameters.values() if item.name not in ("self", "cls")]
     bare = [item.replace(annotation=item.empty) for item in named]
     text = str(signature.replace(parameters=bare, return_annotation=signature.empty))
-    return re.sub(r"<built-in function (\w+)>", r"\1", text)
+    arguments = re.sub(r"<built-in function (\w+)>", r"\1", text)
+    if arguments == "()":
+        return f"\n{level} {title}()\n"
+    return f"\n{level} {title}\n\n```python\n{title}{arguments}\n```\n"
 
 
 def _fields(thing: type) -> str:
