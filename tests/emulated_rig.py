@@ -28,7 +28,9 @@ from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.video import opencv_stream
 from robot.drivers.wsg50.driver import WSG50
 from robot.emulators.sawyer import server as rosbridge_emulator
-from robot.emulators.wsg50.server import EmulatedWSG50, Faults, serve_pty, serve_tcp
+from robot.emulators.wsg50.faults import LineFaults
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
 from robot.grasping.plan import GraspSettings
 from robot.grasping.settings import AttemptSettings
@@ -59,7 +61,7 @@ class World:
         self.seed, self.rate = seed, rate
         self.rng, self.counts = np.random.default_rng([7, seed]), Counter()
         self.emulator = EmulatedWSG50(speed_up=SPEED_UP, referenced=True)
-        self.line = Faults(rate / FRAMES, seed=seed)
+        self.line = LineFaults(rate / FRAMES, seed=seed)
         self.arm_faults, self.left_moving = None, 0
         self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
 
@@ -174,7 +176,7 @@ def _at_once(world):
 
 @contextlib.contextmanager
 def _sawyer(world):
-    world.arm_faults = rosbridge_emulator.Faults(world.rate, seed=world.seed)
+    world.arm_faults = rosbridge_emulator.MessageFaults(world.rate, seed=world.seed)
     with rosbridge_emulator.serve(rosbridge_emulator.EmulatedSawyer(faults=world.arm_faults)) as url:
         yield TrackedSawyer(world, int(url.rpartition(":")[2]))
 

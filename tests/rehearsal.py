@@ -17,7 +17,8 @@ from unittest.mock import patch
 import numpy as np
 
 from retrieval.commands.cli import main as retrieve
-from robot.emulators.wsg50.server import EmulatedWSG50, serve_tcp
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import serve_tcp
 from robot.readings import Frame, Intrinsics
 from robot.recording.folder import read_info, read_recording
 from robot.rig import RIGS, load_rig

@@ -12,7 +12,8 @@ from unittest.mock import patch
 import numpy as np
 
 from robot.collect import CollectSettings, collect
-from robot.emulators.wsg50.server import EmulatedWSG50, serve_tcp
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import serve_tcp
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye

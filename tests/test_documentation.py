@@ -12,7 +12,7 @@ import pytest
 
 from retrieval.commands import cli
 from retrieval.search.answer import EXIT_CODES
-from robot.emulators.wsg50.server import EmulatedWSG50
+from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
 from tests import synthetic
 from tests.documents import PAGES, README, ROOT, blocks, text_of

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from robot.drivers.sawyer import rosbridge
 from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
-from robot.emulators.sawyer.server import EmulatedSawyer, Faults, serve
+from robot.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
 from robot.errors import DeviceError
 from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
 
@@ -328,13 +328,13 @@ def test_the_emulator_answers_what_rosbridge_would():
 
 def test_faults_are_drawn_from_a_seed_and_counted():
     kinds = ("dropped", "corrupted")
-    first, second = Faults(0.5, kinds, seed=3), Faults(0.5, kinds, seed=3)
+    first, second = MessageFaults(0.5, kinds, seed=3), MessageFaults(0.5, kinds, seed=3)
     drawn = [first.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
     assert drawn == [second.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
     assert set(drawn) == {None, *kinds}
     assert first.counts == {kind: drawn.count(kind) for kind in kinds}
-    assert Faults(1.0, kinds).draw(("delayed",)) is None
-    assert Faults().draw(kinds) is None
+    assert MessageFaults(1.0, kinds).draw(("delayed",)) is None
+    assert MessageFaults().draw(kinds) is None
 
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)

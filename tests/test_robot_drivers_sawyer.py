@@ -22,7 +22,7 @@ from robot.drivers.sawyer.messages import JOINTS, Mount
 from robot.drivers.sawyer.rosbridge import Arrival
 from robot.drivers.sawyer.straight_line import Schedule, way_points
 from robot.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
-from robot.emulators.sawyer.server import LIMB, EmulatedSawyer, Faults, serve
+from robot.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Box, Pose
 from tests.waiting import running, until
@@ -681,7 +681,7 @@ def test_it_connects_closes_and_connects_again_and_leaves_no_thread():
 )
 def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds, monkeypatch, capsys):
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.01)
-    faults, outcomes = Faults(rate, kinds, seed=20), Counter()
+    faults, outcomes = MessageFaults(rate, kinds, seed=20), Counter()
     with connected(EmulatedSawyer(faults=faults), timeout_s=1.0) as (emulator, arm):
         for number in range(10):
             target = Pose(0.0, 0.0, 40.0 + 20 * (number % 2), 0.0)

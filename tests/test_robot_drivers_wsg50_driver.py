@@ -6,11 +6,10 @@ import math
 
 import pytest
 
-from robot.drivers.wsg50.commands import Statistics
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50.server import EmulatedWSG50
+from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.errors import DeviceError, RobotConfigError
-from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, TARE, bench
+from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, bench
 
 
 @PORTS
@@ -23,7 +22,6 @@ def test_it_grasps_holds_and_lets_go(port):
         opened = gripper.open(110.0)
         assert (opened.opening_mm, opened.force_n, opened.status) == (pytest.approx(110.0), 0.0, "idle")
         assert gripper.state() == opened
-        assert gripper.statistics() == Statistics(1, 0, 0)
         assert gripper.line_counts == {}
 
 
@@ -103,14 +101,11 @@ def test_what_is_out_of_range_never_reaches_the_gripper():
                 misuse()
         assert emulator.heard == []
         assert gripper.state().status == "holding"
-        for misuse in (
-            lambda: gripper.set_acceleration(5001.0),
-            lambda: gripper.set_soft_limits(50.0, 111.0),
-            lambda: gripper.set_soft_limits(50.0, 40.0),
-        ):
+    for settings in ({"acceleration_mm_s2": 5001.0}, {"soft_limits_mm": [50.0, 111.0]}):
+        with bench(connect=False, **settings) as (gripper, emulator):
             with pytest.raises(DeviceError, match="must be from"):
-                misuse()
-        assert not {0x30, 0x34} & set(emulator.heard)
+                gripper.connect()
+            assert not {0x30, 0x34} & set(emulator.heard)
 
 
 def test_a_gripper_that_would_clamp_harder_than_asked_is_not_told_to():
@@ -148,10 +143,7 @@ def test_a_nominal_width_that_no_motion_may_reach_is_refused():
             with pytest.raises(DeviceError, match="grasp_width_mm must be at most"):
                 gripper.connect()
             assert not emulator.in_fast_stop
-    with bench(grasp_width_mm=50.0) as (gripper, emulator):
-        with pytest.raises(DeviceError, match="grasp_width_mm must be at most"):
-            gripper.set_soft_limits(0.0, 49.0)
-        assert 0x34 not in emulator.heard
+            assert 0x34 not in emulator.heard
 
 
 def test_only_the_states_are_asked_for_again_and_again():
@@ -203,28 +195,9 @@ def test_settings_are_written_read_back_and_plain():
         assert gripper.stroke_mm == 90.0
         with pytest.raises(DeviceError, match="opening"):
             gripper.open(4.0)
-        gripper.clear_soft_limits()
-        assert gripper.stroke_mm == 110.0
-        assert gripper.settings()["soft_limits_mm"] is None
-        assert gripper.set_soft_limits(0.0, 100.0) == (0.0, 100.0)
-        assert gripper.set_acceleration(200.0) == 200.0
-        assert emulator.soft_limits == (0.0, 100.0)
-
-
-def test_small_questions_are_answered():
-    with bench() as (gripper, emulator):
-        assert gripper.info().serial == 20260101
-        assert gripper.speed() == 0.0
-        with pytest.raises(DeviceError, match="NOT_AVAILABLE"):
-            gripper.tare()
-        emulator.has_force_fingers = True
-        gripper.tare()
-        emulator.object_mm = 40.0
-        gripper.grasp(10.0)
-        tared = emulator.heard.count(TARE)
-        with pytest.raises(DeviceError, match="nothing may be held"):
-            gripper.tare()
-        assert emulator.heard.count(TARE) == tared
+        emulator.has_force_fingers, emulator.soft_limits = True, (0.0, 80.0)
+        gripper.recover()
+        assert (gripper.refused, emulator.soft_limits) == ({}, (5.0, 90.0))
 
 
 def test_what_is_held_thinner_than_a_part_is_the_other_finger():

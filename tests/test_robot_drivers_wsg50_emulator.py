@@ -5,9 +5,9 @@ import struct
 import pytest
 
 from robot.drivers.wsg50.codec import Packet, decode, encode
-from robot.emulators.wsg50.faults import KINDS
+from robot.emulators.wsg50.faults import LineFaults
+from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.emulators.wsg50.mechanics import Mechanics
-from robot.emulators.wsg50.server import EmulatedWSG50, Faults
 from robot.errors import RobotConfigError
 from tests.wsg50_packets import bytes_of
 
@@ -86,10 +86,6 @@ def test_it_answers_the_printed_commands_as_the_table_says():
     assert hand.tell(0x33) == (0, struct.pack("<f", 40))
     assert struct.unpack("<8f", hand.tell(0x53)[1]) == (110, 5, 420, 100, 5000, 5, 80, 120)
     assert len(hand.tell(0x50)[1]) == 8
-    assert hand.tell(0x51, b"left") == (0, b"")
-    assert hand.tell(0x52) == (0, b"left")
-    assert hand.tell(0x37, b"\x01") == (0, b"")
-    assert hand.tell(0x46) == (0, struct.pack("<h", 253))
     assert hand.tell(0x90) == (14, b"")
     assert hand.tell(0x25, bytes(7)) == (13, b"")
     assert hand.tell(0x25, bytes(9)) == (15, b"")
@@ -103,7 +99,6 @@ def test_a_motion_is_pending_first_and_denied_while_another_runs():
     hand.wait(0.1)
     assert hand.state() == 6
     assert 1 in hand.flags()
-    assert hand.value(0x44) < 0
     assert hand.tell(MOVE, move) == (4, b"")
     assert hand.tell(GRASP, bytes(8)) == (4, b"")
     assert hand.wait(2) == [(MOVE, 0)]
@@ -131,8 +126,6 @@ def test_grasping_finds_a_part_holds_it_and_says_when_it_is_lost():
     hand.emulator.object_mm = None
     hand.wait(0.1)
     assert (hand.state(), hand.value(0x45)) == (PART_LOST, 0.0)
-    assert hand.tell(0x42, b"\x01") == (0, struct.pack("<IHH", 1, 0, 1))
-    assert hand.tell(0x42, b"\x00") == (0, bytes(8))
     assert hand.to(RELEASE, 80.0) == 0
     assert (hand.state(), hand.value(0x43)) == (IDLE, pytest.approx(80.0))
 
@@ -193,9 +186,8 @@ def test_limits_are_held_and_what_is_outside_is_refused():
     assert [hand.to(MOVE, width) for width in (-1, 111)] == [28, 28]
     assert hand.tell(0x35)[0] == 1
     assert hand.tell(0x34, struct.pack("<ff", 20, 90)) == (0, b"")
+    assert hand.tell(0x35) == (0, struct.pack("<ff", 20, 90))
     assert [hand.to(MOVE, width) for width in (19, 91, 50)] == [28, 28, 0]
-    assert hand.tell(0x36)[0] == 0
-    assert hand.to(MOVE, 100.0) == 0
 
 
 def test_setting_it_while_it_moves_is_a_fast_stop():
@@ -219,9 +211,9 @@ def test_updates_come_by_themselves_until_told_to_end():
     hand = Hand()
     assert hand.tell(0x43, b"\x01\x14\x00")[0] == 0  # every 20 ms
     assert hand.wait(0.2) == [(0x43, 0)] * 10
-    assert hand.tell(0x43, b"\x03\x14\x00")[0] == 0  # only when it changes
-    assert hand.wait(0.2) == []
+    assert hand.tell(0x43, b"\x03\x14\x00")[0] == 28  # only when it changes: nobody asks for it
     assert hand.tell(0x43, b"\x01\x00\x00")[0] == 28
+    assert hand.wait(0.2) == []
     hand.tell(0x43, b"\x01\x14\x00")
     hand.tell(0x43, bytes(3))
     assert hand.wait(0.2) == []
@@ -231,14 +223,6 @@ def test_an_answer_that_fits_no_packet_is_a_range_error():
     hand = Hand()
     assert hand.tell(0x06, bytes(254)) == (0, bytes(254))
     assert [hand.tell(0x06, bytes(size)) for size in (255, 256)] == [(28, b"")] * 2
-    assert hand.tell(0x51, bytes(255)) == (0, b"")
-    assert hand.tell(0x52) == (28, b"")
-
-
-def test_counts_stop_at_what_their_bytes_can_say():
-    hand = Hand()
-    hand.emulator._counts = [70000, 70000, 65536]
-    assert hand.tell(0x42, b"\x00") == (0, struct.pack("<IHH", 70000, 65535, 65535))
 
 
 def test_a_command_is_answered_as_told_once_and_not_done():
@@ -260,10 +244,10 @@ def test_a_client_that_goes_without_a_word_leaves_a_fast_stop():
     assert hand.emulator.in_fast_stop
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", LineFaults.KINDS)
 def test_a_fault_does_to_a_packet_what_its_name_says(kind):
     packet = decode(bytes_of("grasp 12 mm 34 mm/s"))[1]
-    faults = Faults(1.0, [kind], delay_s=0.5)
+    faults = LineFaults(1.0, [kind], delay_s=0.5)
     pieces = list(faults.on(packet))
     data = b"".join(piece.data or b"" for piece in pieces)
     good = encode(packet)
@@ -283,14 +267,14 @@ def test_faults_come_at_their_rate_and_the_same_from_the_same_seed():
     packet = Packet(STOP)
     runs = []
     for _ in range(2):
-        faults = Faults(0.1, seed=3)
+        faults = LineFaults(0.1, seed=3)
         runs.append([list(faults.on(packet)) for _ in range(2000)])
         assert 140 <= sum(faults.counts.values()) <= 260
     assert runs[0] == runs[1]
-    assert not any(Faults().on(packet) is None for _ in range(5))
+    assert not any(LineFaults().on(packet) is None for _ in range(5))
 
 
 @pytest.mark.parametrize("settings", [{"rate": 1.5}, {"rate": -0.1}, {"kinds": ["gone"]}])
 def test_faults_that_cannot_be_are_refused(settings):
     with pytest.raises(RobotConfigError):
-        Faults(**settings)
+        LineFaults(**settings)

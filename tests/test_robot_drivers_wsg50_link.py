@@ -21,8 +21,7 @@ from robot.drivers.wsg50 import link as wsg50_link
 from robot.drivers.wsg50.codec import Packet, decode, encode
 from robot.drivers.wsg50.commands import Command, Status
 from robot.drivers.wsg50.driver import WSG50
-from robot.drivers.wsg50.link import CommandFailed, Link, NoEcho, NoReply
-from robot.drivers.wsg50.port import LinkLost, Port
+from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoEcho, NoReply, Port
 from robot.errors import DeviceError
 from tests.waiting import until
 from tests.wsg50_packets import bytes_of
@@ -210,7 +209,7 @@ def test_pending_is_not_the_end_of_a_command():
 def test_another_status_than_success_says_which_command_and_why():
     with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
         with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
-            link.tell(commands.stop())
+            link.tell(Packet(Command.STOP))
         assert caught.value.status is Status.ACCESS_DENIED
         assert peer.heard.count(Command.STOP) == 1  # an answer is an answer
 
@@ -233,8 +232,8 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
         (lambda link: link.pump(0.0), None),
         (lambda link: link.poll(Command.HOME, 0.05), None),
         (lambda link: link.sync(), NoEcho),
-        (lambda link: link.urgent(commands.stop()), NoReply),
-        (lambda link: link.tell(commands.stop()), NoEcho),
+        (lambda link: link.urgent(Packet(Command.STOP)), NoReply),
+        (lambda link: link.tell(Packet(Command.STOP)), NoEcho),
     ],
 )
 def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
@@ -252,10 +251,10 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
     ("wait", "time_outs"),
     [
         (lambda link: link.poll(Command.HOME, 0.1), 1),
-        (lambda link: link.urgent(commands.stop()), 1),
+        (lambda link: link.urgent(Packet(Command.STOP)), 1),
         (lambda link: link.sync(), 3),
-        (lambda link: link.call(commands.stop()), 4),
-        (lambda link: link.tell(commands.stop()), 7),
+        (lambda link: link.call(Packet(Command.STOP)), 4),
+        (lambda link: link.tell(Packet(Command.STOP)), 7),
         (lambda link: link.pump(0.0), 0),
     ],
     ids=["poll", "urgent", "sync", "call", "tell", "pump"],
@@ -302,7 +301,7 @@ def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
         return echoing(packet) or reply(packet) + updates
 
     with Peer(answer) as peer, linked(peer) as link:
-        link.tell(commands.stop())
+        link.tell(Packet(Command.STOP))
         time.sleep(0.2)
         link.pump(0.0)
         assert commands.number(link.updates[Command.OPENING][0]) == 799.0
@@ -315,7 +314,7 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
         return echoing(packet) or reply(packet, status=statuses.pop(0))
 
     with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
-        link.tell(commands.stop())
+        link.tell(Packet(Command.STOP))
         assert peer.heard.count(Command.STOP) == 2
         assert link.counts == {"asked again": 1}
 
@@ -323,7 +322,7 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
 def test_where_nobody_echoes_nothing_is_asked_again():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoEcho):
-            link.tell(commands.stop())
+            link.tell(Packet(Command.STOP))
         until(lambda: len(peer.heard) == 3)
         time.sleep(0.1)
         assert peer.heard == [Command.LOOP] * 3
@@ -332,7 +331,7 @@ def test_where_nobody_echoes_nothing_is_asked_again():
 def test_a_gripper_that_echoes_nothing_is_not_there():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoReply, match="is it on, and connected"):
-            link.call(commands.stop())
+            link.call(Packet(Command.STOP))
         assert set(peer.heard) == {Command.LOOP}  # nothing was told to a line in doubt
 
 
@@ -392,7 +391,7 @@ def test_replies_of_the_wrong_length_are_asked_again():
 def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
     with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
         link.doubt()
-        link.urgent(commands.stop())
+        link.urgent(Packet(Command.STOP))
         assert peer.heard == [Command.STOP]
 
 
@@ -404,7 +403,7 @@ def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
             link.sync()
         assert not link.is_open
         with pytest.raises(LinkLost, match="must be open"):
-            link.tell(commands.stop())
+            link.tell(Packet(Command.STOP))
         link.close()
     with Peer(echoing) as other:
         link.name = other.url

@@ -16,7 +16,9 @@ import pytest
 
 from robot.drivers.wsg50.codec import Packet, encode
 from robot.emulators.wsg50 import gripper as wsg50_emulated
-from robot.emulators.wsg50.server import EmulatedWSG50, Faults, main, serve_pty, serve_tcp
+from robot.emulators.wsg50.faults import LineFaults
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import main, serve_pty, serve_tcp
 from tests.waiting import STARTED, STARTED_IDS, first_line, running
 from tests.wsg50_packets import bytes_of
 
@@ -118,7 +120,7 @@ def test_what_it_fails_on_costs_one_client(monkeypatch, caplog):
     monkeypatch.setitem(wsg50_emulated._ACTIONS, 0x52, broken)
     with serve_tcp(EmulatedWSG50()) as url:
         with client_of(url) as client:
-            client.sendall(bytes_of("get tag"))
+            client.sendall(bytes_of("get force limit"))
             assert client.recv(100) == b""
         with client_of(url) as client:
             assert talk(client, bytes_of("stop"), encode(Packet(STOP, b"\0\0")))
@@ -133,7 +135,7 @@ def test_a_port_in_use_is_a_sentence(capsys):
 
 
 def test_a_line_that_is_cut_can_be_taken_up_again():
-    faults = Faults(1.0, ["disconnect"])
+    faults = LineFaults(1.0, ["disconnect"])
     emulator = EmulatedWSG50()
     with serve_tcp(emulator, faults) as url:
         host, port = url.removeprefix("socket://").split(":")

@@ -8,8 +8,9 @@ from serial.urlhandler import protocol_socket
 
 from robot.drivers.wsg50.codec import Packet, encode
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50.faults import Piece
-from robot.emulators.wsg50.server import EmulatedWSG50, Faults, serve_pty, serve_tcp
+from robot.emulators.wsg50.faults import LineFaults, Piece
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
 
 SERVE = {"tcp": serve_tcp, "pty": serve_pty}
@@ -20,7 +21,7 @@ HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE, TARE = 0x20, 0x21, 0x22, 0x23,
 PORTS = pytest.mark.parametrize("port", SERVE)
 
 
-class Script(Faults):
+class Script(LineFaults):
     """Does to the packets named by (id, number of the packet with this id) what it is told: the counting starts when
     told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
     none comes before it."""

@@ -12,25 +12,20 @@ MANUAL_REPLIES = {
 }
 COMMANDS = {
     "acknowledge": ("AA AA AA 24 03 00 61 63 6B DC B9", 0x24, "61 63 6B"),
-    "clear soft limits": ("AA AA AA 36 00 00 17 93", 0x36, ""),
     "disconnect": ("AA AA AA 07 00 00 35 4C", 0x07, ""),
     "fast stop": ("AA AA AA 23 00 00 AC 1C", 0x23, ""),
     "stop": ("AA AA AA 22 00 00 0E 76", 0x22, ""),
-    "get tag": ("AA AA AA 52 00 00 9F 52", 0x52, ""),
     "get force limit": ("AA AA AA 33 00 00 2C 70", 0x33, ""),
     "grasping state every 4E0Eh ms": ("AA AA AA 41 03 00 01 0E 4E 15 B9", 0x41, "01 0E 4E"),
     "opening every 1234h ms": ("AA AA AA 43 03 00 01 34 12 85 F3", 0x43, "01 34 12"),
     "info": ("AA AA AA 50 00 00 DB 87", 0x50, ""),
-    "temperature": ("AA AA AA 46 00 00 86 B7", 0x46, ""),
     "grasp 12 mm 34 mm/s": ("AA AA AA 25 08 00 00 00 40 41 00 00 08 42 A7 F1", 0x25, "00 00 40 41 00 00 08 42"),
     "loop abc": ("AA AA AA 06 03 00 61 62 63 CA 44", 0x06, "61 62 63"),
-    "overdrive on": ("AA AA AA 37 01 00 01 04 8D", 0x37, "01"),
     "move to 34 mm at 56 mm/s, stop on block": (
         "AA AA AA 21 09 00 02 00 00 08 42 00 00 60 42 95 56",
         0x21,
         "02 00 00 08 42 00 00 60 42",
     ),
-    "set tag abcd": ("AA AA AA 51 04 00 61 62 63 64 87 85", 0x51, "61 62 63 64"),
 }
 PACKETS = {**MANUAL_REPLIES, **COMMANDS}
 

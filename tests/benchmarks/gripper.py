@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50.codec import Packet
 from robot.drivers.wsg50.commands import Command
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import Link
-from robot.emulators.wsg50.server import EmulatedWSG50, serve_pty, serve_tcp
+from robot.emulators.wsg50.gripper import EmulatedWSG50
+from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from tests.benchmarks.common import Line, duration
 
 PORTS = {"TCP": serve_tcp, "pty": serve_pty}
@@ -27,10 +29,10 @@ def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterat
             link.open()
             try:
                 yield _times(
-                    port, "round trip of a command", trips, lambda link=link: link.call(commands.loop(b"abcd"))
+                    port, "round trip of a command", trips, lambda link=link: link.call(Packet(Command.LOOP, b"abcd"))
                 )
                 yield _updates(port, link, seconds)
-                link.tell(commands.disconnect())
+                link.tell(Packet(Command.DISCONNECT))
             finally:
                 link.close()
             with WSG50(port=address) as gripper:

@@ -4,16 +4,16 @@ A reply bears the id of its command, and its payload begins with a status u16; p
 is SUCCESS. A command that moves is answered by PENDING first, and by a second packet of the same id when it has ended.
 An automatic update is a reply that nobody asked for.
 
-Facts: as in robot.drivers.wsg50.codec; the commands of fingers (60h to 63h) and of scripts (B0h to B2h) are left out.
-Lengths in mm, forces in N as the gripper counts them (robot.drivers.wsg50.force says what they are), speeds in mm/s,
-accelerations in mm/s^2. Whatever cannot be raises WireError.
+Facts: as in robot.drivers.wsg50.codec; commands that the driver does not use are left out. Lengths in mm, speeds in
+mm/s, accelerations in mm/s^2, forces in N as the gripper counts them (WSG50Settings.on_finger says what they are).
+Whatever cannot be raises WireError.
 """
 
 import enum
 import math
 import struct
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from robot.drivers.wsg50.codec import Packet, WireError
 
@@ -36,25 +36,16 @@ class Command(enum.IntEnum):
     GET_FORCE_LIMIT = 0x33
     SET_SOFT_LIMITS = 0x34
     GET_SOFT_LIMITS = 0x35
-    CLEAR_SOFT_LIMITS = 0x36
-    OVERDRIVE = 0x37
     TARE = 0x38
     SYSTEM_STATE = 0x40
     GRASPING_STATE = 0x41
-    STATISTICS = 0x42
     OPENING = 0x43
-    SPEED = 0x44
     FORCE = 0x45
-    TEMPERATURE = 0x46
     INFO = 0x50
-    SET_TAG = 0x51
-    GET_TAG = 0x52
     LIMITS = 0x53
 
 
-UPDATING = frozenset(
-    {Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.SPEED, Command.FORCE},
-)
+UPDATING = frozenset({Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.FORCE})
 """Commands whose reply the gripper can be told to send again and again."""
 
 
@@ -155,18 +146,15 @@ class GripperLimits:
     overdrive_force_n: float
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Grasps since the counts were last reset."""
-
-    grasps: int
-    no_part: int
-    lost: int
-
-
-def loop(token: bytes) -> Packet:
-    """Echoes the token."""
-    return Packet(Command.LOOP, token)
+def packet(command: Command, *numbers: float) -> Packet:
+    """A command, with the lengths, speeds, forces or accelerations that it takes."""
+    try:
+        packed = struct.pack(f"<{len(numbers)}f", *numbers)
+    except (struct.error, OverflowError) as error:
+        raise WireError(f"numbers must fit 32 bits, got {numbers}") from error
+    if not all(map(math.isfinite, numbers)):
+        raise WireError(f"numbers must be finite, got {numbers}")
+    return Packet(command, packed)
 
 
 def home(direction: int = 0) -> Packet:
@@ -176,19 +164,9 @@ def home(direction: int = 0) -> Packet:
     return Packet(Command.HOME, bytes([direction]))
 
 
-def move(width_mm: float, speed_mm_s: float, *, relative: bool = False, stop_on_block: bool = True) -> Packet:
-    """Pre-position the fingers: bit 0 relative, bit 1 stop (rather than clamp) when blocked."""
-    return Packet(Command.MOVE, bytes([relative | stop_on_block << 1]) + _floats(width_mm, speed_mm_s))
-
-
-def stop() -> Packet:
-    """Stop, and stay usable."""
-    return Packet(Command.STOP)
-
-
-def fast_stop() -> Packet:
-    """Stop at once; nothing moves again before it is acknowledged."""
-    return Packet(Command.FAST_STOP)
+def move(width_mm: float, speed_mm_s: float) -> Packet:
+    """Pre-position the fingers, and stop (rather than clamp) when blocked."""
+    return Packet(Command.MOVE, b"\x02" + packet(Command.MOVE, width_mm, speed_mm_s).payload)
 
 
 def acknowledge() -> Packet:
@@ -196,63 +174,18 @@ def acknowledge() -> Packet:
     return Packet(Command.ACKNOWLEDGE, b"ack")
 
 
-def disconnect() -> Packet:
-    """Announce the end of the connection, which else raises a FAST STOP."""
-    return Packet(Command.DISCONNECT)
-
-
-def grasp(width_mm: float, speed_mm_s: float) -> Packet:
-    """Grasp a part of this nominal width."""
-    return Packet(Command.GRASP, _floats(width_mm, speed_mm_s))
-
-
-def release(width_mm: float, speed_mm_s: float) -> Packet:
-    """Let go of the part by opening to this width."""
-    return Packet(Command.RELEASE, _floats(width_mm, speed_mm_s))
-
-
-def set_acceleration(acceleration_mm_s2: float) -> Packet:
-    """Acceleration of all motions but stops."""
-    return Packet(Command.SET_ACCELERATION, _floats(acceleration_mm_s2))
-
-
-def set_force_limit(force_n: float) -> Packet:
-    """Force limit, as the gripper counts forces."""
-    return Packet(Command.SET_FORCE_LIMIT, _floats(force_n))
-
-
-def set_soft_limits(minus_mm: float, plus_mm: float) -> Packet:
-    """Openings that no motion may leave."""
-    return Packet(Command.SET_SOFT_LIMITS, _floats(minus_mm, plus_mm))
-
-
-def overdrive(on: bool) -> Packet:
-    """Allow forces up to the overdrive force."""
-    return Packet(Command.OVERDRIVE, bytes([on]))
-
-
-def statistics(reset: bool = False) -> Packet:
-    """Ask for the counts of grasps, and set them to 0."""
-    return Packet(Command.STATISTICS, bytes([reset]))
-
-
-def set_tag(tag: bytes) -> Packet:
-    """Name of the device."""
-    return Packet(Command.SET_TAG, tag)
-
-
 def ask(command: Command) -> Packet:
     """Ask for a value; of an UPDATING one this also ends its automatic updates."""
-    return Packet(command, struct.pack("<BH", 0, 0) if command in UPDATING else b"")
+    return Packet(command, bytes(3) if command in UPDATING else b"")
 
 
-def update(command: Command, period_ms: int, *, on_change: bool = False) -> Packet:
-    """Ask for a value every `period_ms` (1 to 65535) from now on, or only when it has changed."""
+def update(command: Command, period_ms: int) -> Packet:
+    """Ask for a value every `period_ms` (1 to 65535) from now on."""
     if command not in UPDATING:
         raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} update themselves, not {command!r}")
     if not 1 <= period_ms <= 0xFFFF:
         raise WireError(f"a period must be from 1 to 65535 ms, got {period_ms}")
-    return Packet(command, struct.pack("<BH", 1 | on_change << 1, period_ms))
+    return Packet(command, struct.pack("<BH", 1, period_ms))
 
 
 def reply(packet: Packet) -> tuple[Status, bytes]:
@@ -287,11 +220,6 @@ def info(parameters: bytes) -> Info:
     return Info(*_unpack("<BBHI", parameters))
 
 
-def statistics_of(parameters: bytes) -> Statistics:
-    """Counts of grasps."""
-    return Statistics(*_unpack("<IHH", parameters))
-
-
 def system_state(parameters: bytes) -> SystemState:
     """Bits of the system state."""
     return SystemState(_unpack("<I", parameters)[0])
@@ -299,38 +227,17 @@ def system_state(parameters: bytes) -> SystemState:
 
 def grasping_state(parameters: bytes) -> GraspingState:
     """State of the grasp."""
-    return _member(GraspingState, _unpack("<B", parameters)[0])
-
-
-def temperature(parameters: bytes) -> float:
-    """Degrees Celsius, read as i16 tenths; other notes read a whole number: compare with a thermometer first."""
-    return float(_unpack("<h", parameters)[0]) / 10
+    number = _unpack("<B", parameters)[0]
+    try:
+        return GraspingState(number)
+    except ValueError as error:
+        raise WireError(f"a state of the grasp must be from 0 to {max(GraspingState)}, got {number}") from error
 
 
 def name_of(command_id: int) -> str:
     """Words for an id, as in "GRASP (25h)"."""
     name = Command(command_id).name if command_id in list(Command) else "to an unknown command"
     return f"{name} ({command_id:02X}h)"
-
-
-_Number = TypeVar("_Number", bound=enum.IntEnum)
-
-
-def _member(kind: type[_Number], value: int) -> _Number:
-    try:
-        return kind(value)
-    except ValueError as error:
-        raise WireError(f"{kind.__name__} must be from 0 to {max(kind)}, got {value}") from error
-
-
-def _floats(*values: float) -> bytes:
-    try:
-        packed = struct.pack(f"<{len(values)}f", *values)
-    except (struct.error, OverflowError) as error:
-        raise WireError(f"numbers must fit 32 bits, got {values}") from error
-    if not all(map(math.isfinite, values)):
-        raise WireError(f"numbers must be finite, got {values}")
-    return packed
 
 
 def _unpack(form: str, parameters: bytes) -> tuple[Any, ...]:

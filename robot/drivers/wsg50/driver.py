@@ -1,8 +1,7 @@
 """The WSG-50 parallel gripper (Weiss Robotics, SCHUNK) as a Gripper of the contract.
 
-Commands of its binary interface over a serial port or TCP: robot.drivers.wsg50.commands; the line: wsg50_link; how it
-is set up: wsg50_setup; how a motion is watched: wsg50_motion; what its forces are: wsg50_force. Tried against
-wsg50_emulator, not yet on a gripper.
+Beside this file: bytes (codec), what they mean (commands), the line, serial or TCP (link), how a motion is watched
+(motion), settings and what a force is (setup). Tried against robot.emulators.wsg50, not yet on a gripper.
 
 Before use set in the gripper's web page: binary command interface; "part width tolerance" and "clamping travel" at
 their greatest, since the width of what is grasped is not known beforehand (a note in the Robotics Library's driver);
@@ -12,18 +11,15 @@ not.
 
 import logging
 import time
-from collections.abc import Sequence
 from typing import Any
 
 from robot.devices import Clock, Gripper
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
-from robot.drivers.wsg50.commands import Command, GraspingState, Info, Statistics, Status, SystemState
-from robot.drivers.wsg50.force import FINGER_SHARE, on_finger
-from robot.drivers.wsg50.link import NoReply
+from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState
+from robot.drivers.wsg50.link import LinkLost, NoReply
 from robot.drivers.wsg50.motion import Done, Reading, causes, check_ready, read
-from robot.drivers.wsg50.port import LinkLost
-from robot.drivers.wsg50.setup import TYPICAL, Settings, Setup, first_failure
+from robot.drivers.wsg50.setup import TYPICAL, Setup, WSG50Settings
 from robot.errors import DeviceError
 from robot.readings import GripperState
 from robot.readings import Status as Word
@@ -52,59 +48,26 @@ _SLACK_S = 2.0
 
 
 class WSG50(Gripper):
-    """A WSG-50 at `port`: a path, or socket://192.168.1.20:1000. Forces are those on each finger (wsg50_force).
-
-    baud, stop_bits: of a serial line, as set in the gripper (the defaults are not verified). timeout_s: of an answer.
-    home_direction: "default" as the gripper is configured, "out" or "in"; it is homed on connecting if it has lost its
-    reference. acceleration_mm_s2: 0 leaves the gripper's own; soft_limits_mm: least and greatest opening, empty leaves
-    its own. tare: the force-measuring fingers on connecting. acknowledge_faults: end a FAST STOP that is found, after
-    saying it aloud; else a person must. grasp_width_mm: nominal width given with each grasp. least_part_mm: what is
-    held at less is the other finger, not a part. finger_share: see wsg50_force. update_ms: period of the state while
-    it moves, which must not be older than max_state_age_s. reconnect_tries, reconnect_s: how often `recover` opens the
-    port again, and the first wait (s), which doubles up to 5 s. max_force_n, max_speed_mm_s: ceilings.
+    """A WSG-50; its keywords are those of WSG50Settings.
 
     `stop` lets go of what is held, since STOP ends the gripper's force control. For one thread: to stop it from
     outside, interrupt that thread (Ctrl-C).
-
-    Raises RobotConfigError for a setting out of range.
     """
 
-    def __init__(
-        self,
-        *,
-        port: str,
-        baud: int = 115200,
-        stop_bits: int = 1,
-        timeout_s: float = 1.0,
-        home_direction: str = "default",
-        acceleration_mm_s2: float = 0.0,
-        soft_limits_mm: Sequence[float] = (),
-        tare: bool = False,
-        acknowledge_faults: bool = False,
-        grasp_width_mm: float = 0.0,
-        least_part_mm: float = 1.0,
-        opening_speed_mm_s: float = 80.0,
-        finger_share: float = FINGER_SHARE,
-        update_ms: int = 20,
-        homing_timeout_s: float = 30.0,
-        reconnect_tries: int = 5,
-        reconnect_s: float = 0.2,
-        max_force_n: float = 40.0,
-        max_speed_mm_s: float = 420.0,
-        max_state_age_s: float = 0.5,
-        clock: Clock = time.monotonic,
-    ) -> None:
-        given = {name: value for name, value in locals().items() if name in Settings.__dataclass_fields__}
-        self._wanted = Settings(**given)
+    Settings = WSG50Settings
+
+    def __init__(self, *, clock: Clock = time.monotonic, **settings: Any) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        wanted = self._wanted = WSG50Settings(**settings)
         super().__init__(
             "WSG-50",
             stroke_mm=TYPICAL.stroke_mm,
-            min_force_n=on_finger(TYPICAL.min_force_n, finger_share),
-            max_force_n=min(max_force_n, on_finger(TYPICAL.max_force_n, finger_share)),
-            max_speed_mm_s=max_speed_mm_s,
+            min_force_n=wanted.on_finger(TYPICAL.min_force_n),
+            max_force_n=min(wanted.max_force_n, wanted.on_finger(TYPICAL.max_force_n)),
+            max_speed_mm_s=wanted.max_speed_mm_s,
             clock=clock,
         )
-        self._setup = Setup(self.name, self._wanted, self.refused)
+        self._setup = Setup(self.name, wanted, self.refused)
         self._link, self._motions = self._setup.link, self._setup.motions
 
     @property
@@ -125,11 +88,16 @@ class WSG50(Gripper):
             self._link.close()
             return
         try:
-            failure = first_failure([self._stand]) or first_failure([self._motions.quiet, self._announce])
+            if self._link.is_open:
+                self._setup.stop_if_it_moves(self._stop)
+            else:  # the line was lost after a motion was begun: a serial one tells the jaws nothing
+                self._stop()
+            try:
+                self._motions.quiet()
+            finally:
+                self._link.tell(Packet(Command.DISCONNECT))
         finally:
             self._link.close()
-        if failure:
-            raise failure
 
     def _settings(self) -> dict[str, Any]:
         return self._setup.read_back()
@@ -179,7 +147,8 @@ class WSG50(Gripper):
             self._release(self._further(reading))
         self._setup.set_force(force_n)
         width = max(self._wanted.grasp_width_mm, self._setup.openings[0])
-        return self._as_state(self._run(commands.grasp(width, speed_mm_s), speed_mm_s, _has_grasped))
+        packet = commands.packet(Command.GRASP, width, speed_mm_s)
+        return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_ON))
 
     # More than the contract.
 
@@ -188,74 +157,17 @@ class WSG50(Gripper):
         with self._moving("cannot be homed"):
             return self._as_state(self._setup.home())
 
-    def tare(self) -> None:
-        """Set the force that the fingers measure to 0. Raises DeviceError without such fingers, and while holding."""
-        with self._use("cannot be tared"):
-            if read(self._link).grasping is GraspingState.HOLDING:
-                raise DeviceError(f"{self.name}: nothing may be held when the fingers are tared; open it first")
-            self._link.tell(Packet(Command.TARE))
-
-    def set_acceleration(self, acceleration_mm_s2: float) -> float:
-        """Set the acceleration; returns what the gripper has then (mm/s^2). Raises DeviceError."""
-        with self._use("cannot set its acceleration"):
-            self._setup.check_stands()
-            return self._setup.set_acceleration(acceleration_mm_s2)
-
-    def set_soft_limits(self, least_mm: float, greatest_mm: float) -> tuple[float, float] | None:
-        """Set the openings that no motion leaves; returns what the gripper has then. Raises DeviceError."""
-        with self._use("cannot set its soft limits"):
-            self._check("the least opening", least_mm, 0.0, greatest_mm, "mm")
-            self._setup.check_stands()
-            has = self._setup.set_soft_limits((least_mm, greatest_mm))
-            self._take_limits()
-            return has
-
-    def clear_soft_limits(self) -> None:
-        """Allow the whole stroke. Raises DeviceError."""
-        with self._use("cannot clear its soft limits"):
-            self._setup.check_stands()
-            self._setup.set_soft_limits(())
-            self._take_limits()
-
-    def statistics(self) -> Statistics:
-        """Grasps, those without a part and those that lost it, as the gripper counts them. Raises DeviceError."""
-        with self._use("cannot say its statistics"):
-            return self._link.ask(commands.statistics(), commands.statistics_of)
-
-    def info(self) -> Info:
-        """What the gripper is. Raises DeviceError."""
-        with self._use("cannot say what it is"):
-            return self._link.ask(commands.ask(Command.INFO), commands.info)
-
-    def speed(self) -> float:
-        """Speed of the jaws (mm/s), below 0 when they close. Raises DeviceError."""
-        with self._use("cannot say its speed"):
-            return self._link.ask(commands.ask(Command.SPEED), commands.number)
-
     # How.
 
     def _set_up(self) -> None:
+        """Bring the gripper to its settings, and learn what it can do, below the ceilings."""
         self._setup.run(may_home=self.may_move)
-        self._take_limits()
-
-    def _take_limits(self) -> None:
-        """What the gripper can do, below the ceilings."""
-        limits, share = self._setup.limits, self._wanted.finger_share
+        limits, wanted = self._setup.limits, self._wanted
         self.min_opening_mm, self.stroke_mm = self._setup.openings
-        self.min_force_n = on_finger(limits.min_force_n, share)
-        self.max_force_n = min(self._wanted.max_force_n, on_finger(limits.max_force_n, share))
+        self.min_force_n = wanted.on_finger(limits.min_force_n)
+        self.max_force_n = min(wanted.max_force_n, wanted.on_finger(limits.max_force_n))
         self.min_speed_mm_s = limits.min_speed_mm_s
-        self.max_speed_mm_s = min(self._wanted.max_speed_mm_s, limits.max_speed_mm_s)
-
-    def _stand(self) -> None:
-        """Stop what moves, also where a motion was begun and the line was lost: a serial one tells the jaws nothing."""
-        if self._link.is_open:
-            self._setup.stop_if_it_moves(self._stop)
-        else:
-            self._stop()
-
-    def _announce(self) -> None:
-        self._link.tell(commands.disconnect())
+        self.max_speed_mm_s = min(wanted.max_speed_mm_s, limits.max_speed_mm_s)
 
     def _stop_quietly(self) -> None:
         try:
@@ -274,7 +186,7 @@ class WSG50(Gripper):
 
     def _release(self, width_mm: float) -> Reading:
         speed = self._speed_of_opening()
-        return self._run(commands.release(width_mm, speed), speed, _is_at(width_mm))
+        return self._run(commands.packet(Command.RELEASE, width_mm, speed), speed, _is_at(width_mm))
 
     def _move(self, width_mm: float, *, closing: bool) -> Reading:
         """Pre-position; when that closes the jaws, with no more than the least force."""
@@ -296,11 +208,7 @@ class WSG50(Gripper):
         word = _WORDS[reading.grasping]
         if word == "holding" and reading.opening_mm < self._wanted.least_part_mm:
             word = "no_part"
-        return GripperState(reading.opening_mm, on_finger(reading.force_n, self._wanted.finger_share), word)
-
-
-def _has_grasped(reading: Reading, _: Status | None) -> bool:
-    return reading.grasping in _CLOSED_ON
+        return GripperState(reading.opening_mm, self._wanted.on_finger(reading.force_n), word)
 
 
 def _is_at(width_mm: float) -> Done:

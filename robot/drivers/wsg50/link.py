@@ -1,4 +1,4 @@
-"""The line to a WSG-50: commands out, replies and updates in, each wait with a deadline.
+"""The line to a WSG-50, serial or TCP: commands out, replies and updates in, each wait with a deadline.
 
 Replies, results of motions and automatic updates come interleaved, and only their ids tell them apart; a reply that
 comes late bears the same id as the one that is waited for. So after anything has gone wrong the line is in doubt, and
@@ -9,17 +9,19 @@ Reading is done by whoever waits: updates are only wanted while something is wai
 whatever still comes.
 """
 
+import io
 import itertools
 import os
+import select
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from importlib import import_module
+from typing import Any, TypeVar
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet, WireError, decode, encode
 from robot.drivers.wsg50.commands import Command, Status, name_of
-from robot.drivers.wsg50.port import LinkLost, Port
 from robot.errors import DeviceError
 
 _T = TypeVar("_T")
@@ -37,6 +39,13 @@ which this program is held up. A peer that sends without end, if byte by byte, m
 _PATIENCE = 3.0
 """So many time-outs after a question was first asked it is not asked again."""
 
+_CHUNK = 4096
+_LOOP_POLL_S = 0.001
+
+
+class LinkLost(DeviceError):
+    """The port cannot be opened, is gone, or was closed by the other side."""
+
 
 class NoReply(DeviceError):
     """The gripper did not answer in time, or heard a damaged command; whether it heard it is not known."""
@@ -52,6 +61,86 @@ class CommandFailed(DeviceError):
     def __init__(self, command_id: int, status: Status) -> None:
         super().__init__(f"the gripper answered {name_of(command_id)} with {status.name} (status {int(status)})")
         self.status = status
+
+
+class Port:
+    """An open port. name: a path, or an URL of pyserial such as socket://192.168.1.20:1000. Raises DeviceError.
+
+    pyserial's settings are the same for all kinds; a socket takes them and ignores them.
+    """
+
+    def __init__(self, name: str, *, baud: int, stop_bits: int, write_timeout_s: float) -> None:
+        try:
+            serial = import_module("serial")
+        except ImportError as error:
+            raise DeviceError(
+                "the WSG-50 driver needs pyserial, which is missing; run pip install 'touch-retrieval[gripper]'"
+            ) from error
+        self.name = name
+        try:
+            self._serial: Any = serial.serial_for_url(
+                name,
+                do_not_open=True,
+                baudrate=baud,
+                stopbits=stop_bits,
+                timeout=0,
+                write_timeout=write_timeout_s,
+                exclusive=True,
+            )
+            self._serial.reset_input_buffer = lambda: None  # pyserial's does not end while a socket's peer sends
+            self._serial.open()
+        except Exception as error:  # pyserial lets termios.error, ValueError and others out
+            raise LinkLost(f"the gripper's port {name} cannot be opened: {_words(error)}") from error
+
+    def read(self, timeout_s: float) -> bytes:
+        """What has come, waiting for the first byte at most `timeout_s`; empty at the end of that."""
+        try:
+            if not self._readable(max(0.0, timeout_s)):
+                return b""
+            data: bytes = self._serial.read(_CHUNK)  # with a time-out of 0 it returns what there is
+            return data
+        except (OSError, ValueError, TypeError) as error:  # a closed one is None to select
+            raise LinkLost(
+                f"the gripper's port {self.name} is gone: {_words(error)}; see to its cable and power, "
+                "recover() opens it again"
+            ) from error
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        try:
+            while data:
+                data = data[self._serial.write(data) :]
+        except (OSError, ValueError, TypeError) as error:
+            raise LinkLost(
+                f"the gripper's port {self.name} takes no bytes: {_words(error)}; see to its cable and power, "
+                "recover() opens it again"
+            ) from error
+
+    def close(self) -> None:
+        """Never raises."""
+        sock = getattr(self._serial, "_socket", None)
+        try:
+            self._serial.close()
+        except Exception:
+            return  # what cannot be closed is gone
+        finally:
+            if sock is not None:  # pyserial leaves its socket open where the other side went first
+                sock.close()
+
+    def _readable(self, timeout_s: float) -> bool:
+        try:
+            return bool(select.select([self._serial.fileno()], [], [], timeout_s)[0])
+        except io.UnsupportedOperation:  # loop:// has nothing that the system could wait for
+            deadline = time.monotonic() + timeout_s
+        while not self._serial.in_waiting:
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(_LOOP_POLL_S)
+        return True
+
+
+def _words(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 class Link:
@@ -149,7 +238,7 @@ class Link:
             if number:
                 self.pad()
             token = next(self._tokens).to_bytes(8, "little")
-            self._write(commands.loop(token))
+            self._write(Packet(Command.LOOP, token))
             if self._echoed(Packet(Command.LOOP, bytes(2) + token)):
                 self._in_doubt, self.has_echoed = False, True
                 return

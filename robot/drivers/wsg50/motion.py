@@ -18,6 +18,7 @@ from robot.drivers.wsg50.link import CommandFailed, Link, NoReply
 from robot.errors import DeviceError
 
 _log = logging.getLogger(__name__)
+_STOP, _FAST_STOP = Packet(Command.STOP), Packet(Command.FAST_STOP)
 _WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE)
 UPDATE_BYTES = 25
 """Of an update of each: 10 around a payload, and status and value, 6 and 3."""
@@ -123,9 +124,9 @@ class Motions:
     def stop(self) -> None:
         """Stop the jaws, by FAST STOP if nothing else helps, and see that they stand. Raises DeviceError."""
         patience_s = self.max_age_s + self.link.timeout_s
-        self._say((commands.stop(), commands.stop(), commands.fast_stop(), commands.fast_stop()))
+        self._say((_STOP, _STOP, _FAST_STOP, _FAST_STOP))
         if self._last_reading(time.monotonic() + patience_s).moves:
-            self._say((commands.fast_stop(), commands.fast_stop()))
+            self._say((_FAST_STOP, _FAST_STOP))
             self._standing(time.monotonic() + patience_s)
         self.quiet()
 
@@ -186,7 +187,7 @@ class Motions:
             "FAST STOP; is the line overloaded?"
         )
         try:
-            self.link.urgent(commands.fast_stop())
+            self.link.urgent(_FAST_STOP)
         except DeviceError as second:
             error.add_note(str(second))
         raise error

@@ -8,16 +8,16 @@ It parses and builds messages on its own, so that the driver's reading of them i
 import argparse
 import contextlib
 import json
+import socket
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
+from robot.emulators.faults import Faults
+from robot.emulators.interrupts import until_interrupted
 from robot.emulators.sawyer.arm import SawyerModel, forward, inverse
-from robot.interrupts import until_interrupted
 
 JOINT_NAMES = [f"right_j{number}" for number in range(7)]
 LIMB = "/robot/limb/right/"
@@ -26,52 +26,32 @@ TIP = "right_hand"
 
 MESSAGE_FAULTS = ("dropped", "duplicated", "corrupted")
 REPLY_FAULTS = (*MESSAGE_FAULTS, "delayed", "wrong_id", "ik_failed", "disconnected")
-COMMAND_FAULTS = ("command_dropped",)
 
 
-class Faults:
-    """Something goes wrong in a share `rate` of the operations, drawn from `kinds`; `counts` says how often what did.
+class MessageFaults(Faults):
+    """What the server sends is dropped, duplicated, corrupted (cut short); a reply of a service is besides delayed,
+    sent with a wrong_id, ik_failed, or the connection is disconnected instead; a command is command_dropped."""
 
-    Kinds: what the server sends is dropped, duplicated, corrupted (cut short); a reply of a service is besides
-    delayed, sent with a wrong_id, ik_failed, or the connection is disconnected instead; a command is command_dropped.
-    """
-
-    def __init__(self, rate: float = 0.0, kinds: Sequence[str] | None = None, seed: int = 0) -> None:
-        self.rate = rate
-        self.kinds = tuple(dict.fromkeys((*REPLY_FAULTS, *COMMAND_FAULTS))) if kinds is None else tuple(kinds)
-        self.counts: Counter[str] = Counter()
-        self._rng, self._lock = np.random.default_rng(seed), threading.Lock()
-
-    def draw(self, possible: Sequence[str]) -> str | None:
-        """The fault of this operation, of those possible, or None."""
-        kinds = [kind for kind in possible if kind in self.kinds]
-        with self._lock:
-            if not kinds or self._rng.random() >= self.rate:
-                return None
-            kind = str(self._rng.choice(kinds))
-            self.counts[kind] += 1
-            return kind
+    KINDS = (*REPLY_FAULTS, "command_dropped")
 
 
 class Client:
     """One connection: what it subscribed to and advertised, and how to send to it."""
 
-    def __init__(self, socket: Any) -> None:
-        self.socket = socket
+    def __init__(self, connection: Any) -> None:
+        self.connection = connection
         self.subscribed: set[str] = set()
         self.advertised: set[str] = set()
 
     def send(self, text: str) -> None:
         """Send, or do nothing where the other side is gone."""
         with contextlib.suppress(Exception):
-            self.socket.send(text)
+            self.connection.send(text)
 
     def drop(self) -> None:
         """Cut the connection without a goodbye."""
-        import socket
-
         with contextlib.suppress(OSError):
-            self.socket.socket.shutdown(socket.SHUT_RDWR)
+            self.connection.socket.shutdown(socket.SHUT_RDWR)
 
 
 class EmulatedSawyer:
@@ -81,10 +61,10 @@ class EmulatedSawyer:
     """
 
     def __init__(
-        self, *, model: SawyerModel | None = None, faults: Faults | None = None, rate_hz: float = 100.0
+        self, *, model: SawyerModel | None = None, faults: MessageFaults | None = None, rate_hz: float = 100.0
     ) -> None:
         self.model = model or SawyerModel()
-        self.faults = faults or Faults()
+        self.faults = faults or MessageFaults()
         self.rate_hz = rate_hz
         self.silent: set[str] = set()
         self.refuse_ik = 0
@@ -115,13 +95,13 @@ class EmulatedSawyer:
         for client in tuple(self._clients):  # without the lock: a sender may hold it and wait for this very break
             client.drop()
 
-    def handle(self, socket: Any) -> None:
+    def handle(self, connection: Any) -> None:
         """Serve one connection until it ends."""
-        client = Client(socket)
+        client = Client(connection)
         with self._lock:
             self._clients.add(client)
         try:
-            for text in socket:
+            for text in connection:
                 self._take(client, text)
         except Exception:  # a connection that breaks is what this is for
             pass
@@ -238,7 +218,7 @@ class EmulatedSawyer:
             raise ValueError(f"only position mode, 1, is emulated, got {message['mode']}")
         places = dict(zip(message["names"], message["position"], strict=True))
         target = [float(places[name]) for name in JOINT_NAMES]
-        if self.faults.draw(COMMAND_FAULTS) is None:
+        if self.faults.draw(["command_dropped"]) is None:
             self._advance()
             self.model.command(target)
             self.commands.append((self._now, target))
@@ -337,12 +317,13 @@ def main() -> None:
     parser.add_argument("--faults", type=float, default=0.0, help="share of operations that go wrong")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    emulator = EmulatedSawyer(faults=Faults(asked.faults, seed=asked.seed))
+    emulator = EmulatedSawyer(faults=MessageFaults(asked.faults, seed=asked.seed))
     with until_interrupted(), serve(emulator, asked.host, asked.port) as url:
         print(f"a made-up arm behind rosbridge at {url}; Ctrl-C ends it", flush=True)
         threading.Event().wait()
     for kind, count in sorted(emulator.faults.counts.items()):
-        print(f"{kind}: {count}")
+        if count:
+            print(f"{kind}: {count}")
 
 
 if __name__ == "__main__":

@@ -11,9 +11,26 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet
-from robot.emulators.wsg50 import numbers as facts
 from robot.emulators.wsg50.mechanics import STROKE_MM, Mechanics
-from robot.emulators.wsg50.updates import Updates
+
+# Numbers of the protocol: states, statuses, bits, limits, lengths of commands.
+IDLE, GRASPING, NO_PART, PART_LOST, HOLDING, RELEASING, POSITIONING, ERROR = range(8)
+OK, NOT_AVAILABLE, NOT_INITIALIZED, RUNNING, DAMAGED, NO_PARAM, FEW_PARAMS, UNKNOWN = 0, 1, 3, 4, 11, 12, 13, 14
+FORMAT, DENIED, FAILED, ABORTED, INVALID, PENDING, RANGE, BLOCKED = 15, 16, 18, 19, 24, 26, 28, 29
+FAULT_BITS = {
+    "temperature warning": 13,
+    "temperature": 14,
+    "power": 15,
+    "current": 16,
+    "finger": 17,
+    "command": 18,
+    "script": 20,
+}
+UPDATES = frozenset({0x40, 0x41, 0x43, 0x45})
+REFERENCED_BIT, MOVING_BIT, MINUS_BIT, PLUS_BIT = 0, 1, 2, 3
+STOPPED_BIT, REACHED_BIT, FORCE_BIT, FAST_STOP_BIT = 6, 7, 9, 12
+SPEEDS, ACCELERATIONS, FORCES = (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
+LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x30: 4, 0x32: 4, 0x34: 8}
 
 _MOST_HEARD = 100_000
 _HOMING_MM_S = 100.0
@@ -52,12 +69,12 @@ class EmulatedWSG50:
         self.next_status: dict[int, int] = {}
         self.keeps_force_n: float | None = None
         self.heard: list[int] = []
-        self.grasping, self._bits = facts.IDLE, {facts.REFERENCED_BIT} if referenced else set()
+        self.grasping, self._bits = IDLE, {REFERENCED_BIT} if referenced else set()
         self.force_limit_n = 40.0
         self.soft_limits: tuple[float, float] | None = None
-        self._tag, self._counts = b"emulated", [0, 0, 0]
         self._running: tuple[int, Callable[[], int | None]] | None = None
-        self._updates = Updates(self._value)
+        self._updates: dict[int, tuple[float, float]] = {}
+        """Of each command that updates itself: period and next time (s)."""
         self._owed: list[Packet] = []
         self._announced = False
         self._now = clock()
@@ -89,29 +106,29 @@ class EmulatedWSG50:
     @property
     def is_closing(self) -> bool:
         """Whether the jaws are on their way to close on something."""
-        return self.moves and self.grasping == facts.GRASPING
+        return self.moves and self.grasping == GRASPING
 
     @property
     def in_fast_stop(self) -> bool:
         """Whether it waits for an acknowledgement."""
-        return facts.FAST_STOP_BIT in self._bits
+        return FAST_STOP_BIT in self._bits
 
     def warn(self, fault: str) -> None:
         """Raise the flag of a fault of FAULT_BITS, and no more."""
         with self._lock:
-            self._bits.add(facts.FAULT_BITS[fault])
+            self._bits.add(FAULT_BITS[fault])
 
     def fail(self, fault: str | None = None) -> None:
         """Raise a FAST STOP, with the flag of a fault of FAULT_BITS."""
         with self._lock:
-            self._bits |= {facts.FAST_STOP_BIT} | ({facts.FAULT_BITS[fault]} if fault else set())
+            self._bits |= {FAST_STOP_BIT} | ({FAULT_BITS[fault]} if fault else set())
             self._stand()
-            self.grasping = facts.ERROR
+            self.grasping = ERROR
 
     def lose_reference(self) -> None:
         """As after a loss of power."""
         with self._lock:
-            self._bits.discard(facts.REFERENCED_BIT)
+            self._bits.discard(REFERENCED_BIT)
 
     def connected(self) -> None:
         """A client has come."""
@@ -136,17 +153,15 @@ class EmulatedWSG50:
             forced = self.next_status.pop(packet.id, None)
             answer = self._answer(packet.id, packet.payload) if forced is None else forced
             if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:
-                answer = facts.RANGE  # no room for it beside the status
-            self._owed.append(
-                Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(facts.OK) + answer)
-            )
+                answer = RANGE  # no room for it beside the status
+            self._owed.append(Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer))
             return self._say()
 
     def receive_damaged(self, command: int) -> list[Packet]:
         """What it says to a command whose check sum does not hold."""
         with self._lock:
             if self.answers_bad_checksum:
-                self._owed.append(Packet(command, _status(facts.DAMAGED)))
+                self._owed.append(Packet(command, _status(DAMAGED)))
             return self._say()
 
     def tick(self) -> list[Packet]:
@@ -154,8 +169,11 @@ class EmulatedWSG50:
         with self._lock:
             self._advance()
             self._owed += self._ended()
-            due = list(self._updates.due(self._now))
-            self._owed += [] if self.mute_updates else [Packet(each, _status(facts.OK) + value) for each, value in due]
+            for command, (period_s, next_s) in self._updates.items():
+                if self._now >= next_s:
+                    self._updates[command] = period_s, max(next_s + period_s, self._now)
+                    if not self.mute_updates:
+                        self._owed.append(Packet(command, _status(OK) + self._value(command)))
             return self._say()
 
     def _say(self) -> list[Packet]:
@@ -165,9 +183,9 @@ class EmulatedWSG50:
     def _stand(self) -> None:
         """Stop dead; a motion that was running is answered as aborted."""
         self._jaws.stand()
-        self._bits.discard(facts.FORCE_BIT)
+        self._bits.discard(FORCE_BIT)
         if self._running:
-            self._owed.append(Packet(self._running[0], _status(facts.ABORTED)))
+            self._owed.append(Packet(self._running[0], _status(ABORTED)))
             self._running = None
 
     def _advance(self) -> None:
@@ -181,189 +199,174 @@ class EmulatedWSG50:
         if self._running and (status := self._running[1]()) is not None:
             command, self._running = self._running[0], None
             yield Packet(command, _status(status))
-        if self.grasping == facts.HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
-            self.grasping = facts.PART_LOST
-            self._bits.discard(facts.FORCE_BIT)
-            self._counts[2] += 1
+        if self.grasping == HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
+            self.grasping = PART_LOST
+            self._bits.discard(FORCE_BIT)
 
     def _answer(self, command: int, payload: bytes) -> Answer:
-        if command not in _ACTIONS and command not in facts.UPDATES:
-            return facts.UNKNOWN
-        want = 3 if command in facts.UPDATES else facts.LENGTHS.get(command, 0)
-        if command not in facts.ANY_LENGTH and len(payload) != want:
-            return facts.FEW_PARAMS if len(payload) < want else facts.FORMAT if want else facts.NO_PARAM
-        return self._update(command, payload) if command in facts.UPDATES else _ACTIONS[command](self, payload)
+        if command not in _ACTIONS and command not in UPDATES:
+            return UNKNOWN
+        want = 3 if command in UPDATES else LENGTHS.get(command, 0)
+        if command != 0x06 and len(payload) != want:
+            return FEW_PARAMS if len(payload) < want else FORMAT if want else NO_PARAM
+        return self._update(command, payload) if command in UPDATES else _ACTIONS[command](self, payload)
 
     def _update(self, command: int, payload: bytes) -> Answer:
-        return self._value(command) if self._updates.order(command, payload, self._now) else facts.RANGE
+        """Begin or end what flags u8 and period u16 (ms) ask for."""
+        flags, period_s = payload[0], (payload[1] | payload[2] << 8) / 1000
+        self._updates.pop(command, None)
+        if flags > 1 or (flags and not period_s):
+            return RANGE
+        if flags:
+            self._updates[command] = period_s, self._now + period_s
+        return self._value(command)
 
     def _value(self, command: int) -> bytes:
         if command == 0x40:
             return struct.pack("<I", sum(1 << bit for bit in self._flags()))
         if command == 0x41:
             return bytes([self.grasping])
-        force = self.force_limit_n if self.grasping == facts.HOLDING else 0.0
-        value = {0x43: self._jaws.opening_mm, 0x44: self._jaws.speed_mm_s, 0x45: force}[command]
-        return struct.pack("<f", value)
+        force = self.force_limit_n if self.grasping == HOLDING else 0.0
+        return struct.pack("<f", self._jaws.opening_mm if command == 0x43 else force)
 
     def _flags(self) -> set[int]:
         now = {
-            facts.MOVING_BIT: self._jaws.moves,
-            facts.MINUS_BIT: self._jaws.blocked < 0,
-            facts.PLUS_BIT: self._jaws.blocked > 0,
+            MOVING_BIT: self._jaws.moves,
+            MINUS_BIT: self._jaws.blocked < 0,
+            PLUS_BIT: self._jaws.blocked > 0,
         }
         return self._bits | {bit for bit, on in now.items() if on}
 
     def _begin(self, command: int, state: int, to_mm: float, speed: float, ended: Callable[[], int | None]) -> int:
-        self._bits -= {facts.STOPPED_BIT, facts.REACHED_BIT, facts.FORCE_BIT}
+        self._bits -= {STOPPED_BIT, REACHED_BIT, FORCE_BIT}
         self.grasping, self._running = state, (command, ended)
         self._jaws.go(to_mm, speed)
-        return facts.PENDING
+        return PENDING
 
     def _refusal(self, states: Sequence[int], width: float, speed: float) -> int | None:
         """Why a motion cannot be begun now."""
-        if facts.FAST_STOP_BIT in self._bits:
-            return facts.DENIED
+        if FAST_STOP_BIT in self._bits:
+            return DENIED
         if self._running:
-            return facts.RUNNING
-        if facts.REFERENCED_BIT not in self._bits:
-            return facts.NOT_INITIALIZED
+            return RUNNING
+        if REFERENCED_BIT not in self._bits:
+            return NOT_INITIALIZED
         if self.grasping not in states:
-            return facts.DENIED
+            return DENIED
         low, high = self.soft_limits or (0.0, STROKE_MM)
-        return None if low <= width <= high and facts.SPEEDS[0] <= speed <= facts.SPEEDS[1] else facts.RANGE
+        return None if low <= width <= high and SPEEDS[0] <= speed <= SPEEDS[1] else RANGE
 
     def _home(self, payload: bytes) -> Answer:
         if payload[0] > 2:
-            return facts.INVALID
-        if facts.FAST_STOP_BIT in self._bits or self._running:
-            return facts.DENIED if facts.FAST_STOP_BIT in self._bits else facts.RUNNING
-        self._bits.discard(facts.REFERENCED_BIT)
+            return INVALID
+        if FAST_STOP_BIT in self._bits or self._running:
+            return DENIED if FAST_STOP_BIT in self._bits else RUNNING
+        self._bits.discard(REFERENCED_BIT)
 
         def ended() -> int | None:
             if self._jaws.moves:
                 return None
-            self.grasping = facts.IDLE
+            self.grasping = IDLE
             if self._jaws.blocked:
-                return facts.BLOCKED
-            self._bits |= {facts.REFERENCED_BIT, facts.REACHED_BIT}
-            return facts.OK
+                return BLOCKED
+            self._bits |= {REFERENCED_BIT, REACHED_BIT}
+            return OK
 
-        return self._begin(0x20, facts.POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
+        return self._begin(0x20, POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
 
     def _move(self, payload: bytes) -> Answer:
         flags, width, speed = struct.unpack("<Bff", payload)
         width += self._jaws.opening_mm if flags & 1 else 0.0
-        if (refused := self._refusal((facts.IDLE,), width, speed)) is not None:
+        if (refused := self._refusal((IDLE,), width, speed)) is not None:
             return refused
-        return self._begin(0x21, facts.POSITIONING, width, speed, self._arrived)
+        return self._begin(0x21, POSITIONING, width, speed, self._arrived)
 
     def _arrived(self) -> int | None:
         if self._jaws.moves:
             return None
-        self.grasping = facts.IDLE
+        self.grasping = IDLE
         if self._jaws.blocked:
-            return facts.BLOCKED
-        self._bits.add(facts.REACHED_BIT)
-        return facts.OK
+            return BLOCKED
+        self._bits.add(REACHED_BIT)
+        return OK
 
     def _release(self, payload: bytes) -> Answer:
         width, speed = struct.unpack("<ff", payload)
-        if (refused := self._refusal((facts.NO_PART, facts.PART_LOST, facts.HOLDING), width, speed)) is not None:
+        if (refused := self._refusal((NO_PART, PART_LOST, HOLDING), width, speed)) is not None:
             return refused
-        return self._begin(0x26, facts.RELEASING, width, speed, self._arrived)
+        return self._begin(0x26, RELEASING, width, speed, self._arrived)
 
     def _grasp(self, payload: bytes) -> Answer:
         width, speed = struct.unpack("<ff", payload)
-        if (refused := self._refusal((facts.IDLE,), width, speed)) is not None:
+        if (refused := self._refusal((IDLE,), width, speed)) is not None:
             return refused
-        self._counts[0] += 1
-        return self._begin(0x25, facts.GRASPING, max(0.0, width - _CLAMPING_MM), speed, self._grasped)
+        return self._begin(0x25, GRASPING, max(0.0, width - _CLAMPING_MM), speed, self._grasped)
 
     def _grasped(self) -> int | None:
         if self._jaws.moves:
             return None
         if self._jaws.blocked < 0:
-            self.grasping = facts.HOLDING
-            self._bits.add(facts.FORCE_BIT)
-            return facts.OK
-        self.grasping = facts.NO_PART
-        self._counts[1] += 1
-        return facts.FAILED
+            self.grasping = HOLDING
+            self._bits.add(FORCE_BIT)
+            return OK
+        self.grasping = NO_PART
+        return FAILED
 
     def _stop(self, _: bytes) -> Answer:
         self._stand()
-        self._bits.add(facts.STOPPED_BIT)
-        self.grasping = self.grasping if self.grasping == facts.ERROR else facts.IDLE
-        return facts.OK
+        self._bits.add(STOPPED_BIT)
+        self.grasping = self.grasping if self.grasping == ERROR else IDLE
+        return OK
 
     def _fast_stop(self, _: bytes) -> Answer:
         self.fail()
-        return facts.OK
+        return OK
 
     def _acknowledge(self, payload: bytes) -> Answer:
         if payload != b"\x61\x63\x6b":
-            return facts.INVALID
-        if facts.FAST_STOP_BIT not in self._bits:
-            return facts.DENIED
-        self._bits -= {facts.FAST_STOP_BIT, *facts.FAULT_BITS.values()}
-        self.grasping = facts.IDLE
-        return facts.OK
+            return INVALID
+        if FAST_STOP_BIT not in self._bits:
+            return DENIED
+        self._bits -= {FAST_STOP_BIT, *FAULT_BITS.values()}
+        self.grasping = IDLE
+        return OK
 
     def _announce(self, _: bytes) -> Answer:
         self._announced = True
-        return facts.OK
+        return OK
 
     def _set_acceleration(self, payload: bytes) -> Answer:
         (value,) = struct.unpack("<f", payload)
-        if refused := self._unsettable(facts.ACCELERATIONS[0] <= value <= facts.ACCELERATIONS[1]):
+        if refused := self._unsettable(ACCELERATIONS[0] <= value <= ACCELERATIONS[1]):
             return refused
         self._jaws.acceleration_mm_s2 = value
-        return facts.OK
+        return OK
 
     def _set_force(self, payload: bytes) -> Answer:
         (value,) = struct.unpack("<f", payload)
-        if refused := self._unsettable(facts.FORCES[0] <= value <= facts.FORCES[1]):
+        if refused := self._unsettable(FORCES[0] <= value <= FORCES[1]):
             return refused
         self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
-        return facts.OK
+        return OK
 
     def _set_soft_limits(self, payload: bytes) -> Answer:
         low, high = struct.unpack("<ff", payload)
         if refused := self._unsettable(0 <= low < high <= STROKE_MM):
             return refused
         self.soft_limits = low, high
-        return facts.OK
-
-    def _clear_soft_limits(self, _: bytes) -> Answer:
-        self.soft_limits = None
-        return facts.OK
+        return OK
 
     def _unsettable(self, in_range: bool) -> int:
         """Changing parameters while it moves raises a FAST STOP."""
         if self._jaws.moves:
             self.fail()
-            return facts.DENIED
-        return facts.OK if in_range else facts.RANGE
+            return DENIED
+        return OK if in_range else RANGE
 
     def _tare(self, _: bytes) -> Answer:
         if not self.has_force_fingers:
-            return facts.NOT_AVAILABLE
-        return facts.DENIED if self.grasping == facts.HOLDING else facts.OK
-
-    def _statistics(self, payload: bytes) -> Answer:
-        grasps, *others = self._counts
-        counts = struct.pack("<IHH", grasps, *(min(count, 0xFFFF) for count in others))
-        if payload[0]:
-            self._counts = [0, 0, 0]
-        return counts
-
-    def _set_tag(self, payload: bytes) -> Answer:
-        self._tag = payload
-        return facts.OK
-
-    def _get_soft_limits(self, _: bytes) -> Answer:
-        return facts.NOT_AVAILABLE if self.soft_limits is None else struct.pack("<ff", *self.soft_limits)
+            return NOT_AVAILABLE
+        return DENIED if self.grasping == HOLDING else OK
 
 
 def _status(number: int) -> bytes:
@@ -385,16 +388,8 @@ _ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x32: EmulatedWSG50._set_force,
     0x33: lambda own, _: struct.pack("<f", own.force_limit_n),
     0x34: EmulatedWSG50._set_soft_limits,
-    0x35: EmulatedWSG50._get_soft_limits,
-    0x36: EmulatedWSG50._clear_soft_limits,
-    0x37: lambda _, payload: facts.OK if payload[0] < 2 else facts.INVALID,
+    0x35: lambda own, _: struct.pack("<ff", *own.soft_limits) if own.soft_limits else NOT_AVAILABLE,
     0x38: EmulatedWSG50._tare,
-    0x42: EmulatedWSG50._statistics,
-    0x46: lambda _, payload: struct.pack("<h", 253),
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
-    0x51: EmulatedWSG50._set_tag,
-    0x52: lambda own, _: own._tag,
-    0x53: lambda _, payload: struct.pack(
-        "<8f", STROKE_MM, *facts.SPEEDS, *facts.ACCELERATIONS, *facts.FORCES, facts.OVERDRIVE_N
-    ),
+    0x53: lambda _, payload: struct.pack("<8f", STROKE_MM, *SPEEDS, *ACCELERATIONS, *FORCES, 120.0),
 }

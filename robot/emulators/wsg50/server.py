@@ -25,12 +25,9 @@ from pathlib import Path
 from typing import Protocol
 
 from robot.drivers.wsg50.codec import PREAMBLE, Packet, decode, encode
-from robot.emulators.wsg50.faults import Faults
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.numbers import UPDATES
-from robot.interrupts import until_interrupted
-
-__all__ = ["EmulatedWSG50", "Faults", "main", "serve_pty", "serve_tcp"]
+from robot.emulators.interrupts import until_interrupted
+from robot.emulators.wsg50.faults import LineFaults
+from robot.emulators.wsg50.gripper import UPDATES, EmulatedWSG50
 
 _log = logging.getLogger(__name__)
 _TICK_S = 0.001
@@ -51,7 +48,7 @@ class _Line(Protocol):
 
 
 @contextlib.contextmanager
-def serve_tcp(emulator: EmulatedWSG50, faults: Faults | None = None, *, port: int = 0) -> Iterator[str]:
+def serve_tcp(emulator: EmulatedWSG50, faults: LineFaults | None = None, *, port: int = 0) -> Iterator[str]:
     """Serve one client at a time on 127.0.0.1; gives the URL for the driver. port 0: any free one."""
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(0.02)
@@ -64,12 +61,12 @@ def serve_tcp(emulator: EmulatedWSG50, faults: Faults | None = None, *, port: in
                     emulator.tick()
             return None
 
-        with _thread(lambda stop: _serve(emulator, faults or Faults(), wait_for_client, stop)):
+        with _thread(lambda stop: _serve(emulator, faults or LineFaults(), wait_for_client, stop)):
             yield f"socket://127.0.0.1:{server.getsockname()[1]}"
 
 
 @contextlib.contextmanager
-def serve_pty(emulator: EmulatedWSG50, faults: Faults | None = None) -> Iterator[str]:
+def serve_pty(emulator: EmulatedWSG50, faults: LineFaults | None = None) -> Iterator[str]:
     """Serve a pseudo-terminal; gives a path that stays the same when the line was cut. A serial line that is cut or
     closed raises no FAST STOP: the gripper does not notice."""
     with tempfile.TemporaryDirectory() as folder:
@@ -79,7 +76,7 @@ def serve_pty(emulator: EmulatedWSG50, faults: Faults | None = None) -> Iterator
         def wait_for_client(stop: threading.Event) -> _Line | None:
             return None if stop.is_set() else first.pop() if first else _Terminal(path)
 
-        with _thread(lambda stop: _serve(emulator, faults or Faults(), wait_for_client, stop)):
+        with _thread(lambda stop: _serve(emulator, faults or LineFaults(), wait_for_client, stop)):
             yield str(path)
 
 
@@ -144,7 +141,7 @@ def _thread(work: Callable[[threading.Event], None]) -> Iterator[None]:
 
 def _serve(
     emulator: EmulatedWSG50,
-    faults: Faults,
+    faults: LineFaults,
     wait_for_client: Callable[[threading.Event], _Line | None],
     stop: threading.Event,
 ) -> None:
@@ -165,7 +162,7 @@ def _serve(
 class _Session:
     """One client's time with the gripper."""
 
-    def __init__(self, emulator: EmulatedWSG50, faults: Faults, line: _Line) -> None:
+    def __init__(self, emulator: EmulatedWSG50, faults: LineFaults, line: _Line) -> None:
         self.emulator, self.faults, self.line = emulator, faults, line
         self._arrived, self._heard = bytearray(), bytearray()
 
@@ -176,7 +173,7 @@ class _Session:
                 self._hear()
             for packet in self.emulator.tick():
                 if packet.id in UPDATES:  # faults are for commands and what answers them
-                    self._write(packet)
+                    self.line.write(encode(packet))
                 else:
                     self._say(packet)
 
@@ -208,9 +205,6 @@ class _Session:
                 raise _Cut
             self.line.write(piece.data)
 
-    def _write(self, packet: Packet) -> None:
-        self.line.write(encode(packet))
-
 
 def _packets(buffer: bytearray) -> Iterator[tuple[bytes, Packet | None]]:
     """Take the whole packets out of a buffer, each with the noise before it; at last the noise behind them."""
@@ -241,7 +235,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     emulator = EmulatedWSG50(object_mm=options.object_mm, speed_up=options.speed_up)
-    faults = Faults(options.faults, seed=options.seed)
+    faults = LineFaults(options.faults, seed=options.seed)
     serving = serve_pty(emulator, faults) if options.pty else serve_tcp(emulator, faults, port=options.tcp)
     try:
         with until_interrupted(), serving as address:
