@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Box, Frame, GripperState, Pose
+from robot.settings import TypedSettings
 
 MAX_AGE_S = 0.5
 _CLOCK_SLACK_S = 0.05
@@ -32,7 +33,12 @@ Clock = Callable[[], float]
 
 
 class Device(ABC):
-    """Something that is connected, used and closed. `clock` counts seconds, the same for all devices of a rig."""
+    """Something that is connected, used and closed. `clock` counts seconds, the same for all devices of a rig.
+
+    Settings: the dataclass of a driver's settings, whose fields are keywords of the driver beside those it names.
+    """
+
+    Settings: ClassVar[type[TypedSettings] | None] = None
 
     def __init__(self, name: str, *, clock: Clock = time.monotonic) -> None:
         self.name, self.clock = name, clock

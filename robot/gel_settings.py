@@ -10,24 +10,18 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from robot.errors import RobotConfigError
-from robot.settings import build, check_range
+from robot.settings import TypedSettings, build, limited
 
 UNKNOWN = "unknown"
-_RANGES = {"thickness_mm": (0.01, 100.0), "modulus_mpa": (1e-4, 1e3), "poisson": (0.0, 0.5)}
 
 
 @dataclass(frozen=True)
-class GelSettings:
+class GelSettings(TypedSettings):
     """One finger's gel: thickness, Young's modulus, Poisson's ratio; None: not known, and drawn where simulated."""
 
-    thickness_mm: float | None = None
-    modulus_mpa: float | None = None
-    poisson: float | None = None
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError for what no gel is."""
-        for name, value in self.known().items():
-            check_range(f"a gel's {name}", value, *_RANGES[name])
+    thickness_mm: float | None = limited(0.01, 100.0, None)
+    modulus_mpa: float | None = limited(1e-4, 1e3, None)
+    poisson: float | None = limited(0.0, 0.5, None)
 
     def known(self) -> dict[str, float]:
         """What was said, by name."""
@@ -35,7 +29,7 @@ class GelSettings:
 
     def said(self) -> dict[str, float | str]:
         """As in recording.json, where what is not known is "unknown"."""
-        return {**dict.fromkeys(_RANGES, UNKNOWN), **self.known()}
+        return {**dict.fromkeys(asdict(self), UNKNOWN), **self.known()}
 
 
 def gels_of(tables: Mapping[str, Any], fingers: Iterable[str]) -> dict[str, GelSettings]:

@@ -42,7 +42,7 @@ Paths are those of the process that reads the file. Unknown keys are refused eve
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -50,14 +50,14 @@ from typing import Any
 
 import numpy as np
 
-from robot.devices import Arm, Camera, Device, Gripper, TactileSensor
+from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
 from robot.grasping.plan import GraspSettings
 from robot.grasping.settings import AttemptSettings, attempt_of
 from robot.readings import Box
 from robot.rig import Rig, ask_on_terminal
-from robot.settings import build, check_type
+from robot.settings import TypedSettings, build, check_type, limited
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
@@ -90,54 +90,31 @@ DRIVERS: Mapping[str, Mapping[str, str]] = {
 HAND_EYE_DAYS = 30.0
 """A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
 
-
 LEAST_WAIT_S = 0.1
 """Between a motion and the picture of what came of it: three frames of a gel at 30 a second."""
 
 
 @dataclass(frozen=True)
-class Limits:
+class Limits(TypedSettings):
     """Ceilings: workspace (mm), speeds (mm/s), force on each finger (N), age of the state of what moves (s)."""
 
-    workspace_lower_mm: Sequence[float]
-    workspace_upper_mm: Sequence[float]
-    arm_speed_mm_s: float = 200.0
-    force_n: float = 25.0
-    jaw_speed_mm_s: float = 80.0
-    state_age_s: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError for a limit that is not above 0."""
-        for name in ("arm_speed_mm_s", "force_n", "jaw_speed_mm_s", "state_age_s"):
-            value = getattr(self, name)
-            if not 0 < value < float("inf"):
-                raise RobotConfigError(f"[limits]: {name} must be above 0, got {value}")
-
-    @property
-    def workspace(self) -> Box:
-        """Raises RobotConfigError unless lower < upper in x, y and z."""
-        lower, upper = map(tuple, (self.workspace_lower_mm, self.workspace_upper_mm))
-        if len(lower) != 3 or len(upper) != 3:
-            raise RobotConfigError(f"[limits]: the workspace must be x, y and z in mm, got {lower} and {upper}")
-        return Box(lower, upper)
+    workspace_lower_mm: tuple[float, float, float]
+    workspace_upper_mm: tuple[float, float, float]
+    arm_speed_mm_s: float = limited(1e-3, 1e6, 200.0)
+    force_n: float = limited(1e-3, 1e6, 25.0)
+    jaw_speed_mm_s: float = limited(1e-3, 1e6, 80.0)
+    state_age_s: float = limited(1e-3, 1e6, 0.5)
 
 
 @dataclass(frozen=True)
-class GivenObject:
+class GivenObject(TypedSettings):
     """Where every object is put and how large it is (mm), for a rig that cannot see it; error_mm: of the place."""
 
     x_mm: float
     y_mm: float
-    height_mm: float
-    radius_mm: float
-    error_mm: float = 5.0
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError for sizes that are not above 0."""
-        if not (self.height_mm > 0 and self.radius_mm > 0 and self.error_mm >= 0):
-            raise RobotConfigError(
-                f"[object]: height_mm and radius_mm must be above 0, error_mm at least 0, got {self}"
-            )
+    height_mm: float = limited(1e-3, 1e6)
+    radius_mm: float = limited(1e-3, 1e6)
+    error_mm: float = limited(0, 1e6, 5.0)
 
     def fit(self) -> CylinderFit:
         """As what a camera would have found."""
@@ -167,10 +144,17 @@ class RealRig(Rig):
     ) -> None:
         """Raises RobotConfigError, UnknownName for a driver; connects nothing."""
         ceilings = build(Limits, limits, where="[limits]")
+        state_age = {"max_state_age_s": ceilings.state_age_s}
+        moving: dict[str, Any] = {
+            "workspace": Box(ceilings.workspace_lower_mm, ceilings.workspace_upper_mm),
+            "max_speed_mm_s": ceilings.arm_speed_mm_s,
+            "ask": ask_on_terminal,
+        }
+        closing = {"max_force_n": ceilings.force_n, "max_speed_mm_s": ceilings.jaw_speed_mm_s}
         gels = gels_of(gel, sensors)
         super().__init__(
-            _arm(arm, ceilings, ask_on_terminal),
-            _gripper(gripper, ceilings),
+            load_driver("arm", arm, "[arm]", **moving, **state_age),
+            load_driver("gripper", gripper, "[gripper]", **closing, **state_age),
             _sensors(sensors),
             _camera(camera),
             info={"source": source, "sensor": sensor, "gels": [{finger: gels[finger].said() for finger in gels}]},
@@ -198,18 +182,6 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -
     module, class_name = known[name].split(":")
     driver: type[Device] = getattr(import_module(module), class_name)
     return build(driver, settings, where=where, clock=time.monotonic, **given)
-
-
-def _arm(table: Mapping[str, Any], limits: Limits, ask: Callable[[str], object]) -> Arm:
-    given = {"workspace": limits.workspace, "max_speed_mm_s": limits.arm_speed_mm_s, "ask": ask}
-    arm: Arm = load_driver("arm", table, "[arm]", max_state_age_s=limits.state_age_s, **given)
-    return arm
-
-
-def _gripper(table: Mapping[str, Any], limits: Limits) -> Gripper:
-    given = {"max_force_n": limits.force_n, "max_speed_mm_s": limits.jaw_speed_mm_s}
-    gripper: Gripper = load_driver("gripper", table, "[gripper]", max_state_age_s=limits.state_age_s, **given)
-    return gripper
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
@@ -247,11 +219,6 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
         "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
     }
     settings = attempt_of({**capped, **attempt}, {"force_n": force_n, **grasp})
-    _check_ceilings(settings, limits)
-    return settings
-
-
-def _check_ceilings(settings: AttemptSettings, limits: Limits) -> None:
     asked = {
         "[grasp]: force_n": (settings.grasp.force_n[1], limits.force_n, "force_n"),
         "[attempt]: travel_mm_s": (settings.travel_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
@@ -266,3 +233,4 @@ def _check_ceilings(settings: AttemptSettings, limits: Limits) -> None:
             raise RobotConfigError(
                 f"[attempt]: {name} must be at least {LEAST_WAIT_S:g} s, for gels to see what is then"
             )
+    return settings

@@ -1,6 +1,6 @@
 """Plain settings, as TOML gives them, to the keywords of a class: checked by name, annotated type and range.
 
-Settings of one thing stand once, as a frozen dataclass of `Settings`; a number's range stands beside its default.
+Settings of one thing stand once, as a frozen dataclass of `TypedSettings`; a number's range stands beside its default.
 """
 
 import inspect
@@ -23,12 +23,12 @@ _PLAIN: Mapping[Any, tuple[type | tuple[type, ...], str]] = {
 
 
 def limited(least: float, most: float, default: Any = MISSING, *, unit: str = "") -> Any:
-    """A field of `Settings` that must be from `least` to `most`; without a default it must be said."""
+    """A field of `TypedSettings` that must be from `least` to `most`; without a default it must be said."""
     return field(default=default, metadata={"range": (least, most, unit)})
 
 
 @dataclass(frozen=True)
-class Settings:
+class TypedSettings:
     """Base of dataclasses of settings: each is of its annotated type, a list becomes a tuple, numbers are in range."""
 
     def __post_init__(self) -> None:
@@ -68,9 +68,10 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     """The keywords that a class takes: annotated type, and whether it must be said."""
     found: dict[str, tuple[Any, bool]] = {}
-    for each in (getattr(cls, "Settings", None), cls):
+    settings: type | None = getattr(cls, "Settings", None)
+    for each in (settings, cls):
         if each is not None:
-            hints = typing.get_type_hints(each.__init__)
+            hints = typing.get_type_hints(each.__init__)  # type: ignore[misc]
             for name, parameter in inspect.signature(each).parameters.items():
                 if parameter.kind is not parameter.VAR_KEYWORD:
                     found[name] = hints.get(name), parameter.default is parameter.empty

@@ -15,7 +15,7 @@ from robot.readings import Frame
 from tests.fake_video import own_threads
 from tests.waiting import until
 
-SETTINGS = ReaderSettings(warmup_s=0.0, timeout_s=5.0, frozen_s=2.0, backoff_s=(1e-3, 4e-3))
+SETTINGS = ReaderSettings(warmup_s=0.0, timeout_s=5.0, frozen_s=2.0)
 ENOUGH_S = 10.0
 
 
@@ -60,8 +60,8 @@ def make(script):
     """Readers of the script, closed at the end of the test; no thread may be left."""
     made = []
 
-    def reader(settings=SETTINGS, script=script):
-        made.append((script, FrameReader("eye", script.open, settings, clock=lambda: 0.0)))
+    def reader(settings=SETTINGS, script=script, backoff_s=(1e-3, 4e-3)):
+        made.append((script, FrameReader("eye", script.open, settings, clock=lambda: 0.0, backoff_s=backoff_s)))
         return made[-1][1]
 
     yield reader
@@ -130,7 +130,7 @@ def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_pictures_a
 
 def test_what_is_wrong_with_a_lost_stream_is_said_to_whoever_asks(script, make):
     script.show(1.0)
-    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02, backoff_s=(ENOUGH_S, ENOUGH_S)))
+    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02), backoff_s=(ENOUGH_S, ENOUGH_S))
     reader.start()
     script.items.put(DeviceError("it gives no more pictures"))
     until(lambda: reader.lost)
@@ -158,7 +158,7 @@ def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_a_picture_ma
 
 def test_a_lost_stream_is_opened_at_once_when_somebody_is_in_a_hurry(script, make):
     script.show(1.0)
-    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=5.0, backoff_s=(100.0, 100.0)))
+    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=5.0), backoff_s=(100.0, 100.0))
     reader.start()
     script.items.put(DeviceError("gone"))
     until(lambda: reader.lost)
@@ -199,7 +199,7 @@ def test_a_stream_that_stands_still_gives_nothing_fresh_long_before_it_counts_as
 
 
 def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
-    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.05, frozen_s=2.0, backoff_s=(ENOUGH_S, ENOUGH_S)))
+    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.05, frozen_s=2.0), backoff_s=(ENOUGH_S, ENOUGH_S))
     script.show(0.0, 1.0, 2.0, picture=7)
     reader.start()
     seen(reader, 3)
@@ -249,7 +249,7 @@ def test_closing_ends_the_thread_and_lets_go_of_the_camera_also_twice_and_before
 
 def test_closing_ends_a_thread_that_waits_to_open_its_camera_again(script, make):
     script.show(1.0)
-    reader = make(ReaderSettings(warmup_s=0.0, backoff_s=(100.0, 100.0)))
+    reader = make(ReaderSettings(warmup_s=0.0), backoff_s=(100.0, 100.0))
     reader.start()
     script.items.put(DeviceError("gone"))
     until(lambda: reader.lost)

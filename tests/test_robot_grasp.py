@@ -10,6 +10,7 @@ import pytest
 from robot.errors import PlanError, RobotConfigError
 from robot.grasping.plan import GraspSettings, plan_grasp
 from robot.readings import Box
+from robot.settings import build
 from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
 
@@ -140,16 +141,16 @@ def test_a_setting_out_of_range_is_refused(name, value):
 
 
 def test_settings_come_from_plain_values():
-    assert GraspSettings.from_dict({"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
+    assert build(GraspSettings, {"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
     with pytest.raises(RobotConfigError, match="no setting 'jitter'; it knows clearance_mm, finger_mm"):
-        GraspSettings.from_dict({"jitter": 3})
+        build(GraspSettings, {"jitter": 3})
     for wrong, said in (
-        ({"force_n": [1, 2, 3]}, "force_n must be a range of forces above 0"),
-        ({"force_n": ["a", "b"]}, "force_n must be a list, each of them a number"),
+        ({"force_n": [1, 2, 3]}, "force_n must be a list of 2"),
+        ({"force_n": ["a", "b"]}, "force_n must be a list of 2, each of them a number"),
         ({"lift_mm": "high"}, "lift_mm must be a number"),
     ):
         with pytest.raises(RobotConfigError, match=said):
-            GraspSettings.from_dict(wrong)
+            build(GraspSettings, wrong)
 
 
 def test_forces_that_the_gripper_cannot_give_are_refused_before_anything_moves():

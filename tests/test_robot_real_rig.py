@@ -131,9 +131,12 @@ BAD = {
     ),
     "a flat workspace": (
         {"limits": "workspace_lower_mm = [0, 0]\nworkspace_upper_mm = [1, 1]"},
-        r"\[limits\]: the workspace must be x, y and z",
+        r"\[limits\]: workspace_lower_mm must be a list of 3",
     ),
-    "a limit of nothing": ({"limits": TABLES["limits"] + "\nstate_age_s = 0"}, "state_age_s must be above 0"),
+    "a limit of nothing": (
+        {"limits": TABLES["limits"] + "\nstate_age_s = 0"},
+        r"\[limits\]: state_age_s must be",
+    ),
     "a force above the ceiling": ({"grasp": "force_n = [5, 16]"}, r"\[grasp\]: force_n must be at most force_n = 15"),
     "a speed above the ceiling": (
         {"attempt": "travel_mm_s = 91"},
@@ -148,10 +151,16 @@ BAD = {
     "a speed without end": ({"attempt": "travel_mm_s = inf"}, r"\[attempt\]: travel_mm_s must be a finite number"),
     "a place that is none": ({"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"}, "x_mm must be a finite"),
     "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"of the fingers that feel, in \[gel\.a\]; got 'b'"),
-    "a gel of no thickness": ({"gel.a": "thickness_mm = 0"}, "a gel's thickness_mm must be from 0.01 to 100, got 0"),
+    "a gel of no thickness": (
+        {"gel.a": "thickness_mm = 0"},
+        r"\[gel\.a\]: thickness_mm must be from 0.01 to",
+    ),
     "an unknown word of a gel": ({"gel.a": "stiffness = 4"}, r"\[gel\.a\] has no setting 'stiffness'"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
-    "an object of no size": ({"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"}, "must be above 0"),
+    "an object of no size": (
+        {"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"},
+        r"\[object\]: height_mm must be from 0.001",
+    ),
 }
 
 

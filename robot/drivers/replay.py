@@ -14,14 +14,14 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, TactileSensor
-from robot.drivers.video.rectify import in_rgb, make_rectifier
+from robot.drivers.video.rectify import CutSettings, in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording.folder import INFO_FILE, parse_object, read_recording
@@ -33,8 +33,29 @@ LEAST_HZ = 10.0
 
 _FPS = (0.01, 1000.0)
 _MOST_PX = 1e6
-LEFT_OUT = math.nan
 INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmSettings(CutSettings):
+    """path: the film or folder. fps: pictures a second, 0 for the file's own. loop: again and again."""
+
+    path: str
+    fps: float = 0.0
+    loop: bool = True
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        super().__post_init__()
+        if self.fps != 0 and not _FPS[0] <= self.fps <= _FPS[1]:
+            raise RobotConfigError(f"fps must be from {_FPS[0]:g} to {_FPS[1]:g}, or 0 for the file's, got {self.fps}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderSettings(FilmSettings):
+    """A folder of pictures does not know their rate."""
+
+    fps: float = 30.0
 
 
 class _PacedSensor(TactileSensor):
@@ -43,27 +64,16 @@ class _PacedSensor(TactileSensor):
     `_repeats`: how often each is shown, at the `_rate_hz` that comes of it.
     """
 
-    def __init__(
-        self,
-        *,
-        finger: str,
-        path: str,
-        fps: float = 0.0,
-        loop: bool = True,
-        crop: Sequence[float] = (),
-        calibration: str = "",
-        output_px: Sequence[int] = (),
-        clock: Clock = time.monotonic,
-    ) -> None:
+    Settings: ClassVar[type[FilmSettings]] = FilmSettings
+
+    def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; opens nothing."""
         super().__init__(f"gel {finger}", finger, clock=clock)
-        if fps != 0 and not _FPS[0] <= fps <= _FPS[1]:
-            raise RobotConfigError(f"fps must be from {_FPS[0]:g} to {_FPS[1]:g}, or 0 for the file's, got {fps}")
-        self.path, self.fps, self.loop = Path(path), fps, loop
-        self._asked_fps = fps
-        self._rectifier = make_rectifier(calibration, crop, output_px)
+        asked = self._asked = self.Settings(**settings)
+        self.path, self.fps = Path(asked.path), asked.fps
+        self._rectifier = make_rectifier(asked)
         self._count, self._start_s = 0, 0.0
-        self._repeats, self._rate_hz = 1, fps
+        self._repeats, self._rate_hz = 1, asked.fps
         self._decoded: OrderedDict[int, npt.NDArray[np.uint8]] = OrderedDict()
 
     @abstractmethod
@@ -76,7 +86,7 @@ class _PacedSensor(TactileSensor):
 
     def _connect(self) -> None:
         self._count, rate = self._open()
-        self.fps = self._asked_fps or rate
+        self.fps = self._asked.fps or rate
         if self._count < 1 or not _FPS[0] <= self.fps <= _FPS[1]:
             raise DeviceError(
                 f"{self.path} must hold pictures and say how many a second, got {self._count}, {rate:g}; if only the "
@@ -91,7 +101,7 @@ class _PacedSensor(TactileSensor):
         self._decoded.clear()
 
     def _settings(self) -> dict[str, Any]:
-        return {"path": str(self.path), "pictures": self._count, "fps": self.fps, "loop": self.loop}
+        return {"path": str(self.path), "pictures": self._count, "fps": self.fps, "loop": self._asked.loop}
 
     def _read(self) -> Frame:
         return self._frame(self._now())
@@ -102,7 +112,7 @@ class _PacedSensor(TactileSensor):
     def _now(self) -> int:
         """How many pictures were shown before the one of now, repeated ones counted each time."""
         shown = math.floor((self.clock() - self._start_s) * self._rate_hz)
-        if shown >= self._count * self._repeats and not self.loop:
+        if shown >= self._count * self._repeats and not self._asked.loop:
             raise DeviceError(
                 f"{self.path} ended: its {self._count} pictures lasted {self._count / self.fps:.3g} s; "
                 "set loop = true to see it again and again"
@@ -121,7 +131,7 @@ class _PacedSensor(TactileSensor):
 
 
 class VideoSensor(_PacedSensor):
-    """A film file as a sensor. fps: 0 for the file's own."""
+    """A film file as a sensor; its keywords are those of FilmSettings."""
 
     _film: Any = None
     _next = 0
@@ -159,24 +169,10 @@ class VideoSensor(_PacedSensor):
 
 
 class ImagesSensor(_PacedSensor):
-    """The pictures of a folder as a sensor, in the order of their names."""
+    """The pictures of a folder as a sensor, in the order of their names; its keywords are those of FolderSettings."""
 
-    def __init__(
-        self,
-        *,
-        finger: str,
-        path: str,
-        fps: float = 30.0,
-        loop: bool = True,
-        crop: Sequence[float] = (),
-        calibration: str = "",
-        output_px: Sequence[int] = (),
-        clock: Clock = time.monotonic,
-    ) -> None:
-        """Raises RobotConfigError for a setting out of range; opens nothing."""
-        cutting: dict[str, Any] = {"crop": crop, "calibration": calibration, "output_px": output_px}
-        super().__init__(finger=finger, path=path, fps=fps, loop=loop, clock=clock, **cutting)
-        self._files: list[Path] = []
+    Settings = FolderSettings
+    _files: Sequence[Path] = ()
 
     def _open(self) -> tuple[int, float]:
         self._files = [each for each in sorted(self.path.iterdir()) if each.suffix.lower() in _SUFFIXES]
@@ -207,16 +203,22 @@ class ReplayCamera(Camera):
         *,
         path: str,
         extrinsics: npt.ArrayLike,
-        fx: float = LEFT_OUT,
-        fy: float = LEFT_OUT,
-        cx: float = LEFT_OUT,
-        cy: float = LEFT_OUT,
+        fx: float | None = None,
+        fy: float | None = None,
+        cx: float | None = None,
+        cy: float | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
         """Raises RobotConfigError for fx, fy, cx and cy that are not all given, or out of range; opens nothing."""
         super().__init__("replay camera", extrinsics, clock=clock)
         self.path = Path(path)
-        self._given = _given(fx, fy, cx, cy)
+        lens = [each for each in (fx, fy, cx, cy) if each is not None]
+        if lens and (len(lens) != 4 or not _is_lens(*lens)):
+            raise RobotConfigError(
+                "fx, fy, cx and cy must be given together, in pixels up to a million, fx and fy above 0, "
+                f"got {fx}, {fy}, {cx}, {cy}"
+            )
+        self._given = Intrinsics(*lens) if lens else None
         self._intrinsics: Intrinsics | None = None
         self._pairs: list[_Pair] = []
         self._next = 0
@@ -248,18 +250,6 @@ class ReplayCamera(Camera):
         depth_m = _depth_m(pair.depth) if depth and pair.depth is not None else None
         self._next += 1
         return RGBD(colour, depth_m, self._intrinsics, self.clock())
-
-
-def _given(*lens: float) -> Intrinsics | None:
-    """fx, fy, cx and cy of a rig's file; None where all are left out. Raises RobotConfigError."""
-    if all(map(math.isnan, lens)):
-        return None
-    if not _is_lens(*lens):
-        raise RobotConfigError(
-            "fx, fy, cx and cy must be given together, in pixels up to a million, fx and fy above 0, got "
-            + ", ".join(f"{each:g}" for each in lens)
-        )
-    return Intrinsics(*lens)
 
 
 def _is_lens(fx: float, fy: float, cx: float, cy: float) -> bool:

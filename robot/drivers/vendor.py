@@ -4,14 +4,14 @@ import contextlib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 from robot.drivers.video.frames import MOST_S
 from robot.errors import DeviceError
-from robot.settings import check_range
+from robot.settings import TypedSettings, limited
 
-_MOST_WARMUP = 1000
 _LIBRARY = re.compile(r"(lib[^\s:/]+\.(?:so|dylib)[.\d]*)")
 """As the loaders of Linux and macOS name what they do not find."""
 
@@ -42,10 +42,13 @@ def missing_library(package: str, error: ImportError) -> str | None:
     return f"{library}, a library of the system that {package} cannot find; {cure}"
 
 
-def check_waits(warmup_frames: int, timeout_s: float) -> None:
-    """Raise RobotConfigError for waits that never end or that the system cannot make."""
-    check_range("warmup_frames", warmup_frames, 0, _MOST_WARMUP)
-    check_range("timeout_s", timeout_s, 1e-3, MOST_S, "s")
+@dataclass(frozen=True, kw_only=True)
+class MakerSettings(TypedSettings):
+    """serial: which camera, where several are connected. warmup_frames: dropped at first. timeout_s: of a picture."""
+
+    serial: str = ""
+    warmup_frames: int = limited(0, 1000, 5)
+    timeout_s: float = limited(1e-3, MOST_S, 3.0, unit="s")
 
 
 def finite(what: str, numbers: Iterable[float]) -> list[float]:

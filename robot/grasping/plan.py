@@ -7,21 +7,19 @@ on how another one fared.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
 
 import numpy as np
 
 from robot.devices import Arm, Gripper
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import Box, Pose
-from robot.settings import build
+from robot.settings import TypedSettings, limited
 from robot.sight.cylinder import CylinderFit
 
 
 @dataclass(frozen=True)
-class GraspSettings:
+class GraspSettings(TypedSettings):
     """How grasps are drawn. Lengths in mm, forces in N.
 
     force_n: range of the clamping force. jitter_mm: the pose strays so far from the axis in x and in y.
@@ -31,34 +29,19 @@ class GraspSettings:
     """
 
     force_n: tuple[float, float] = (5.0, 25.0)
-    jitter_mm: float = 1.0
-    floor_mm: float = 10.0
-    top_margin_mm: float = 15.0
-    reach_mm: float = 110.0
-    finger_mm: float = 25.0
-    clearance_mm: float = 5.0
-    lift_mm: float = 180.0
+    jitter_mm: float = limited(0, 1e6, 1.0)
+    floor_mm: float = limited(0, 1e6, 10.0)
+    top_margin_mm: float = limited(0, 1e6, 15.0)
+    reach_mm: float = limited(1, 1e6, 110.0)
+    finger_mm: float = limited(1, 1e6, 25.0)
+    clearance_mm: float = limited(0, 1e6, 5.0)
+    lift_mm: float = limited(1, 1e6, 180.0)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
-        if len(self.force_n) != 2 or not 0 < self.force_n[0] <= self.force_n[1] < math.inf:
+        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        super().__post_init__()
+        if not 0 < self.force_n[0] <= self.force_n[1]:
             raise RobotConfigError(f"force_n must be a range of forces above 0, lower first, got {self.force_n}")
-        for name in ("jitter_mm", "floor_mm", "top_margin_mm", "clearance_mm"):
-            self._require(name, 0.0)
-        for name in ("reach_mm", "finger_mm", "lift_mm"):
-            self._require(name, 1.0)
-
-    def _require(self, name: str, least: float) -> None:
-        value = getattr(self, name)
-        if not least <= value < math.inf:
-            raise RobotConfigError(f"{name} must be at least {least:g}, got {value}")
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any], where: str = "") -> Self:
-        """From plain values, as TOML gives them. Raises RobotConfigError, also for an unknown name."""
-        made = build(cls, settings, where=where)
-        low, high = made.force_n
-        return replace(made, force_n=(low, high))
 
     def check(self, arm: Arm, gripper: Gripper) -> None:
         """Raise RobotConfigError where this rig cannot do what is asked."""
@@ -96,7 +79,9 @@ def plan_grasp(
         )
     low = max(floor, fit.height_mm - settings.reach_mm)
     high = max(low, fit.height_mm - settings.top_margin_mm)
-    pose = _rounded(fit.x_mm + float(dx), fit.y_mm + float(dy), low + share * (high - low), yaw)
+    # To a micrometre and a microradian: the last bits of a fit may depend on how many threads computed it.
+    x, y, z = fit.x_mm + float(dx), fit.y_mm + float(dy), low + share * (high - low)
+    pose = Pose(round(x, 3), round(y, 3), round(z, 3), math.floor(yaw * 1e6) / 1e6)
     width = fit.width_mm(yaw, settings.finger_mm) + 2 * settings.clearance_mm
     if width > stroke_mm:
         raise PlanError(
@@ -104,11 +89,6 @@ def plan_grasp(
             f"{width:.0f} mm, and they open {stroke_mm:.0f} mm"
         )
     return GraspPlan(pose, _above(pose, fit, settings, workspace), stroke_mm, force)
-
-
-def _rounded(x: float, y: float, z: float, yaw: float) -> Pose:
-    """To a micrometre and a microradian: the last bits of a fit may depend on how many threads computed it."""
-    return Pose(round(x, 3), round(y, 3), round(z, 3), math.floor(yaw * 1e6) / 1e6)
 
 
 def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Box) -> Pose:

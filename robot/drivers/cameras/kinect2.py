@@ -9,6 +9,7 @@ newer comes before that; opening a serial number that is not there crashes the p
 import contextlib
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Clock
 from robot.drivers.discover import as_text
-from robot.drivers.vendor import check_waits, load, start_again, vendor_errors
+from robot.drivers.vendor import MakerSettings, load, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -32,28 +33,30 @@ PIPELINES = {
 _POLL_S = 0.002
 
 
-class Kinect2(Camera):
-    """A Kinect 2. serial: which one, where several are connected. pipeline: one of PIPELINES, or "auto", the first that
-    this build has. upside_down: it hangs from above; picture and intrinsics are turned by half a turn."""
+@dataclass(frozen=True, kw_only=True)
+class Kinect2Settings(MakerSettings):
+    """pipeline: one of PIPELINES, or "auto", the first that this build has. upside_down: it hangs from above; picture
+    and intrinsics are turned by half a turn."""
 
-    def __init__(
-        self,
-        *,
-        extrinsics: npt.ArrayLike,
-        serial: str = "",
-        pipeline: str = "auto",
-        upside_down: bool = False,
-        warmup_frames: int = 5,
-        timeout_s: float = 3.0,
-        clock: Clock = time.monotonic,
-    ) -> None:
+    pipeline: str = "auto"
+    upside_down: bool = False
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting out of range."""
+        super().__post_init__()
+        if self.pipeline not in ("auto", *PIPELINES):
+            raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {self.pipeline!r}")
+
+
+class Kinect2(Camera):
+    """A Kinect 2; its keywords are those of Kinect2Settings."""
+
+    Settings = Kinect2Settings
+
+    def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("kinect2", extrinsics, clock=clock)
-        if pipeline not in ("auto", *PIPELINES):
-            raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {pipeline!r}")
-        check_waits(warmup_frames, timeout_s)
-        self.serial, self.pipeline, self.upside_down = serial, pipeline, upside_down
-        self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
+        self._asked = Kinect2Settings(**settings)
         self._package: Any = None
         self._freenect: Any = None
         self._device: Any = None
@@ -63,7 +66,11 @@ class Kinect2(Camera):
         self._has: dict[str, Any] = {}
 
     def _connect(self) -> None:
-        package = self._package = _package()
+        install = (
+            "build libfreenect2 with shared libraries first (github.com/OpenKinect/libfreenect2), "
+            "then run pip install pylibfreenect2"
+        )
+        package = self._package = load("pylibfreenect2", "a Kinect 2", install)
         with vendor_errors("kinect2 cannot be started"):
             self._freenect = package.Freenect2()
             serial = self._choose()
@@ -74,34 +81,35 @@ class Kinect2(Camera):
             self._device.setIrAndDepthFrameListener(self._listener)
             self._device.start()
             self._learn(as_text(serial), name)
-            for _ in range(self.warmup_frames):
+            for _ in range(self._asked.warmup_frames):
                 self._discard()
 
     def _choose(self) -> str | bytes:
         """The serial number as the package gives it."""
         count = self._freenect.enumerateDevices()
         found = {as_text(each): each for each in map(self._freenect.getDeviceSerialNumber, range(count))}
-        if self.serial in found or (not self.serial and len(found) == 1):
-            chosen: str | bytes = found[self.serial or next(iter(found))]
+        asked = self._asked.serial
+        if asked in found or (not asked and len(found) == 1):
+            chosen: str | bytes = found[asked or next(iter(found))]
             return chosen
-        wanted = f"kinect2 {self.serial} must be" if self.serial else "one kinect2, or its serial number given, must be"
+        wanted = f"kinect2 {asked} must be" if asked else "one kinect2, or its serial number given, must be"
         raise DeviceError(f"{wanted} connected; connected: {', '.join(found) or 'none'}")
 
     def _make_pipeline(self) -> tuple[str, Any]:
         """The first of the wanted pipelines that this build has and this computer can run."""
         failures = []
-        for name in PIPELINES if self.pipeline == "auto" else (self.pipeline,):
+        for name in PIPELINES if self._asked.pipeline == "auto" else (self._asked.pipeline,):
             try:
                 return name, getattr(self._package, PIPELINES[name])()
             except Exception as error:
                 failures.append(f"{name}: {error}")
-        raise DeviceError(f"kinect2 must compute its depth with {self.pipeline}, but {'; '.join(failures)}")
+        raise DeviceError(f"kinect2 must compute its depth with {self._asked.pipeline}, but {'; '.join(failures)}")
 
     def _learn(self, serial: str, pipeline: str) -> None:
         infrared = self._device.getIrCameraParams()
         self._registration = self._package.Registration(infrared, self._device.getColorCameraParams())
         cx, cy = float(infrared.cx), float(infrared.cy)
-        if self.upside_down:
+        if self._asked.upside_down:
             cx, cy = WIDTH - 1 - cx, HEIGHT - 1 - cy
         self._intrinsics = Intrinsics(float(infrared.fx), float(infrared.fy), cx, cy)
         self._has = {"serial": serial, "pipeline": pipeline, "width": WIDTH, "height": HEIGHT}
@@ -127,11 +135,11 @@ class Kinect2(Camera):
         """A set of frames, released whatever happens. Waiting is ours: not every version of the package can give up."""
         if self._device is None:
             raise DeviceError("kinect2 was stopped by a failed recovery; call recover() again")
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + self._asked.timeout_s
         while not self._listener.hasNewFrame():
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"kinect2 must give a picture within {self.timeout_s:g} s, but did not; "
+                    f"kinect2 must give a picture within {self._asked.timeout_s:g} s, but did not; "
                     "it needs USB 3 and its own power"
                 )
             time.sleep(_POLL_S)
@@ -166,15 +174,7 @@ class Kinect2(Camera):
     def _in_metre(self, depth_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         known = np.isfinite(depth_mm) & (depth_mm > 0)
         depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
-        return np.ascontiguousarray(depth_m[::-1, ::-1] if self.upside_down else depth_m)
+        return np.ascontiguousarray(depth_m[::-1, ::-1] if self._asked.upside_down else depth_m)
 
     def _upright(self, colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        return np.ascontiguousarray(colour[::-1, ::-1] if self.upside_down else colour)
-
-
-def _package() -> Any:
-    build = (
-        "build libfreenect2 with shared libraries first (github.com/OpenKinect/libfreenect2), "
-        "then run pip install pylibfreenect2"
-    )
-    return load("pylibfreenect2", "a Kinect 2", build)
+        return np.ascontiguousarray(colour[::-1, ::-1] if self._asked.upside_down else colour)

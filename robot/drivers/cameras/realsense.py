@@ -7,6 +7,7 @@ its exposure.
 """
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -14,40 +15,35 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock
-from robot.drivers.vendor import check_waits, finite, load, start_again, vendor_errors
-from robot.errors import DeviceError, RobotConfigError
+from robot.drivers.vendor import MakerSettings, finite, load, start_again, vendor_errors
+from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
+from robot.settings import limited
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealSenseSettings(MakerSettings):
+    """width, height in pixels and fps of both streams."""
+
+    width: int = limited(1, 20_000, 640, unit="pixels")
+    height: int = limited(1, 20_000, 480, unit="pixels")
+    fps: int = limited(1, 1000, 30)
+    warmup_frames: int = limited(0, 1000, 30)
 
 
 class RealSense(Camera):
-    """A RealSense depth camera. serial: which one, where several are connected. warmup_frames: dropped at first.
+    """A RealSense depth camera; its keywords are those of RealSenseSettings.
 
     A picture with lens distortion is undistorted by the maker's own model (depth by the nearest pixel, so that none is
     made up at edges), and `settings` says so.
     """
 
-    def __init__(
-        self,
-        *,
-        extrinsics: npt.ArrayLike,
-        serial: str = "",
-        width: int = 640,
-        height: int = 480,
-        fps: int = 30,
-        warmup_frames: int = 30,
-        timeout_s: float = 3.0,
-        clock: Clock = time.monotonic,
-    ) -> None:
+    Settings = RealSenseSettings
+
+    def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("realsense", extrinsics, clock=clock)
-        if not (1 <= min(width, height) <= max(width, height) <= 20_000 and 1 <= fps <= 1000):
-            raise RobotConfigError(
-                "width and height must be from 1 to 20000 pixels and fps from 1 to 1000, "
-                f"got {width} x {height} at {fps}"
-            )
-        check_waits(warmup_frames, timeout_s)
-        self.serial, self.width, self.height, self.fps = serial, width, height, fps
-        self.warmup_frames, self.timeout_s = warmup_frames, timeout_s
+        self._asked = RealSenseSettings(**settings)
         self._pipeline: Any = None
         self._align: Any = None
         self._intrinsics: Intrinsics | None = None
@@ -56,7 +52,7 @@ class RealSense(Camera):
         self._has: dict[str, Any] = {}
 
     def _connect(self) -> None:
-        rs = _package()
+        rs = load("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")
         with vendor_errors("realsense cannot be started"):
             serial = self._choose(rs)
             pipeline = rs.pipeline()
@@ -64,23 +60,23 @@ class RealSense(Camera):
             self._pipeline = pipeline  # from here on `_close` stops it
             self._align = rs.align(rs.stream.color)
             self._learn(rs, profile, serial)
-            for _ in range(self.warmup_frames):
+            for _ in range(self._asked.warmup_frames):
                 self._wait()
 
     def _choose(self, rs: Any) -> str:
         found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
-        if self.serial in found or (not self.serial and len(found) == 1):
-            return self.serial or found[0]
+        if self._asked.serial in found or (not self._asked.serial and len(found) == 1):
+            return self._asked.serial or found[0]
         connected = ", ".join(found) or "none"
-        if self.serial:
-            raise DeviceError(f"realsense {self.serial} must be connected; connected: {connected}")
+        if self._asked.serial:
+            raise DeviceError(f"realsense {self._asked.serial} must be connected; connected: {connected}")
         raise DeviceError(f"one realsense must be connected, or its serial number given; connected: {connected}")
 
     def _config(self, rs: Any, serial: str) -> Any:
         config = rs.config()
         config.enable_device(serial)
-        config.enable_stream(rs.stream.depth, self.width, self.height, rs.format.z16, self.fps)
-        config.enable_stream(rs.stream.color, self.width, self.height, rs.format.rgb8, self.fps)
+        config.enable_stream(rs.stream.depth, self._asked.width, self._asked.height, rs.format.z16, self._asked.fps)
+        config.enable_stream(rs.stream.color, self._asked.width, self._asked.height, rs.format.rgb8, self._asked.fps)
         return config
 
     def _learn(self, rs: Any, profile: Any, serial: str) -> None:
@@ -115,11 +111,13 @@ class RealSense(Camera):
         start_again(self._close, self._connect)
 
     def _wait(self) -> Any:
-        return self._pipeline.wait_for_frames(round(1000 * self.timeout_s))
+        return self._pipeline.wait_for_frames(round(1000 * self._asked.timeout_s))
 
     def _read(self, depth: bool) -> RGBD:
         with vendor_errors("realsense gives no picture; is it plugged into USB 3?"):
-            self._running().poll_for_frames()  # what waits there was taken before it was asked for
+            if self._pipeline is None:
+                raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
+            self._pipeline.poll_for_frames()  # what waits there was taken before it was asked for
             frames = self._wait()
             time_s = self.clock()
             if depth:
@@ -130,11 +128,6 @@ class RealSense(Camera):
         if self._undistortion is not None:
             colour = np.asarray(cv2.remap(colour, self._undistortion, None, cv2.INTER_LINEAR), np.uint8)
         return RGBD(colour, depth_m, self._intrinsics, time_s)
-
-    def _running(self) -> Any:
-        if self._pipeline is None:
-            raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
-        return self._pipeline
 
     def _in_metre(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
         """Known depth times the scale, NaN where unknown."""
@@ -158,7 +151,3 @@ def _copied(frame: Any, what: str) -> npt.NDArray[Any]:
     if not frame:
         raise DeviceError(f"realsense must give {what} with each picture, but did not")
     return np.array(frame.get_data())
-
-
-def _package() -> Any:
-    return load("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")

@@ -1,106 +1,54 @@
 """Gel sensors that are USB cameras: GelSight, GelSight Mini, DIGIT, and any other.
 
-A new sensor is a row of PRESETS and a class of three lines. What a preset says, a rig's file may say otherwise.
+A new sensor is a class of a few lines here. What a PRESET says, a rig's file may say otherwise.
 Automatic exposure and white balance are switched off unless asked for: with them the same press looks different twice.
 """
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from robot.devices import Clock, TactileSensor
-from robot.drivers.video.frames import ReaderSettings
-from robot.drivers.video.opencv_stream import LEAVE, CaptureSettings, reader_maker
-from robot.drivers.video.rectify import in_rgb, make_rectifier
+from robot.drivers.video.opencv_stream import CaptureReader, CaptureSettings, UsbCameraSettings
+from robot.drivers.video.rectify import CutSettings, in_rgb, make_rectifier
 from robot.readings import Frame
 
 
-@dataclass(frozen=True)
-class Preset:
-    """What a kind of sensor is set to where the rig's file says nothing. quarter_turns: to the left."""
-
-    width: int = 0
-    height: int = 0
-    fps: float = 0.0
-    fourcc: str = ""
-    led: tuple[int, ...] = ()
-    quarter_turns: int = 0
-    crop: tuple[float, ...] = ()
-
-
-PRESETS: Mapping[str, Preset] = {
-    "uvc": Preset(),
-    # As the paper's authors ran usb_cam, with both automatics off.
-    "gelsight": Preset(1280, 960, 30.0, "MJPG"),
-    # The size that the maker's software asks for, and the border that it cuts off (0.15 of each side). The camera's own
-    # 3280 x 2464 pixels at 25 pictures a second keep a core busy.
-    "gelsight_mini": Preset(320, 240, 25.0, crop=(0.15, 0.15, 0.15, 0.15)),
-    # Its picture is transposed and turned over before people see it, which is a quarter turn to the left.
-    "digit": Preset(320, 240, 60.0, led=(15, 15, 15), quarter_turns=1),
-}
+@dataclass(frozen=True, kw_only=True)
+class GelCameraSettings(UsbCameraSettings, CutSettings):
+    """The camera behind a gel, and what is cut out of its pictures. keep: pictures kept to match the other finger's in
+    time."""
 
 
 class OpencvTactile(TactileSensor):
-    """The gel behind a USB camera, named by `device`, a path in /dev/v4l/by-id (or by-path: the socket).
+    """The gel behind a USB camera; its keywords are those of GelCameraSettings.
 
-    crop, calibration, output_px: see robot.drivers.video.rectify. keep: pictures kept to match the other finger's in
-    time. Other settings as in CaptureSettings and ReaderSettings. allow_index: let `device` be a number or /dev/video0.
+    PRESET: what a kind of sensor is set to where the rig's file says nothing. CROP: what is cut off then.
+    QUARTER_TURNS: of its picture, to the left.
     """
 
-    PRESET: ClassVar[str] = "uvc"
+    Settings = GelCameraSettings
+    PRESET: ClassVar[CaptureSettings] = CaptureSettings()
+    CROP: ClassVar[tuple[float, ...]] = ()
+    QUARTER_TURNS: ClassVar[int] = 0
 
-    def __init__(
-        self,
-        *,
-        finger: str,
-        device: str,
-        width: int = 0,
-        height: int = 0,
-        fps: float = 0.0,
-        fourcc: str = "",
-        auto_exposure: bool = False,
-        exposure_ms: float = LEAVE,
-        auto_white_balance: bool = False,
-        white_balance_k: float = LEAVE,
-        gain: float = LEAVE,
-        buffer: int = 0,
-        led: Sequence[int] = (),
-        crop: Sequence[float] = (),
-        calibration: str = "",
-        output_px: Sequence[int] = (),
-        warmup_s: float = 1.0,
-        timeout_s: float = 3.0,
-        frozen_s: float = 2.0,
-        keep: int = 4,
-        allow_index: bool = False,
-        clock: Clock = time.monotonic,
-    ) -> None:
+    def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range or a calibration file that is none; touches no device."""
         super().__init__(f"gel {finger}", finger, clock=clock)
-        preset = PRESETS[self.PRESET]
-        size_is_left = not (width or height)
-        self.device = device
-        asked = CaptureSettings(
-            width=preset.width if size_is_left else width,
-            height=preset.height if size_is_left else height,
-            fps=fps or preset.fps,
-            fourcc=fourcc or preset.fourcc,
-            auto_exposure=auto_exposure,
-            exposure_ms=exposure_ms,
-            auto_white_balance=auto_white_balance,
-            white_balance_k=white_balance_k,
-            gain=gain,
-            buffer=buffer,
-            led=tuple(led) or preset.led,
+        said, preset = GelCameraSettings(**settings), self.PRESET
+        size = said if said.width or said.height else preset
+        self._asked = replace(
+            said,
+            width=size.width,
+            height=size.height,
+            fps=said.fps or preset.fps,
+            fourcc=said.fourcc or preset.fourcc,
+            led=said.led or preset.led,
         )
-        reading = ReaderSettings(keep=keep, warmup_s=warmup_s, timeout_s=timeout_s, frozen_s=frozen_s)
-        self._rectifier = make_rectifier(calibration, crop, output_px, preset.crop)
-        self._quarter_turns = preset.quarter_turns
-        self._make_reader = reader_maker(self, device, asked, reading, allow_index=allow_index)
-        self._reader = self._make_reader()
+        self._rectifier = make_rectifier(said, self.CROP)
+        self._reader = CaptureReader(self, self._asked)
         self._picture_px: list[int] = []
 
     @property
@@ -114,7 +62,7 @@ class OpencvTactile(TactileSensor):
         return self._reader.lost
 
     def _connect(self) -> None:
-        self._reader = self._make_reader()
+        self._reader = CaptureReader(self, self._asked)
         self._reader.start()
         height, width = self._read().pixels.shape[:2]  # a calibration for another size is found here
         self._picture_px = [width, height]
@@ -137,24 +85,28 @@ class OpencvTactile(TactileSensor):
 
     def _picture(self, frame: Frame) -> Frame:
         """Turned, the gel alone, and then in RGB: the fewer pixels, the sooner."""
-        turns = self._quarter_turns
+        turns = self.QUARTER_TURNS
         turned = np.ascontiguousarray(np.rot90(frame.pixels, turns)) if turns else frame.pixels
         return Frame(in_rgb(self._rectifier.apply(turned)), frame.time_s)
 
 
 class GelSight(OpencvTactile):
-    """The paper's GelSight: 1280 x 960 at 30 pictures a second."""
+    """The paper's GelSight, as its authors ran usb_cam, with both automatics off."""
 
-    PRESET = "gelsight"
+    PRESET = CaptureSettings(width=1280, height=960, fps=30.0, fourcc="MJPG")
 
 
 class GelSightMini(OpencvTactile):
-    """GelSight Mini: its border cut off."""
+    """GelSight Mini: the size that the maker's software asks for, and the border that it cuts off. The camera's own
+    3280 x 2464 pixels at 25 pictures a second keep a core busy."""
 
-    PRESET = "gelsight_mini"
+    PRESET = CaptureSettings(width=320, height=240, fps=25.0)
+    CROP = (0.15, 0.15, 0.15, 0.15)
 
 
 class Digit(OpencvTactile):
-    """DIGIT: 320 x 240 at 60 pictures a second, upright, LEDs at full brightness unless `led` says otherwise."""
+    """DIGIT, LEDs at full brightness unless `led` says otherwise. Its picture is transposed and turned over before
+    people see it, which is a quarter turn to the left."""
 
-    PRESET = "digit"
+    PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))
+    QUARTER_TURNS = 1

@@ -18,19 +18,19 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from robot.devices import Arm, Clock
 from robot.drivers.sawyer import messages, straight_line
-from robot.drivers.sawyer.messages import Joints, Mount
+from robot.drivers.sawyer.messages import Joints, Mount, newest_joints, stands
 from robot.drivers.sawyer.rosbridge import Arrival, RosbridgeLink
-from robot.drivers.sawyer.state import newest_joints, stands
 from robot.drivers.sawyer.straight_line import Schedule, way_points
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError
 from robot.readings import Box, Pose
-from robot.settings import check_range
+from robot.settings import TypedSettings, check_range, limited
 
 _LOG = logging.getLogger(__name__)
 _READ = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
@@ -49,8 +49,9 @@ _MARGIN_MM = 20.0
 """So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
 
 
-class Sawyer(Arm):
-    """Sawyer's right arm through rosbridge at host:port.
+@dataclass(frozen=True, kw_only=True)
+class SawyerSettings(TypedSettings):
+    """A Sawyer's right arm through rosbridge at host:port.
 
     base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: from the origin of `tip` along its z
     axis to the point between the fingertips; tool_yaw_deg: from the tip's x axis about z to where finger a closes to.
@@ -58,68 +59,51 @@ class Sawyer(Arm):
     states older than this stop the arm; the robot's and the collision state where older than this and than 2 s.
     """
 
-    def __init__(
-        self,
-        *,
-        workspace: Box,
-        host: str,
-        base_xyz_mm: Sequence[float],
-        tool_mm: float,
-        port: int = 9090,
-        tip: str = "right_hand",
-        base_yaw_deg: float = 0.0,
-        tool_yaw_deg: float = 0.0,
-        speed_ratio: float = 0.3,
-        joint_speed_rad_s: float = 0.5,
-        rate_hz: float = 100.0,
-        ramp_s: float = 0.3,
-        arrival_rad: float = 0.01,
-        settle_s: float = 5.0,
-        command_timeout_s: float = 0.2,
-        timeout_s: float = 2.0,
-        ik_retries: int = 2,
-        reconnect_tries: int = 5,
-        enable: bool = False,
-        max_speed_mm_s: float = 200.0,
-        max_state_age_s: float = 0.5,
-        clock: Clock = time.monotonic,
-    ) -> None:
+    host: str
+    base_xyz_mm: tuple[float, float, float]
+    tool_mm: float = limited(0, 1000)
+    port: int = limited(1, 65535, 9090)
+    tip: str = "right_hand"
+    base_yaw_deg: float = limited(-360, 360, 0.0)
+    tool_yaw_deg: float = limited(-360, 360, 0.0)
+    speed_ratio: float = limited(0.01, 1, 0.3)
+    joint_speed_rad_s: float = limited(0.01, 1.5, 0.5)
+    rate_hz: float = limited(20, 1000, 100.0)
+    ramp_s: float = limited(0, 5, 0.3)
+    arrival_rad: float = limited(1e-3, 0.1, 0.01)
+    settle_s: float = limited(0.1, 60, 5.0)
+    command_timeout_s: float = limited(0.05, 1, 0.2)
+    timeout_s: float = limited(0.05, 60, 2.0)
+    ik_retries: int = limited(0, 20, 2)
+    reconnect_tries: int = limited(1, 20, 5)
+    enable: bool = False
+    max_speed_mm_s: float = 200.0
+    max_state_age_s: float = limited(0.02, 5, 0.5)
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        super().__post_init__()
+        for value in self.base_xyz_mm:
+            check_range("base_xyz_mm", value, -1e4, 1e4, "mm")
+
+
+class Sawyer(Arm):
+    """Sawyer's right arm; its keywords are those of SawyerSettings."""
+
+    Settings = SawyerSettings
+
+    def __init__(self, *, workspace: Box, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        super().__init__("sawyer", workspace, max_speed_mm_s=max_speed_mm_s, clock=clock)
-        for name, value, low, high in (
-            ("port", port, 1, 65535),
-            ("tool_mm", tool_mm, 0, 1000),
-            ("base_yaw_deg", base_yaw_deg, -360, 360),
-            ("tool_yaw_deg", tool_yaw_deg, -360, 360),
-            ("speed_ratio", speed_ratio, 0.01, 1),
-            ("joint_speed_rad_s", joint_speed_rad_s, 0.01, 1.5),
-            ("rate_hz", rate_hz, 20, 1000),
-            ("ramp_s", ramp_s, 0, 5),
-            ("arrival_rad", arrival_rad, 1e-3, 0.1),
-            ("settle_s", settle_s, 0.1, 60),
-            ("command_timeout_s", command_timeout_s, 0.05, 1),
-            ("timeout_s", timeout_s, 0.05, 60),
-            ("ik_retries", ik_retries, 0, 20),
-            ("reconnect_tries", reconnect_tries, 1, 20),
-            ("max_state_age_s", max_state_age_s, 0.02, 5),
-        ):
-            check_range(name, value, low, high)
-        if len(base_xyz_mm) != 3 or not all(abs(value) <= 1e4 for value in base_xyz_mm):
-            raise RobotConfigError(f"base_xyz_mm must be x, y and z in mm, each within 10 m, got {base_xyz_mm}")
-        x, y, z = (float(value) for value in base_xyz_mm)
-        self._mount = Mount((x, y, z), math.radians(base_yaw_deg), tool_mm, math.radians(tool_yaw_deg))
-        self._url = f"ws://{host}:{port}"
-        self._tip, self._enable, self._max_state_age_s = tip, enable, max_state_age_s
-        self._speed_ratio, self._joint_speed_rad_s = speed_ratio, joint_speed_rad_s
-        self._tick_s, self._ramp_s = 1.0 / rate_hz, ramp_s
-        self._arrival_rad, self._settle_s = arrival_rad, settle_s
-        self._command_timeout_s, self._timeout_s = command_timeout_s, timeout_s
-        self._ik_retries, self._reconnect_tries = ik_retries, reconnect_tries
+        asked = self._asked = SawyerSettings(**settings)
+        super().__init__("sawyer", workspace, max_speed_mm_s=asked.max_speed_mm_s, clock=clock)
+        yaw, tool_yaw = math.radians(asked.base_yaw_deg), math.radians(asked.tool_yaw_deg)
+        self._mount = Mount(asked.base_xyz_mm, yaw, asked.tool_mm, tool_yaw)
+        self._url, self._tick_s = f"ws://{asked.host}:{asked.port}", 1.0 / asked.rate_hz
         self._under_way = self._sees_collisions = False
         self._link = self._new_link()
 
     def _new_link(self) -> RosbridgeLink:
-        return RosbridgeLink(self._url, timeout_s=self._timeout_s, clock=self.clock)
+        return RosbridgeLink(self._url, timeout_s=self._asked.timeout_s, clock=self.clock)
 
     def _connect(self) -> None:
         self._sees_collisions = False
@@ -147,8 +131,8 @@ class Sawyer(Arm):
         self._link.advertise(*messages.JOINT_COMMAND)
         for topic, _ in _READ if self._sees_collisions else _READ[:-1]:
             self._link.wait_for(topic)
-        self._set("speed_ratio", messages.SPEED_RATIO, self._speed_ratio)
-        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._command_timeout_s)
+        self._set("speed_ratio", messages.SPEED_RATIO, self._asked.speed_ratio)
+        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._asked.command_timeout_s)
 
     def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
         """Publish a setting and read it back as the topic shows it; what differs is noted in `refused`."""
@@ -168,11 +152,11 @@ class Sawyer(Arm):
     def _make_ready(self) -> None:
         """Enable the motors where that is all that is missing and allowed. Raises DeviceError."""
         state = self._robot_state()
-        if self._enable and self.may_move and not (state.enabled or state.stopped or state.error):
+        if self._asked.enable and self.may_move and not (state.enabled or state.stopped or state.error):
             _LOG.warning("%s: the motors are being enabled", self.name)
             self._link.advertise(*messages.ENABLE)
             self._link.publish(messages.ENABLE[0], {"data": True})
-            deadline = self.clock() + self._timeout_s
+            deadline = self.clock() + self._asked.timeout_s
             while not self._robot_state().enabled and self.clock() < deadline:
                 time.sleep(self._tick_s)
         self._check_free()
@@ -189,7 +173,7 @@ class Sawyer(Arm):
     def _settings(self) -> dict[str, Any]:
         return {
             "url": self._url,
-            "tip": self._tip,
+            "tip": self._asked.tip,
             "speed_ratio": self._read_back(messages.SPEED_RATIO),
             "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
         }
@@ -213,23 +197,23 @@ class Sawyer(Arm):
         self._make_ready()
 
     def _rejoin(self) -> None:
-        for trial in range(self._reconnect_tries):
+        for trial in range(self._asked.reconnect_tries):
             self._link.close()
             try:
                 return self._join()
             except DeviceError as error:
-                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._reconnect_tries, error)
-                if trial + 1 == self._reconnect_tries:
+                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._asked.reconnect_tries, error)
+                if trial + 1 == self._asked.reconnect_tries:
                     raise
             time.sleep(min(_BACK_OFF_S * 2**trial, _LONGEST_BACK_OFF_S))
         raise AssertionError("the loop returns or raises")
 
     def _pose(self) -> Pose:
-        return self._pose_since(self.clock() - self._max_state_age_s)
+        return self._pose_since(self.clock() - self._asked.max_state_age_s)
 
     def _pose_since(self, since_s: float) -> Pose:
         arrival = self._link.wait_for(messages.TIP_STATES[0], since_s=since_s)
-        return self._mount.pose_of(messages.tip_of(arrival.message, self._tip))
+        return self._mount.pose_of(messages.tip_of(arrival.message, self._asked.tip))
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         began = self.clock()
@@ -239,7 +223,7 @@ class Sawyer(Arm):
         start = self._fresh_joints()
         poses = way_points(self._inside(self._pose()), pose)
         joints = self._solve(poses, start)
-        schedule = Schedule.of(poses, joints, speed_mm_s, self._joint_speed_rad_s, self._ramp_s)
+        schedule = Schedule.of(poses, joints, speed_mm_s, self._asked.joint_speed_rad_s, self._asked.ramp_s)
         self._under_way = True
         try:
             self._follow(schedule, began)
@@ -268,8 +252,8 @@ class Sawyer(Arm):
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
         """Ask with other seeds when one fails, at most `ik_retries` times more."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
-        for trial in range(self._ik_retries + 1):
-            request = messages.ik_request(tip, self._tip, seeds[trial % len(seeds)])
+        for trial in range(self._asked.ik_retries + 1):
+            request = messages.ik_request(tip, self._asked.tip, seeds[trial % len(seeds)])
             try:
                 found = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
             except DeviceError as error:
@@ -280,9 +264,10 @@ class Sawyer(Arm):
             if turn <= _MOST_TURN_RAD:
                 return found
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
+        tries = self._asked.ik_retries + 1
         raise DeviceError(
-            f"{self.name}: the hand must reach {pose}, but after {self._ik_retries + 1} tries: {problem}; nothing has "
-            "moved. Choose a smaller workspace or check base_xyz_mm and tool_mm"
+            f"{self.name}: the hand must reach {pose}, but after {tries} tries: {problem}; nothing has moved. "
+            "Choose a smaller workspace or check base_xyz_mm and tool_mm"
         )
 
     def _follow(self, schedule: Schedule, began: float) -> None:
@@ -301,16 +286,16 @@ class Sawyer(Arm):
     def _settle(self, goal: Joints, began: float) -> None:
         """Wait until every joint is within `arrival_rad` and stands. Raises DeviceError for one that does not arrive
         in `settle_s`; one that trembles where it should be is let be."""
-        deadline = self.clock() + self._settle_s
+        deadline = self.clock() + self._asked.settle_s
         while True:
             off = float(np.abs(self._watch(goal, began) - goal).max())
             late = self.clock() > deadline
-            if off <= self._arrival_rad and (late or self._stands(began)):
+            if off <= self._asked.arrival_rad and (late or self._stands(began)):
                 return
             if late:
                 raise DeviceError(
-                    f"{self.name}: every joint must come within {self._arrival_rad:g} rad of its goal, after "
-                    f"{self._settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
+                    f"{self.name}: every joint must come within {self._asked.arrival_rad:g} rad of its goal, after "
+                    f"{self._asked.settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
                 )
             self._command(goal)
             time.sleep(self._tick_s)
@@ -351,13 +336,13 @@ class Sawyer(Arm):
         found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
         if found is not None:
             joints, since_s = found
-            if (age_s := self.clock() - since_s) <= self._max_state_age_s:
+            if (age_s := self.clock() - since_s) <= self._asked.max_state_age_s:
                 return joints
         self._link.check()
         age = "never came" if found is None else f"is {age_s:.2f} s old"
         raise DeviceError(
-            f"{self.name}: the joint state must be at most {self._max_state_age_s:g} s old, it {age}; without new "
-            f"commands the robot ends its motion after {self._command_timeout_s:g} s by itself"
+            f"{self.name}: the joint state must be at most {self._asked.max_state_age_s:g} s old, it {age}; without "
+            f"new commands the robot ends its motion after {self._asked.command_timeout_s:g} s by itself"
         )
 
     def _robot_state(self) -> messages.RobotState:
@@ -373,7 +358,7 @@ class Sawyer(Arm):
         return arrivals
 
     def _check_comes(self, topic: str, arrivals: Sequence[Arrival], unseen: str) -> None:
-        limit_s = max(self._max_state_age_s, _SLOW_STATE_AGE_S)
+        limit_s = max(self._asked.max_state_age_s, _SLOW_STATE_AGE_S)
         if not arrivals or self.clock() - arrivals[-1].time_s > limit_s:
             self._link.check()
             raise DeviceError(

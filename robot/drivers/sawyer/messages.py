@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from robot.drivers.sawyer.rosbridge import Arrival
 from robot.errors import DeviceError
 from robot.readings import Pose
 
@@ -41,6 +42,8 @@ COLLIDED = "the robot reports a collision, the arm holds: look what it touches a
 _BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop still holds"}
 _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
 _MOST_LEAN_RAD = math.radians(10.0)
+STILL_RAD, STILL_S = 1e-3, 0.1
+"""An arm stands when no joint has moved by more in so long."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,32 @@ def stamp_of(message: Mapping[str, Any]) -> Any:
     """The time stamp of a message, to compare and nothing else; None where it has none."""
     header = message.get("header")
     return header.get("stamp") if isinstance(header, dict) else None
+
+
+def newest_joints(arrivals: Sequence[Arrival]) -> tuple[Joints, float] | None:
+    """The newest joints and since when they have been said: one repeated with its old time stamp is as old as its first
+    copy. None where none came."""
+    found, since_s = None, -math.inf
+    for arrival in reversed(arrivals):
+        if found is None:
+            found = joints_of(arrival.message)
+            stamp = stamp_of(arrival.message)
+            since_s = arrival.time_s
+        elif stamp is not None and stamp_of(arrival.message) == stamp:
+            since_s = arrival.time_s
+        else:
+            break
+    return None if found is None else (found, since_s)
+
+
+def stands(arrivals: Sequence[Arrival], since_s: float, now_s: float) -> bool:
+    """Whether the joint states of the last STILL_S, none from before `since_s`, are of an arm that stands."""
+    recent = [
+        joints
+        for arrival in arrivals
+        if arrival.time_s >= max(since_s, now_s - STILL_S) and (joints := joints_of(arrival.message)) is not None
+    ]
+    return now_s - since_s >= STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < STILL_RAD
 
 
 def tip_of(message: Mapping[str, Any], tip: str) -> Mapping[str, Any]:

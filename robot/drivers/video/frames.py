@@ -21,7 +21,7 @@ import numpy as np
 from robot.devices import Clock
 from robot.errors import DeviceError
 from robot.readings import Frame
-from robot.settings import check_range
+from robot.settings import TypedSettings, limited
 
 log = logging.getLogger(__name__)
 MOST_S = 600.0
@@ -44,30 +44,24 @@ class Stream(Protocol):
         """Let go of the camera."""
 
 
-@dataclass(frozen=True)
-class ReaderSettings:
+@dataclass(frozen=True, kw_only=True)
+class ReaderSettings(TypedSettings):
     """keep: pictures kept. warmup_s: pictures so soon after opening are dropped (automatic exposure, first black ones).
     timeout_s: how long somebody who asks waits for a picture. frozen_s: a stream of the same pixels for longer is
-    opened again; its picture is too old to be used long before that. backoff_s: first and longest wait before that.
+    opened again; its picture is too old to be used long before that. Raises RobotConfigError for one out of range.
     """
 
-    keep: int = 4
-    warmup_s: float = 1.0
-    timeout_s: float = 3.0
-    frozen_s: float = 2.0
-    backoff_s: tuple[float, float] = (0.1, 5.0)
-
-    def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
-        check_range("keep", self.keep, 1, 1000, "pictures")
-        for name, least in (("warmup_s", 0.0), ("timeout_s", 1e-3), ("frozen_s", 1e-3)):
-            check_range(name, getattr(self, name), least, MOST_S, "s")
+    keep: int = limited(1, 1000, 4, unit="pictures")
+    warmup_s: float = limited(0, MOST_S, 1.0, unit="s")
+    timeout_s: float = limited(1e-3, MOST_S, 3.0, unit="s")
+    frozen_s: float = limited(1e-3, MOST_S, 2.0, unit="s")
 
 
 class FrameReader:
     """Reads the streams that `open_stream` opens, in a thread of its own, from `start` to `close`.
 
-    frames_seen: pictures taken, the dropped ones included. lost: how often a stream was given up.
+    frames_seen: pictures taken, the dropped ones included. lost: how often a stream was given up. backoff_s: first and
+    longest wait before it is opened again.
     """
 
     def __init__(
@@ -77,8 +71,9 @@ class FrameReader:
         settings: ReaderSettings,
         *,
         clock: Clock = time.monotonic,
+        backoff_s: tuple[float, float] = (0.1, 5.0),
     ) -> None:
-        self.name, self.settings, self.clock = name, settings, clock
+        self.name, self.settings, self.clock, self.backoff_s = name, settings, clock, backoff_s
         self.frames_seen = self.lost = 0
         self._open_stream = open_stream
         self._kept: deque[Frame] = deque(maxlen=settings.keep)
@@ -143,7 +138,7 @@ class FrameReader:
             return list(self._kept)
 
     def _run(self, stream: Stream | None) -> None:
-        shortest, longest = self.settings.backoff_s
+        shortest, longest = self.backoff_s
         delay = shortest
         while not self._ended.is_set():
             try:
@@ -164,16 +159,13 @@ class FrameReader:
         with self._news:
             self.frames_seen += 1
             if self._last is not None and _same(self._last.pixels, frame.pixels):
-                self._check_moves(frame.time_s - self._last.time_s)
+                if (still_s := frame.time_s - self._last.time_s) > self.settings.frozen_s:
+                    raise DeviceError(f"its stream is frozen: the same picture for {still_s:.1f} s")
                 return
             self._last = frame
             if frame.time_s >= self._warm_s:
                 self._kept.append(frame)
                 self._news.notify_all()
-
-    def _check_moves(self, still_s: float) -> None:
-        if still_s > self.settings.frozen_s:
-            raise DeviceError(f"its stream is frozen: the same picture for {still_s:.1f} s")
 
     def _lose(self, stream: Stream | None, error: Exception, delay: float) -> None:
         with self._news:

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from robot.drivers import discover
 from robot.drivers.video.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
+from robot.settings import TypedSettings, limited
 
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
@@ -32,15 +32,12 @@ _STAMP_S = (-0.05, 1.0)
 """A picture's own time is believed where it is so much older than now; else it is on another clock."""
 
 _NUMBERED = re.compile(r"/dev/video\d+")
-LEAVE = math.nan
-"""For a number: leave it as the camera has it."""
-
 _MAY_BE_LEFT = ("exposure_ms", "white_balance_k", "gain")
 
 
-@dataclass(frozen=True)
-class CaptureSettings:
-    """What is asked of a camera; 0, "", () and nan leave a setting as the camera has it.
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings(TypedSettings):
+    """What is asked of a camera; 0, "", () and None leave a setting as the camera has it.
 
     width, height in pixels; fps; fourcc as "MJPG"; exposure_ms and white_balance_k count where they are not automatic;
     gain in the camera's own unit; buffer: pictures that the system keeps back (1 to 10); led: red, green, blue of a
@@ -49,51 +46,50 @@ class CaptureSettings:
 
     width: int = 0
     height: int = 0
-    fps: float = 0.0
+    fps: float = limited(0, 1000, 0.0)
     fourcc: str = ""
     auto_exposure: bool = False
-    exposure_ms: float = LEAVE
+    exposure_ms: float | None = limited(0, 1e9, None)
     auto_white_balance: bool = False
-    white_balance_k: float = LEAVE
-    gain: float = LEAVE
-    buffer: int = 0
+    white_balance_k: float | None = limited(0, 1e9, None)
+    gain: float | None = limited(0, 1e9, None)
+    buffer: int = limited(0, 10, 0, unit="pictures")
     led: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        size, led = (self.width, self.height), self.led
-        _require("width and height must be given together, up to 20000 pixels", size, _is_size(size))
-        _require("fps must be from 0 to 1000", self.fps, 0 <= self.fps <= 1000)
-        text = self.fourcc
+        super().__post_init__()
+        size, text, led = (self.width, self.height), self.fourcc, self.led
+        is_size = size == (0, 0) or 1 <= min(size) <= max(size) <= 20000
+        _require("width and height must be given together, up to 20000 pixels", size, is_size)
         _require('fourcc must be four letters, as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
-        for name in _MAY_BE_LEFT:
-            value = getattr(self, name)
-            _require(f"{name} must be 0 or more", value, math.isnan(value) or 0 <= value < math.inf)
         for name, automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
             value = getattr(self, name)
-            _require(f"{name} must be left out where it is automatic", value, not automatic or math.isnan(value))
-        _require("buffer must be from 0 to 10 pictures", self.buffer, 0 <= self.buffer <= 10)
+            _require(f"{name} must be left out where it is automatic", value, not automatic or value is None)
         _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3) and all(0 <= each <= 15 for each in led))
 
     def asked(self) -> dict[str, Any]:
         """Settings to write, in the order in which to write them."""
         values = {name: getattr(self, name) for name in _PROPERTIES}
-        return {name: value for name, value in values.items() if _is_asked(name, value)}
+        return {
+            name: value
+            for name, value in values.items()
+            if value is not None and (value or isinstance(value, bool) or name in _MAY_BE_LEFT)
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class UsbCameraSettings(CaptureSettings, ReaderSettings):
+    """A USB camera named by `device`, a path in /dev/v4l/by-id (or by-path: the socket), what is asked of it and how it
+    is read. allow_index: let `device` be a number or /dev/video0."""
+
+    device: str
+    allow_index: bool = False
 
 
 def _require(what: str, got: object, holds: bool) -> None:
     if not holds:
         raise RobotConfigError(f"a camera's {what}, got {got}")
-
-
-def _is_size(size: tuple[int, int]) -> bool:
-    return size == (0, 0) or 1 <= min(size) <= max(size) <= 20000
-
-
-def _is_asked(name: str, value: Any) -> bool:
-    if name in _MAY_BE_LEFT:
-        return not math.isnan(value)
-    return isinstance(value, bool) or bool(value)
 
 
 @dataclass(frozen=True)
@@ -111,22 +107,16 @@ class _Property:
         return has is not None and abs(float(has) - float(asked)) <= self.slack
 
 
-def _fourcc_text(number: float) -> str:
-    return (int(number) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
-
-
-def _whole(value: float) -> int:
-    return round(value)
-
-
 _PROPERTIES: Mapping[str, _Property] = {
     "fourcc": _Property(
-        cv2.CAP_PROP_FOURCC, lambda text: float(int.from_bytes(text.encode("ascii"), "little")), _fourcc_text
+        cv2.CAP_PROP_FOURCC,
+        lambda text: float(int.from_bytes(text.encode("ascii"), "little")),
+        lambda number: (int(number) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1"),
     ),
-    "width": _Property(cv2.CAP_PROP_FRAME_WIDTH, from_camera=_whole),
-    "height": _Property(cv2.CAP_PROP_FRAME_HEIGHT, from_camera=_whole),
+    "width": _Property(cv2.CAP_PROP_FRAME_WIDTH, from_camera=round),
+    "height": _Property(cv2.CAP_PROP_FRAME_HEIGHT, from_camera=round),
     "fps": _Property(cv2.CAP_PROP_FPS, slack=0.5),
-    "buffer": _Property(cv2.CAP_PROP_BUFFERSIZE, from_camera=_whole),
+    "buffer": _Property(cv2.CAP_PROP_BUFFERSIZE, from_camera=round),
     "auto_exposure": _Property(cv2.CAP_PROP_AUTO_EXPOSURE, lambda on: 3.0 if on else 1.0, lambda value: value != 1),
     "exposure_ms": _Property(cv2.CAP_PROP_EXPOSURE, lambda ms: 10.0 * ms, lambda value: value / 10, slack=0.05),
     "auto_white_balance": _Property(cv2.CAP_PROP_AUTO_WB, from_camera=bool),
@@ -214,21 +204,11 @@ class CaptureReader(FrameReader):
     `refused` is the owner's dictionary, kept up to date.
     """
 
-    def __init__(
-        self,
-        name: str,
-        device: str,
-        asked: CaptureSettings,
-        reading: ReaderSettings,
-        *,
-        allow_index: bool,
-        refused: dict[str, str],
-        clock: Clock,
-    ) -> None:
+    def __init__(self, owner: Device, asked: UsbCameraSettings) -> None:
         """Raises RobotConfigError for a `device` that may be another camera tomorrow; opens nothing."""
-        super().__init__(name, self._open_camera, reading, clock=clock)
-        self.device, self.asked, self.refused = device, asked, refused
-        self._path = stable_path(device, allow_index)
+        super().__init__(owner.name, self._open_camera, asked, clock=owner.clock)
+        self.asked, self.refused = asked, owner.refused
+        self._path = stable_path(asked.device, asked.allow_index)
         self.camera: dict[str, Any] = {}
 
     def _open_camera(self) -> CaptureStream:
@@ -236,29 +216,13 @@ class CaptureReader(FrameReader):
         stream = CaptureStream(self._path, self.asked, self.clock)
         self.refused.clear()
         self.refused.update(stream.refused)
-        self.camera = {"device": self.device, **stream.settings}
+        self.camera = {"device": self.asked.device, **stream.settings}
         return stream
 
     def recover(self) -> None:
         """A lost stream is opened again without being asked: have it be now, and wait for a picture."""
         self.hurry()
         self.after(self.clock())
-
-
-def reader_maker(
-    owner: Device, device: str, asked: CaptureSettings, reading: ReaderSettings, *, allow_index: bool
-) -> Callable[[], CaptureReader]:
-    """Makes readers of one camera for its `owner`, who needs a new one for each connection."""
-    return partial(
-        CaptureReader,
-        owner.name,
-        device,
-        asked,
-        reading,
-        allow_index=allow_index,
-        refused=owner.refused,
-        clock=owner.clock,
-    )
 
 
 def _words(value: Any) -> str:

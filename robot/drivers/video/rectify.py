@@ -28,9 +28,22 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
+from robot.settings import TypedSettings
 from robot.storage import read_regular
 
 Picture = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutSettings(TypedSettings):
+    """How a sensor's pictures are cut to the gel: `crop`, shares at left, top, right and bottom, or a calibration file;
+    output_px: width and height of the result, counts before the file's."""
+
+    crop: Sequence[float] = ()
+    calibration: str = ""
+    output_px: Sequence[int] = ()
+
+
 _KEYS = {"image_px", "corners_px", "crop", "output_px", "note"}
 _MOST_PX, _MOST = 20_000, 1e9
 
@@ -118,19 +131,14 @@ def in_rgb(picture: Picture) -> Picture:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def make_rectifier(
-    calibration: str = "", crop: Sequence[float] = (), output_px: Sequence[int] = (), default_crop: Sequence[float] = ()
-) -> Rectifier:
-    """From a driver's settings. A calibration file excludes `crop`; `output_px` counts before the file's.
-
-    Raises RobotConfigError.
-    """
-    size = tuple(output_px)
-    if not calibration:
-        return Rectifier(crop=tuple(crop or default_crop), output_px=size)
-    if crop:
+def make_rectifier(settings: CutSettings, default_crop: Sequence[float] = ()) -> Rectifier:
+    """From a driver's settings. Raises RobotConfigError, also for both a calibration file and `crop`."""
+    size = tuple(settings.output_px)
+    if not settings.calibration:
+        return Rectifier(crop=tuple(settings.crop or default_crop), output_px=size)
+    if settings.crop:
         raise RobotConfigError("a picture is cut by crop or by a calibration file; give one of them")
-    found = load_rectifier(calibration)
+    found = load_rectifier(settings.calibration)
     return Rectifier(found.crop, found.corners_px, found.image_px, size or found.output_px)
 
 

@@ -14,7 +14,7 @@ from robot.drivers.wsg50.commands import Command, GraspingState, GripperLimits, 
 from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost
 from robot.drivers.wsg50.motion import UPDATE_BYTES, Motions, Reading, causes
 from robot.errors import DeviceError, RobotConfigError
-from robot.settings import Settings, limited
+from robot.settings import TypedSettings, limited
 
 _log = logging.getLogger(__name__)
 _DIRECTIONS = {"default": 0, "out": 1, "in": 2}
@@ -29,7 +29,7 @@ TYPICAL = GripperLimits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class WSG50Settings(Settings):
+class WSG50Settings(TypedSettings):
     """Settings of a WSG-50 at `port`: a path, or socket://192.168.1.20:1000. Forces are those on each finger.
 
     baud, stop_bits: of a serial line, as set in the gripper (the defaults are not verified). timeout_s: of an answer.

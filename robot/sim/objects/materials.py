@@ -10,32 +10,20 @@ from types import MappingProxyType
 import numpy as np
 
 from robot.errors import UnknownName
-from robot.settings import check_range
+from robot.settings import TypedSettings, limited
 
 
 @dataclass(frozen=True)
-class ObjectMaterial:
+class ObjectMaterial(TypedSettings):
     """Isotropic linear elasticity, density, friction against gel, and two numbers for shading (0 to 1)."""
 
     name: str
-    modulus_mpa: float
-    poisson: float
-    density_kg_m3: float
-    friction: float
-    gloss: float
-    roughness: float
-
-    def __post_init__(self) -> None:
-        limits = {
-            "modulus_mpa": (1e-3, 1e6),
-            "poisson": (-1.0, 0.5),
-            "density_kg_m3": (1.0, 25000.0),
-            "friction": (0.0, 5.0),
-            "gloss": (0.0, 1.0),
-            "roughness": (0.0, 1.0),
-        }
-        for field, (low, high) in limits.items():
-            check_range(field, getattr(self, field), low, high)
+    modulus_mpa: float = limited(1e-3, 1e6)
+    poisson: float = limited(-1.0, 0.5)
+    density_kg_m3: float = limited(1.0, 25000.0)
+    friction: float = limited(0.0, 5.0)
+    gloss: float = limited(0.0, 1.0)
+    roughness: float = limited(0.0, 1.0)
 
 
 _TABLE = (
