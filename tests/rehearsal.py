@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from retrieval.commands.cli import main as retrieve
+from retrieval.commands.main import main as retrieve
 from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.emulators.wsg50.server import serve_tcp
 from robot.readings import Frame, Intrinsics

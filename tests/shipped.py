@@ -24,7 +24,7 @@ import numpy as np
 
 import robot.collect
 import robot.rig
-from retrieval.commands import cli
+from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import trained_checkpoint
@@ -186,7 +186,7 @@ def retrieve(*arguments: object) -> int:
     """Say a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
     print("$ retrieve " + " ".join(words), file=sys.stderr, flush=True)
-    return cli.main(words)
+    return run_command(words)
 
 
 if __name__ == "__main__":

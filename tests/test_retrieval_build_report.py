@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from indexes.store.folder import IndexStore
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
@@ -118,11 +118,11 @@ def test_objects_without_a_readable_photo_are_named_and_the_exit_code_says_so(tm
     own = laid_out(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg", "cup/1.jpg", "ball/0.jpg")
     command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
     (own / "cup" / "0.jpg").write_bytes(b"broken")
-    assert cli.main(command) == 0  # the cup has another photo
+    assert main(command) == 0  # the cup has another photo
     (own / "cup" / "1.jpg").write_bytes(b"broken")
     (own / "ball" / "0.jpg").rename(own / "ball" / "0.gif")
     capsys.readouterr()
-    assert cli.main([*command, "--json"]) == 1
+    assert main([*command, "--json"]) == 1
     printed = capsys.readouterr()
     assert json.loads(printed.out)["without_photo"] == ["ball", "cup"]
     assert "2 of 3 objects are not in the index, for none of their pictures can be read: ball, cup" in printed.err

@@ -1,6 +1,7 @@
 """The command line as users meet it: the commands exactly as documented, exit codes, one-line errors, clean stdout."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.commands.cli import COMMANDS, main
+from retrieval.commands.main import main
+from retrieval.commands.options import Command
 from retrieval.search import defaults
 
 
@@ -195,10 +197,94 @@ def test_an_unexpected_error_is_no_traceback_unless_debug_is_asked_for(workplace
         main(["--debug", "query", "--gelsight", "a.png"])
 
 
-def test_an_unknown_command_is_wrong_use():
-    with pytest.raises(SystemExit) as leaving:
-        main(["fetch"])
-    assert leaving.value.code == 2
+WRONG_WORDS = {
+    "no command": ([], "retrieve: Missing command"),
+    "an unknown command": (["fetch"], "retrieve: No such command 'fetch'"),
+    "an unknown option": (["check", "rec", "--quick"], "retrieve check: No such option: --quick"),
+    "an argument too many": (["check", "rec", "rec2"], "retrieve check: Got unexpected extra argument(s) (rec2)"),
+    "none at all": (["check"], "retrieve check: Missing argument 'recording'"),
+    "no touch": (["query", "--top", "3"], "retrieve query: Missing option '--gelsight'"),
+    "no number": (["query", "--gelsight", "a.png", "--top", "few"], "retrieve query: Invalid value for '--top'"),
+    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'grasp-success'"),
+    "a forgotten folder": (["collect", "--out", "--preview"], "retrieve collect: --out needs a value"),
+    "forgotten files": (["query", "--gelsight", "--json"], "retrieve query: --gelsight needs a value"),
+    "a forgotten word": (["rig", "check", "--rig"], "retrieve rig: --rig needs a value"),
+    "no task": (["rig"], "retrieve rig: Missing command"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(WRONG_WORDS))
+def test_wrong_words_are_one_line_on_stderr_and_exit_code_2(case, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments, words = WRONG_WORDS[case]
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert words in line
+    assert line.startswith("retrieve")
+    assert line.endswith("; see --help")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monkeypatch):
+    given = []
+    monkeypatch.setattr(Command, "invoke", lambda self, context: given.append(context.params))
+    words = ["--gelsight", "a.png", "b.png", "--top", "3", "--gelsight", "a2.png", "b2.png", "--background", "n.png"]
+    assert main(["query", *words]) == 0
+    assert main(["query", "--gelsight=a.png", "--none-prior", "-1"]) == 0
+    assert main(["frontier", "--out", "o", "--only", "closing", "contact", "--quick"]) == 0
+    assert given[0]["gelsight"] == [("a.png", "b.png"), ("a2.png", "b2.png")]
+    assert (given[0]["background"], given[0]["top"]) == (("n.png",), 3)
+    assert (given[1]["gelsight"], given[1]["none_prior"]) == ([("a.png",)], -1.0)
+    assert (given[2]["only"], given[2]["quick"]) == (("closing", "contact"), True)
+
+
+def test_the_package_is_the_command_line_too_and_help_lists_choices():
+    asked = [sys.executable, "-m", "retrieval", "train", "--help"]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("Usage: retrieve train ")
+    assert "--task <match|grasp-success>" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("build", ["build-index"]),
+        ("rig ca", ["calibrate"]),
+        ("train rec --task g", ["grasp-success"]),
+        ("query --gelsight a.png b.png --to", ["--top"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_choices(words, completed):
+    asked = {"COMP_WORDS": f"retrieve {words}", "COMP_CWORD": str(len(words.split()))}
+    assert complete("complete_bash", **asked).split() == completed
+
+
+def test_the_script_for_a_shell_names_the_program():
+    assert "complete -o default -F _retrieve_completion retrieve" in complete("source_bash")
+
+
+def complete(what, **asked):
+    """What the program answers a shell."""
+    environment = {**os.environ, "_RETRIEVE_COMPLETE": what, **asked}
+    done = subprocess.run(
+        [sys.executable, "-m", "retrieval"], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+@pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
+def test_completion_is_shown_and_installed_for_a_named_shell(option, tmp_path):
+    """As typer lets tests name the shell, which else is that of the process above."""
+    environment = {**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1", "HOME": str(tmp_path)}
+    asked = [sys.executable, "-m", "retrieval", option, "bash"]
+    done = subprocess.run(asked, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    script = done.stdout if option == "--show-completion" else (tmp_path / ".bash_completions/retrieve.sh").read_text()
+    assert "complete -o default -F _retrieve_completion retrieve" in script
 
 
 def test_check_leaves_with_1_when_it_finds_errors(recording, tmp_path, capsys):
@@ -307,17 +393,7 @@ def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
 
 def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
     main(["build-index", "catalog/", "--model", str(model)])
-    query = [
-        sys.executable,
-        "-m",
-        "retrieval.commands.cli",
-        "query",
-        "--gelsight",
-        "a.png",
-        "b.png",
-        "--index",
-        "index",
-    ]
+    query = [sys.executable, "-m", "retrieval", "query", "--gelsight", "a.png", "b.png", "--index", "index"]
     done = subprocess.run(f"{' '.join(query)} | true", shell=True, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "Broken pipe" not in done.stderr
@@ -326,9 +402,7 @@ def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
 def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(workplace, model):
     """Python's print falls back to stdout where stderr is closed."""
     main(["build-index", "catalog/", "--model", str(model)])
-    query = (
-        f"{sys.executable} -m retrieval.commands.cli query --gelsight a.png b.png --index index --json --none-prior 0"
-    )
+    query = f"{sys.executable} -m retrieval query --gelsight a.png b.png --index index --json --none-prior 0"
     done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
     assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)
     assert subprocess.run(f"{query} >&- 2>&-", shell=True, check=False).returncode == 0
@@ -344,7 +418,7 @@ def test_ctrl_c_that_comes_out_as_another_error_is_still_ctrl_c(monkeypatch, cap
             raise RecursionError from None
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setitem(COMMANDS, "check", interrupted)
+    monkeypatch.setattr("retrieval.data.check.recording.check_recording", interrupted)
     assert main(["check", "recording"]) == 1
     assert capsys.readouterr().err == "retrieve check: stopped by Ctrl-C\n"
     assert signal.getsignal(signal.SIGINT) is before

@@ -40,7 +40,7 @@ class Build:
 
 
 def command(*arguments):
-    return [sys.executable, "-m", "retrieval.commands.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "retrieval", *map(str, arguments)]
 
 
 def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=math.inf):

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.commands import cli
 from retrieval.commands.demo import PHOTOS, SEED, TOUCHES
+from retrieval.commands.main import main
 from robot.recording.folder import read_recording
 
 
@@ -14,7 +14,7 @@ from robot.recording.folder import read_recording
 def finished(tmp_path_factory):
     """Where a demo of four objects has run."""
     folder = tmp_path_factory.mktemp("demo")
-    assert cli.main(["demo", "--objects", "4", "--jobs", "1", "--out", str(folder / "demo")]) == 0
+    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(folder / "demo")]) == 0
     return folder / "demo"
 
 
@@ -36,7 +36,7 @@ def test_no_grasp_gives_both_a_photo_and_a_touch(finished):
 
 def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_defaults(finished, capsys):
     lines = (finished / "recording" / "metadata.jsonl").read_bytes()
-    assert cli.main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished)]) == 0
+    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished)]) == 0
     said = capsys.readouterr()
     assert (finished / "recording" / "metadata.jsonl").read_bytes() == lines
     assert f"0 embedded, {4 * PHOTOS} unchanged" in said.err
@@ -47,13 +47,13 @@ def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_de
 
 
 def test_a_command_that_is_used_wrongly_ends_the_demo_with_its_exit_code(tmp_path, capsys):
-    assert cli.main(["demo", "--objects", "0", "--out", str(tmp_path / "demo")]) == 2
+    assert main(["demo", "--objects", "0", "--out", str(tmp_path / "demo")]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert said[-2] == "retrieve collect: at least one object must be collected, got none"
-    assert said[-1] == "retrieve demo: `retrieve collect` failed; what it said stands above"
+    assert said[-2].startswith("$ retrieve collect --rig sim --objects 0 ")
+    assert said[-1] == "retrieve demo: at least one object must be collected, got none"
 
 
 def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
-    assert cli.main(["demo", "--out", str(tmp_path)]) == 2
+    assert main(["demo", "--out", str(tmp_path)]) == 2
     assert "must be a new folder or an earlier demo's; it holds thesis.tex" in capsys.readouterr().err

@@ -56,7 +56,7 @@ def test_a_clean_recording_has_no_remark_but_says_what_could_not_be_checked(felt
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 5])
 def test_a_clean_simulated_recording_is_called_clean(tmp_path, seed):
-    from retrieval.commands.cli import main
+    from retrieval.commands.main import main
 
     options = ["--objects", "5", "--grasps", "4", "--seed", str(seed), "--out", str(tmp_path / "r")]
     assert main(["collect", "--rig", "sim", *options]) == 0

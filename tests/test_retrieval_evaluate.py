@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.commands.cli import main
+from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
 from retrieval.evaluation.bench import Bench, _shuffled

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.commands.cli import main
+from retrieval.commands.main import main
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
 from retrieval.model import export as exporting
@@ -149,7 +149,7 @@ def test_a_query_takes_the_export_that_lies_beside_the_model_and_ranks_the_same(
 def test_a_query_runs_with_torch_blocked_where_there_is_an_export(own, index, touch, onnx_wins, tmp_path):
     files = [str(path) for path in touch]
     arguments = ["query", "--gelsight", *files, "--index", str(index), "--none-prior", "0", "--json"]
-    code = f"import sys\nfrom retrieval.commands.cli import main\nsys.exit(main({arguments!r}))"
+    code = f"import sys\nfrom retrieval.commands.main import main\nsys.exit(main({arguments!r}))"
     refused = run_blocked(code, ("torch",))
     assert refused.returncode == 1
     assert "blocked: torch" in refused.stderr
@@ -301,7 +301,7 @@ class Guard:
 
 sys.meta_path.insert(0, Guard())
 sys.stdout.isatty = lambda: True  # in a terminal, rich draws the table
-from retrieval.commands.cli import main
+from retrieval.commands.main import main
 code = main({arguments!r})
 used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))
 print(sorted({allowed!r} - used), file=sys.stderr)
@@ -323,9 +323,8 @@ def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(o
 
 
 def test_querys_help_and_a_wrong_index_import_no_encoder(tmp_path):
-    code = (
-        f"from retrieval.commands.cli import main\nmain(['query', '--gelsight', 'a.png', '--index', {str(tmp_path)!r}])"
-    )
+    arguments = ["query", "--gelsight", "a.png", "--index", str(tmp_path)]
+    code = f"from retrieval.commands.main import main\nmain({arguments!r})"
     done = run_blocked(code, ("torch", "onnxruntime", "onnx"))
     assert "run `retrieve build-index` first" in done.stderr, done.stderr
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from indexes.errors import CorruptIndex
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError, ConfigError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
 from retrieval.model.config import load_config
@@ -211,7 +211,7 @@ def test_a_row_of_a_photo_outside_the_catalogue_or_without_its_parts_is_refused(
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", '{"seed": 1' + "0" * 5000 + "}", "7"])
 def test_a_hostile_split_is_one_sentence(tmp_path, capsys, text):
     (tmp_path / "split.json").write_text(text)
-    assert cli.main(["check", str(tmp_path), "--split", str(tmp_path / "split.json")]) == 2
+    assert main(["check", str(tmp_path), "--split", str(tmp_path / "split.json")]) == 2
     said = capsys.readouterr().err
     assert "unexpected" not in said
     assert len(said.splitlines()) == 1
@@ -239,6 +239,6 @@ def test_names_that_no_disk_takes_are_one_sentence(tmp_path, capsys):
         ["export", name],
     ]
     for command in commands:
-        code, said = cli.main(command), capsys.readouterr().err.splitlines()
+        code, said = main(command), capsys.readouterr().err.splitlines()
         assert (code, [line for line in said if "unexpected" in line]) == (2, []), command
         assert len(said[-1]) < 2200, command

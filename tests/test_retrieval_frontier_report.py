@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.lab import reports as frontier_report
 from retrieval.lab.frontier.points import Panel, Point, Row
 from retrieval.lab.frontier.report import write_frontier
@@ -65,7 +65,7 @@ def test_a_row_that_was_left_out_says_why_and_has_no_plot(tmp_path):
 
 def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, tmp_path, capsys):
     command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--quick", "--json"]
-    assert cli.main([*command, "--only", "closing"]) == 0
+    assert main([*command, "--only", "closing"]) == 0
     said = capsys.readouterr()
     assert json.loads(said.out)["rows"].keys() == {"closing"}
     assert "closing: closing step (against closed form of a spring)" in said.err
@@ -75,7 +75,7 @@ def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, tmp_pat
 
 
 def test_wrong_names_are_one_line_and_exit_code_2(model, tmp_path, capsys):
-    assert cli.main(["frontier", "--out", str(tmp_path), "--model", str(model), "--only", "speed"]) == 2
+    assert main(["frontier", "--out", str(tmp_path), "--model", str(model), "--only", "speed"]) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("retrieve frontier: an approximation must be one of")
 
 
@@ -104,7 +104,7 @@ def few_cases(monkeypatch):
 
 def test_hard_cases_that_hold_are_shown_and_the_exit_code_is_0(few_cases, tmp_path, capsys):
     few_cases(GOOD)
-    assert cli.main(["frontier", "--stability", "--out", str(tmp_path)]) == 0
+    assert main(["frontier", "--stability", "--out", str(tmp_path)]) == 0
     assert "holds  top k, a <NaN>: must hold: is refused; naive ranked first; ours refused" in capsys.readouterr().err
     page = (tmp_path / "stability.html").read_text()
     assert "a &lt;NaN&gt;" in page
@@ -114,7 +114,7 @@ def test_hard_cases_that_hold_are_shown_and_the_exit_code_is_0(few_cases, tmp_pa
 
 def test_a_hard_case_that_does_not_hold_is_exit_code_1(few_cases, tmp_path, capsys):
     few_cases(GOOD, BAD)
-    assert cli.main(["frontier", "--stability", "--out", str(tmp_path), "--json"]) == 1
+    assert main(["frontier", "--stability", "--out", str(tmp_path), "--json"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["failed"] == 1
     assert said.err.splitlines()[-1] == "retrieve frontier: 1 of 2 hard cases do not hold; see the page"

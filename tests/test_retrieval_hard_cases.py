@@ -1,7 +1,5 @@
 """The table of hard inputs of every kernel here: ours holds, and the naive formula fails on the same input."""
 
-import logging
-
 import numpy as np
 import pytest
 import torch
@@ -48,25 +46,15 @@ def rows():
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_what_must_hold_does_and_the_naive_formula_fails(rows, kernel):
     of_kernel = [row for row in rows if row.kernel == kernel]
-    if kernel == "PLS" and not of_kernel:
-        pytest.importorskip("sklearn")
     assert of_kernel
     assert [f"{row.case}: {row.ours}" for row in of_kernel if not row.holds] == []
     assert [f"{row.case}: {row.naive}" for row in of_kernel if row.naive_holds] == []
 
 
 def test_every_row_says_all_of_it_and_comes_once(rows):
-    assert {row.kernel for row in rows} | {"PLS"} == set(KERNELS)
+    assert {row.kernel for row in rows} == set(KERNELS)
     assert len({(row.kernel, row.case) for row in rows}) == len(rows)
     assert all(row.case and row.must_hold and row.naive and row.ours for row in rows)
-
-
-def test_a_kernel_whose_library_is_missing_is_left_out_and_that_is_said(monkeypatch, caplog):
-    monkeypatch.setattr(linear, "find_spec", lambda name: None)
-    with caplog.at_level(logging.WARNING), np.errstate(all="ignore"):
-        kernels = {row.kernel for row in linear.hard_cases()}
-    assert kernels == {"CCA", "whitening", "standardising", "cosine"}
-    assert "PLS are left out: they need scikit-learn" in caplog.text
 
 
 def test_a_kernel_that_no_longer_holds_is_shown_so(monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.console.output import PrintableFormatter, print_json, printable, say, show
 
 ROOT = Path(__file__).parents[1]
@@ -55,9 +55,11 @@ def test_everything_that_is_said_goes_the_same_way(capsys):
 
 def test_errors_of_commands_and_of_their_words_are_escaped(tmp_path, capsys):
     name = f"{tmp_path}/\x1b[2J\nretrieve check: 0 error(s)"
-    assert cli.main(["check", name]) == 2
-    with pytest.raises(SystemExit):
-        cli.main(["check", name, "\x1b[31m"])
+    assert main(["check", name]) == 2
+    assert main(["check", name, "\x1b[31m"]) == 2
+    assert main(["\x1b[31m"]) == 2
+    assert main(["query", "--top", "\x1b[31m"]) == 2
+    assert main(["train", "--task", "\x1b[31m"]) == 2
     err = capsys.readouterr().err
     assert "\x1b" not in err
     assert not any(line.startswith("retrieve check: 0 error(s)") for line in err.splitlines())
@@ -74,17 +76,19 @@ def test_a_terminal_of_plain_ascii_is_shown_escapes():
 
 SPEAKING = """
 import sys
-from retrieval.commands import cli
-cli.COMMANDS["check"] = lambda _: (cli.say("said"), cli.print_json({}))
-sys.exit(cli.main(["check", "."]))
+from retrieval.commands.main import main
+from retrieval.console.output import say
+from robot.drivers import discover
+discover.discover = lambda: say("said") or []
+sys.exit(main(["rig", "check", "--json"]))
 """
 
 
 @pytest.mark.parametrize(
     ("streams", "code", "said"),
     [
-        (">/dev/full", 1, "said\nretrieve check: standard output cannot be written: No space left on device\n"),
-        ("2>/dev/full", 0, "{}\n"),
+        (">/dev/full", 1, "said\nretrieve rig: standard output cannot be written: No space left on device\n"),
+        ("2>/dev/full", 0, '{"found": []}\n'),
         (">&-", 0, "said\n"),
         (">&- 2>&-", 0, ""),
     ],

@@ -12,7 +12,7 @@ import pytest
 
 from indexes.store.folder import IndexStore
 from indexes.store.unfinished import FOLDER
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.search import embed
@@ -136,11 +136,11 @@ def test_ctrl_c_keeps_what_was_embedded_and_says_so(own, model, tmp_path, embedd
 
     monkeypatch.setattr(embed.Unfinished, "keep", interrupted)
     command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
-    assert cli.main(command) == 1
+    assert main(command) == 1
     assert f"what was embedded is kept in {index}; the same command goes on with it" in capsys.readouterr().err
     done = sum(embedded)
     monkeypatch.setattr(embed.Unfinished, "keep", keep)
-    assert cli.main(command) == 0
+    assert main(command) == 0
     assert sum(embedded) == PHOTOS
     assert done >= 16
 

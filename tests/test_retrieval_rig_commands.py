@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from retrieval.commands.cli import main
+from retrieval.commands.main import main
 from robot.drivers.discover import Found
 from robot.rig import RIGS
 

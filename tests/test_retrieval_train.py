@@ -537,17 +537,7 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 100000"))
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command = [
-        *torchrun,
-        "-m",
-        "retrieval.commands.cli",
-        "train",
-        str(recording),
-        "--out",
-        str(out),
-        "--config",
-        str(config),
-    ]
+    command = [*torchrun, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
     with running(command, env=environment) as process:
         until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
@@ -595,17 +585,7 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
     out = tmp_path / "m.safetensors"
     config = tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("validate_every = 30", "validate_every = 5"))
-    command = [
-        sys.executable,
-        "-m",
-        "retrieval.commands.cli",
-        "train",
-        str(recording),
-        "--out",
-        str(out),
-        "--config",
-        str(config),
-    ]
+    command = [sys.executable, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
     with running(command) as process:
         until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
     assert state_path(out).exists()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval.commands.cli import main
+from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.model.posterior import Posterior
 from retrieval.search.answer import EXIT_CODES, in_words

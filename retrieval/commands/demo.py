@@ -5,17 +5,25 @@ make the catalogue, the touches of its last ones are the queries; no grasp gives
 """
 
 import os
+import shlex
 import shutil
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from retrieval.commands import cli
+import typer
+
+from retrieval.commands.build_index import build_index
+from retrieval.commands.collect import collect
+from retrieval.commands.options import Values
+from retrieval.commands.query import query
 from retrieval.console.output import say
-from retrieval.data.dataset import Grasp, load_grasps
-from retrieval.errors import BadInput, RetrievalError
-from retrieval.search.answer import EXIT_CODES, MATCH
+from retrieval.errors import BadInput
+
+if TYPE_CHECKING:
+    from retrieval.data.dataset import Grasp
 
 SEED = 20_000
 """Of the demo's objects; the shipped checkpoint was trained on other seeds."""
@@ -23,32 +31,30 @@ PHOTOS, TOUCHES = 3, 3
 """Grasps of each object that give a photo to the catalogue, and those that give a touch."""
 
 
-def run_demo(folder: Path, objects: int = 20, jobs: int = 2) -> None:
-    """Collect, build the index, query; ends with a table and `folder`/query.html. What is there is used again.
+def demo(
+    *,
+    out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
+    objects: Annotated[int, typer.Option(help="how many objects")] = 20,
+    jobs: Annotated[int, typer.Option(help="simulated rigs that work at once")] = 2,
+) -> None:
+    """The whole job on the simulated rig; ends with an HTML page."""
+    from retrieval.data.dataset import load_grasps
 
-    Raises BadInput for a folder of other files, and it or RetrievalError where a command fails, by its exit code.
-    """
-    _check_folder(folder)
-    with _own_state(folder / "state"):
-        recording, catalogue, index = folder / "recording", folder / "catalog", folder / "index"
-        _retrieve(
-            *("collect", "--rig", "sim", "--objects", objects, "--grasps", PHOTOS + TOUCHES),
-            *("--seed", SEED, "--jobs", jobs, "--out", recording, "--preview"),
-        )
+    ours = {"recording", "recording-preview.png", "catalog", "index", "state", "query.html"}
+    if out.exists() and (others := {path.name for path in out.iterdir()} - ours):
+        raise BadInput(f"{out} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
+    with _own_state(out / "state"):
+        recording, catalogue, index = out / "recording", out / "catalog", out / "index"
+        grasps = PHOTOS + TOUCHES
+        _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=jobs, out=recording, preview=True)
         queries = _split(load_grasps(recording), catalogue)
         in_hand = sorted(queries)[len(queries) // 2]
-        _retrieve("build-index", catalogue, "--out", index)
-        gelsight = [word for grasp in queries[in_hand] for word in ("--gelsight", *grasp.touches)]
-        _retrieve("query", *gelsight, "--index", index, "--html", folder / "query.html", "--top", 8)
+        _run(build_index, catalogue, out=index)
+        gelsight = [Values(map(str, grasp.touches)) for grasp in queries[in_hand]]
+        _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
         say(f"in the hand: {in_hand}, an object that the model was never trained on")
         say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
-        say(f"look at {folder / 'query.html'} and {folder / 'recording-preview.png'}")
-
-
-def _check_folder(folder: Path) -> None:
-    ours = {"recording", "recording-preview.png", "catalog", "index", "state", "query.html"}
-    if folder.exists() and (others := {path.name for path in folder.iterdir()} - ours):
-        raise BadInput(f"{folder} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
+        say(f"look at {out / 'query.html'} and {out / 'recording-preview.png'}")
 
 
 @contextmanager
@@ -65,7 +71,19 @@ def _own_state(folder: Path) -> Iterator[None]:
             os.environ["XDG_STATE_HOME"] = before
 
 
-def _split(grasps: Sequence[Grasp], catalogue: Path) -> dict[str, list[Grasp]]:
+def _run(command: Callable[..., object], *arguments: Path, **options: object) -> None:
+    """Say a command as a user would type it, and run it."""
+    words = [command.__name__.replace("_", "-"), *map(str, arguments)]
+    for name, given in options.items():
+        for value in given if isinstance(given, list) else [given]:
+            words.append(f"--{name}")
+            if value is not True:
+                words += value if isinstance(value, Values) else [str(value)]
+    say("$ retrieve " + shlex.join(words))
+    command(*arguments, **options)
+
+
+def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]]":
     """Copy the photos of each object's first grasps into the catalogue; returns its last grasps, by object."""
     by_object: dict[str, list[Grasp]] = defaultdict(list)
     for grasp in grasps:
@@ -77,8 +95,9 @@ def _split(grasps: Sequence[Grasp], catalogue: Path) -> dict[str, list[Grasp]]:
     return {name: own[PHOTOS : PHOTOS + TOUCHES] for name, own in by_object.items() if len(own) > PHOTOS}
 
 
-def _first_places(index: Path, queries: dict[str, list[Grasp]]) -> str:
+def _first_places(index: Path, queries: "dict[str, list[Grasp]]") -> str:
     """How often the true object comes first, and among the first five; and what the verdicts were worth."""
+    from retrieval.search.answer import MATCH
     from retrieval.search.searcher import Searcher
 
     with Searcher.open(index) as searcher:
@@ -96,13 +115,3 @@ def _first_places(index: Path, queries: dict[str, list[Grasp]]) -> str:
         f"among the first five for {five} (chance {chances[1]:.1f}); "
         f'the verdict is "{MATCH}" for {len(matched)}, of which {matched.count(0)} are right'
     )
-
-
-def _retrieve(*arguments: object) -> None:
-    """Say a command as a user would type it, and run it."""
-    words = [str(argument) for argument in arguments]
-    say("$ retrieve " + " ".join(words))
-    code = cli.main(words)
-    if code not in EXIT_CODES.values():  # "none of these" is an answer too
-        failure = BadInput if code == BadInput.exit_code else RetrievalError
-        raise failure(f"`retrieve {words[0]}` failed; what it said stands above")

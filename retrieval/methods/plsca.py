@@ -74,7 +74,7 @@ def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:
     By power iteration: the other algorithm of scikit-learn decomposes the deflated cross matrix in full, and LAPACK's
     gesdd has been seen not to converge on one of ImageNet features after 20 components.
     """
-    from sklearn.cross_decomposition import PLSCanonical  # an optional dependency, slow to import
+    from sklearn.cross_decomposition import PLSCanonical  # slow to import
     from sklearn.exceptions import ConvergenceWarning
 
     # Centring takes one dimension of the rows; more components than the smaller view has directions do not exist.

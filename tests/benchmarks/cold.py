@@ -21,8 +21,8 @@ from tests.benchmarks.query import STAGES, gel_images, write_index
 PHOTOS = 1000
 REPETITIONS = 5
 
-# What `run_query` and `Searcher.open` do, a step at a time, in a process of its own. A step's imports are those that
-# the steps before it have not made.
+# What `retrieve query` and `Searcher.open` do, a step at a time, in a process of its own. A step's imports are those
+# that the steps before it have not made.
 PROGRAM = f"""
 import sys, time
 from importlib import import_module
@@ -33,7 +33,7 @@ def step(name, function):
     value = function()
     ms[name] = 1e3 * (time.perf_counter() - start)
     return value
-names = ("numpy", "PIL.Image", "retrieval.commands.cli", "retrieval.search.searcher", backend, "indexes.kinds.flat")
+names = ("numpy", "PIL.Image", "retrieval.commands.main", "retrieval.search.searcher", backend, "indexes.kinds.flat")
 for name in names:
     step("import " + name, lambda: import_module(name))
 from pathlib import Path
@@ -108,7 +108,7 @@ def _help(repetitions: int) -> Line:
     seconds = []
     for _ in range(repetitions + 1):
         start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "retrieval.commands.cli", "--help"], capture_output=True, check=True)
+        subprocess.run([sys.executable, "-m", "retrieval", "--help"], capture_output=True, check=True)
         seconds.append(time.perf_counter() - start)
     median = 1e3 * statistics.median(seconds[1:])
     return Line("cold", "no tower", f"`retrieve --help` takes {median:.0f} ms", {"help_ms": median})

@@ -45,7 +45,7 @@ from indexes.kinds.choice import ladder
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.spool import Block, Kept
-from retrieval.commands import cli
+from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
 from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -320,7 +320,7 @@ def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
 def collected(folder: Path) -> Path:
     """A small recording of the simulated rig."""
     words = ["collect", "--rig", "sim", "--objects", "60", "--grasps", "2", "--seed", "20000", "--jobs", "2"]
-    if cli.main([*words, "--out", str(folder / "recording")]):
+    if retrieve([*words, "--out", str(folder / "recording")]):
         raise SystemExit("the recording could not be collected")
     return folder / "recording"
 

@@ -5,11 +5,9 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from importlib.util import find_spec
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from retrieval.lab.frontier.points import Point
 from retrieval.model.encode import one_thread
@@ -33,18 +31,11 @@ def timed(points: Sequence[Point], works: Sequence[Callable[[], object]], repeat
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """PyTorch; and numpy, where threadpoolctl is installed, which scikit-learn brings along."""
-    with one_thread(), _one_blas_thread():
-        yield
-
-
-def _one_blas_thread() -> AbstractContextManager[Any]:
-    if find_spec("threadpoolctl") is None:
-        return nullcontext()
+    """PyTorch; and numpy, by threadpoolctl, which scikit-learn brings along."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped, unused-ignore]
 
-    limits: AbstractContextManager[Any] = threadpool_limits(1)
-    return limits
+    with one_thread(), threadpool_limits(1):
+        yield
 
 
 def _seconds(work: Callable[[], object], calls: int) -> float:

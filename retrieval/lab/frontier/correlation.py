@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +55,8 @@ def cca_solver(sample: Sample) -> Row:
         OURS: _ours,
         "eigenvalues of X'X, float64": partial(_by_covariance, np.float64),
         "eigenvalues of X'X, float32": partial(_by_covariance, np.float32),
+        "scikit-learn's NIPALS, first 8": _by_sklearn,
     }
-    if find_spec("sklearn"):
-        solvers["scikit-learn's NIPALS, first 8"] = _by_sklearn
     points = timed(
         [_point(problem, name, solve) for name, solve in solvers.items()],
         [partial(solve, problem) for solve in solvers.values()],

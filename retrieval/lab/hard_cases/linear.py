@@ -1,8 +1,6 @@
 """Canonical correlation, partial least squares, whitening, standardising and cosines of degenerate features."""
 
-import logging
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,6 @@ from retrieval.training.features import Features
 
 Matrix = NDArray[np.float64]
 _CCA, _COSINE = "CCA", "cosine"
-log = logging.getLogger(__name__)
 
 
 def hard_cases() -> Iterator[HardCase]:
@@ -28,12 +25,7 @@ def hard_cases() -> Iterator[HardCase]:
     yield _every_scale()
     yield _more_components_than_rank()
     yield _nan_feature()
-    if find_spec("sklearn"):
-        yield _partial_least_squares()
-    else:
-        log.warning(
-            "hard cases of PLS are left out: they need scikit-learn (pip install 'touch-retrieval[evaluation]')"
-        )
+    yield _partial_least_squares()
     yield _thin_direction()
     yield _constant_feature()
     yield _far_feature()

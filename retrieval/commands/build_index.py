@@ -1,0 +1,66 @@
+"""`retrieve build-index`: make a folder of photos searchable."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import Json, Model
+from retrieval.console.output import print_json, say
+from retrieval.errors import RetrievalError
+
+
+def build_index(
+    catalogue: Annotated[Path, typer.Argument(help="folder: <object>/<photo> or <object>.<ext>")],
+    *,
+    objects_from: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RULE",
+            help="what names a photo's object: folder (the first one, else the file), stem (the file's name without "
+            "its number), or a pattern such as {split}/{object}/{photo} or {object}_{view}.jpg (default: as the index "
+            "has it, else folder)",
+        ),
+    ] = None,
+    model: Model = None,
+    out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
+    kind: Annotated[
+        str | None,
+        typer.Option(help="candidate index (default: exact, unless a bound asks for more); see the README"),
+    ] = None,
+    min_recall: Annotated[
+        float | None,
+        typer.Option(help="least share of touches whose best photo must be found (default: 0.99)"),
+    ] = None,
+    max_ms: Annotated[
+        float | None, typer.Option(help="longest search in milliseconds: candidates and judging them")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make a folder of photos searchable."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.search import build, defaults
+
+    path, why = defaults.find_model(model, out)
+    say(f"model: {path} ({why})")
+    try:
+        report = build.build_index(
+            catalogue,
+            load_checkpoint(path),
+            out,
+            objects_from=objects_from,
+            kind=kind,
+            min_recall=min_recall,
+            max_ms=max_ms,
+        )
+    except KeyboardInterrupt:
+        say(f"what was embedded is kept in {out}; the same command goes on with it")
+        raise
+    defaults.remember("index", out)
+    for line in report.lines():
+        say(line)
+    if json:
+        print_json(report.to_dict())
+    if report.without_photo:
+        count = len(report.without_photo)
+        raise RetrievalError(f"the index is written, but {count} object(s) have no photo that can be read; see above")

@@ -1,0 +1,41 @@
+"""`retrieve check`: lint a recording."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import Json, Recording, read_split
+from retrieval.console.output import print_json, say
+from retrieval.errors import BadInput, RetrievalError
+
+
+def check(
+    recording: Recording,
+    *,
+    split: Annotated[
+        Path | None, typer.Option(help="JSON file with train, validation and test objects to check")
+    ] = None,
+    model: Annotated[Path | None, typer.Option(help="check the split that this checkpoint was trained with")] = None,
+    json: Json = False,
+) -> None:
+    """Lint a recording: broken files, duplicates, leakage, swapped folders."""
+    from retrieval.data.check.recording import check_recording
+
+    if split and model:
+        raise BadInput("give --split or --model, not both")
+    objects = read_split(split)
+    if model:
+        from retrieval.model.checkpoint import load_checkpoint
+
+        objects = load_checkpoint(model).split
+    findings = check_recording(recording, objects)
+    if json:
+        print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
+    for finding in findings:
+        say(f"{finding.severity}: {finding.message}")
+    errors, warnings = (sum(one.severity == severity for one in findings) for severity in ("error", "warning"))
+    say(f"{recording}: {errors} error(s), {warnings} warning(s)")
+    if errors:
+        raise RetrievalError(f"{recording} is not fit for training; see the errors above")

@@ -1,0 +1,98 @@
+"""`retrieve collect`: a recording, by a rig on its own."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from retrieval.console.files import PREVIEW, require_ours
+from retrieval.console.output import say, show
+from retrieval.console.progress import CollectBar
+from retrieval.errors import RetrievalError
+
+
+def collect(
+    *,
+    rig: Annotated[str, typer.Option(help="which rig, by name or TOML file; sim is the simulated one")] = "sim",
+    objects: Annotated[int, typer.Option(help="how many objects")] = 98,
+    grasps: Annotated[int, typer.Option(help="accepted grasps of each object")] = 44,
+    out: Annotated[Path, typer.Option(help="recording folder to write or to go on with")],
+    seed: Annotated[int, typer.Option(help="seed of every random choice")] = 0,
+    jobs: Annotated[int, typer.Option(help="simulated rigs that work at once")] = 1,
+    gate: Annotated[
+        Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the area of contact)")
+    ] = None,
+    preview: Annotated[bool, typer.Option("--preview", help="write a contact sheet, OUT-preview.png")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="print the motions of one attempt at each object; nothing moves")
+    ] = False,
+) -> None:
+    """Collect a recording with a rig on its own; goes on where it was stopped."""
+    if dry_run:
+        _rehearse(rig, objects, seed)
+        return
+    from functools import partial
+
+    from robot.collect import CollectSettings
+    from robot.collect import collect as collect_grasps
+    from robot.recording.attempt_log import acceptance_table
+    from robot.rig import load_rig
+
+    # Beside the recording: every image inside belongs to a grasp. "." and ".." have no name to add something to.
+    folder = out if out.name not in ("", "..") else out.resolve()
+    sheet = folder.with_name(f"{folder.name}-preview.png")
+    if preview:
+        require_ours(sheet, PREVIEW)
+    decide, gate_name = _load_gate(gate)
+    settings = CollectSettings(grasps=grasps)
+    try:
+        with CollectBar() as bar:
+            tallies = collect_grasps(
+                partial(load_rig, rig, seed=seed),
+                out,
+                objects=objects,
+                seed=seed,
+                settings=settings,
+                gate=decide,
+                gate_name=gate_name,
+                jobs=jobs,
+                progress=bar,
+            )
+    except KeyboardInterrupt:
+        say(f"what was collected is whole in {out}; the same command goes on with it")
+        raise
+    for line in acceptance_table(tallies, wanted=settings.grasps).splitlines():
+        say(line)
+    accepted = sum(each.accepted for each in tallies)
+    if accepted == 0:
+        raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl says why")
+    say(f"{out}: {accepted} accepted grasps of {len(tallies)} objects")
+    if preview:
+        from robot.sim.preview import write_preview
+
+        say(f"preview: {write_preview(out, sheet)}")
+
+
+def _rehearse(name: str, objects: int, seed: int) -> None:
+    """`--dry-run`: the motions of one attempt at each object, on stdout; nothing moves, nothing is recorded."""
+    from robot.grasping.attempt import Attempter
+    from robot.grasping.dry_run import without_motion
+    from robot.rig import load_rig
+
+    rig = without_motion(load_rig(name, seed=seed), show)
+    with rig:
+        attempter = Attempter(rig, seed, rig.attempt)
+        for object_id in rig.object_ids(objects):
+            attempt = attempter.run(object_id, 0)
+            say(f"{object_id}: {attempt.reason or 'nothing was moved, nothing was recorded'}")
+
+
+def _load_gate(path: Path | None) -> tuple[Any, str | None]:
+    """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
+    if path is None:
+        return None, None
+    from retrieval.model.stored import file_digest
+    from retrieval.training.grasp_success import load_gate
+
+    gate = load_gate(path)
+    return gate, f"learned, sha256 {file_digest(path)}"

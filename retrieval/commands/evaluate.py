@@ -1,0 +1,70 @@
+"""`retrieve evaluate`: methods compared on objects they never saw."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import DEFAULT_PRESET, INIT, SPLIT, Json, Recording, read_split, training_config
+from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
+from retrieval.console.output import print_json, say
+from retrieval.errors import BadInput
+
+WRITTEN = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
+
+
+def evaluate(
+    recording: Recording,
+    *,
+    out: Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")],
+    methods: Annotated[str | None, typer.Option(help="methods to compare, with commas between (default: all)")] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(metavar="PRESET", help="preset (tiny, small, mobilenet, paper) or TOML file (default: small)"),
+    ] = None,
+    model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
+    init: Annotated[str | None, typer.Option(help=INIT)] = None,
+    iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
+    seeds: Annotated[int, typer.Option(help="trainings of each method")] = 1,
+    seed: Annotated[
+        int | None, typer.Option(help="seed of split, queries and first training, instead of the preset's")
+    ] = None,
+    split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="folder where features of images are kept (default: OUT/features)")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Compare methods on objects they never saw; goes on where it was stopped. Writes a report."""
+    from retrieval.evaluation import run
+    from retrieval.methods import METHODS
+    from retrieval.report.evaluation import write_report
+
+    if model and (preset or init):
+        raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
+    for name, kind in WRITTEN.items():
+        require_ours(out / name, kind)
+    try:
+        results = run.evaluate(
+            recording,
+            out,
+            config=training_config(preset, init, iterations, seed),
+            preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
+            methods=methods.split(",") if methods else tuple(METHODS),
+            model=model,
+            seeds=seeds,
+            split=read_split(split),
+            cache=cache,
+        )
+    except KeyboardInterrupt:
+        say(f"what was made is kept in {out}; the same command goes on with it")
+        raise
+    text, page, *_ = write_report(out, recording)
+    say(f"report: {text}, {page}")
+    if json:
+        print_json(results)
+        return
+    from retrieval.report.results import read_results
+    from retrieval.report.terminal import print_measures
+
+    print_measures(read_results(out))

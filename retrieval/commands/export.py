@@ -1,0 +1,31 @@
+"""`retrieve export`: a checkpoint's touch encoder as ONNX."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import DEFAULT_MODEL, Json
+from retrieval.console.output import print_json, say
+
+
+def export(
+    model: Annotated[str | None, typer.Argument(metavar="MODEL", help=f"checkpoint (default: {DEFAULT_MODEL})")] = None,
+    *,
+    out: Annotated[
+        Path | None, typer.Option(help="file to write (default: beside the checkpoint, ending in .onnx)")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a checkpoint's touch encoder as ONNX; `query` finds it beside the checkpoint and does without PyTorch."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.model.export import export as write_export
+    from retrieval.search import defaults
+
+    path, why = defaults.find_model(model)
+    say(f"model: {path} ({why})")
+    result = write_export(load_checkpoint(path), out)
+    say(str(result))
+    if json:
+        print_json(dataclasses.asdict(result))

@@ -1,0 +1,127 @@
+"""The command line `retrieve`: its commands, and what holds for all of them.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input.
+A command's function is what the command line calls and what Python may call; its docstring is its help.
+"""
+
+import errno
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from retrieval.commands import rig
+from retrieval.commands.build_index import build_index
+from retrieval.commands.check import check
+from retrieval.commands.collect import collect
+from retrieval.commands.demo import demo
+from retrieval.commands.evaluate import evaluate
+from retrieval.commands.export import export
+from retrieval.commands.frontier import frontier
+from retrieval.commands.import_ import import_
+from retrieval.commands.options import Command
+from retrieval.commands.query import query
+from retrieval.commands.train import train
+from retrieval.console.interruption import noticed_interrupts
+from retrieval.console.output import give_up_stdout, prepare_streams, printing, say, show
+from retrieval.version import __version__
+
+LONGEST = 2000
+"""Characters of a message; what stands in a hostile file may be of any length."""
+_WRONG_PATHS = {
+    *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP),
+}
+
+app = typer.Typer(
+    # Without markup nothing is drawn, and rich is not imported.
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+for _command in (demo, collect, import_, check, train, build_index, query, export, evaluate, frontier):
+    _name = _command.__name__.strip("_").replace("_", "-")
+    app.command(_name, cls=Command)(_command)
+app.add_typer(rig.app)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        show(f"touch-retrieval {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def retrieve(
+    *,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="show the program's version and exit"),
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="show the traceback of an error")] = False,
+) -> None:
+    """From the gel images of a grasp, find the catalogue photo of the object in the hand."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    _replace_closed_streams()
+    prepare_streams()
+    program = typer.main.get_command(app)
+    if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that asks what may follow
+        program(prog_name="retrieve")
+    context: Any = None
+    with noticed_interrupts() as interrupts:
+        # Not program.main(), which has its own ideas of Ctrl-C and of readers that left.
+        try:
+            context = program.make_context("retrieve", list(sys.argv[1:] if argv is None else argv))
+            with context:
+                code = program.invoke(context)
+            with printing():
+                sys.stdout.flush()
+            return code or 0
+        except typer.Exit as leaving:  # after --help or --version
+            return leaving.exit_code
+        except typer.TyperException as wrong:
+            return _fail(context, f"{wrong.format_message().rstrip('.')}; see --help", wrong.exit_code)
+        except BrokenPipeError:  # the reader of stdout has left, as `| head` does
+            give_up_stdout()
+            return 1
+        except KeyboardInterrupt:
+            return _stopped(context, interrupts)
+        except Exception as error:
+            if context is not None and context.params["debug"]:
+                raise
+            return _explain(context, error, interrupts)
+
+
+def _stopped(context: Any, interrupts: list[int]) -> int:
+    by = "SIGTERM" if signal.SIGTERM in interrupts else "Ctrl-C"
+    return _fail(context, f"stopped by {by}", 1)
+
+
+def _explain(context: Any, error: Exception, interrupts: list[int]) -> int:
+    """Say what went wrong in one line; returns the exit code."""
+    code = getattr(error, "exit_code", None)  # every error tree of the project carries one
+    if code is not None:
+        return _fail(context, str(error), code)
+    if interrupts:
+        return _stopped(context, interrupts)
+    if isinstance(error, OSError):  # wrong use where another path would have done
+        message = f"{error.filename or 'a file'}: {error.strerror or error}"
+        return _fail(context, message, 2 if error.errno in _WRONG_PATHS else 1)
+    return _fail(context, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
+
+
+def _fail(context: Any, message: str, code: int) -> int:
+    words = ["retrieve"] if context is None else ["retrieve", context.invoked_subcommand]
+    say(f"{' '.join(filter(None, words))}: {message if len(message) <= LONGEST else message[:LONGEST] + ' ...'}")
+    return code
+
+
+def _replace_closed_streams() -> None:
+    """A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout."""
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115

@@ -1,0 +1,90 @@
+"""What several commands share: options, options of several values, and what is read where an option names it."""
+
+import dataclasses
+from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+import typer
+from typer.core import TyperCommand
+
+from indexes.store.regular import read_json
+from retrieval.errors import BadInput
+
+if TYPE_CHECKING:
+    from retrieval.data.dataset import Split
+    from retrieval.model.config import Config
+
+DEFAULT_PRESET = "small"
+DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
+INIT = "first weights of the towers: random, imagenet, or a state dict file"
+SPLIT = "JSON file with train, validation and test objects"
+
+Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
+Model = Annotated[str | None, typer.Option(help=f"checkpoint (default: {DEFAULT_MODEL})")]
+Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
+
+_BETWEEN = "\0"  # which no word of a command line holds
+
+
+class Values(tuple[str, ...]):
+    """The values after one option that takes several, such as the gel images of one grasp."""
+
+    @classmethod
+    def read(cls, joined: str) -> Self:
+        """As `Command` hands them over."""
+        return cls(joined.split(_BETWEEN))
+
+
+class Command(TyperCommand):
+    """A command whose options of several values, those with a metavar in "...", take the words up to the next option.
+
+    What is named like an option is no option's value: `--out --preview` has forgotten the folder.
+    """
+
+    def get_short_help_str(self, limit: int = 0) -> str:
+        """Its help in a list of commands, not cut."""
+        return self.help or ""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the values of such an option to one word; see `Values.read`."""
+        options = {name: each for each in self.params for name in each.opts if name.startswith("-")}
+        joined: list[str] = []
+        while args and args[0] != "--":
+            word, *args = args
+            joined.append(word)
+            option = options.get(word)
+            if option is None or getattr(option, "is_flag", False):
+                continue
+            if (not args or args[0] in options) and not ctx.resilient_parsing:
+                ctx.fail(f"{word} needs a value")
+            if (option.metavar or "").endswith("..."):
+                values = list(takewhile(lambda value: not value.startswith("-"), args))
+                joined.append(_BETWEEN.join(values))
+                args = args[len(values) :]
+            else:
+                joined += args[:1]
+                args = args[1:]
+        return super().parse_args(ctx, joined + args)
+
+
+def read_split(path: Path | None) -> "Split | None":
+    """The split of objects that `--split` names. Raises BadInput."""
+    if path is None:
+        return None
+    from retrieval.data.dataset import Split
+
+    try:
+        return Split.from_dict(read_json(path))
+    except ValueError as error:
+        raise BadInput(f"{path} is not a JSON file: {error}") from error
+
+
+def training_config(preset: str | None, init: str | None, iterations: int | None, seed: int | None) -> "Config":
+    """A preset or TOML file, and what options say instead. Raises ConfigError."""
+    from retrieval.model.config import load_config
+
+    config = load_config(preset or DEFAULT_PRESET)
+    changed: dict[str, Any] = {name: value for name, value in {"init": init, "seed": seed}.items() if value is not None}
+    steps = config.training.iterations if iterations is None else iterations
+    return dataclasses.replace(config, training=dataclasses.replace(config.training.of_steps(steps), **changed))

@@ -1,0 +1,80 @@
+"""`retrieve query`: which object is in the hand."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import Json, Values
+from retrieval.console.files import PAGE, require_ours, text_bytes, write_output
+from retrieval.console.output import print_json, say
+
+
+def query(
+    *,
+    gelsight: Annotated[
+        list[Values],
+        typer.Option(
+            parser=Values.read,
+            metavar="IMAGE...",
+            help="gel images of one grasp, one per finger; again for more grasps of the same object",
+        ),
+    ],
+    background: Annotated[
+        Values | None,
+        typer.Option(
+            parser=Values.read,
+            metavar="IMAGE...",
+            help="no-contact frames, one per finger: some models subtract them, others see by them if there is a "
+            "contact",
+        ),
+    ] = None,
+    index: Annotated[
+        str | None, typer.Option(help="index folder (default: ./index, else the last one built from this folder)")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
+    top: Annotated[int, typer.Option(help="objects to return")] = 10,
+    candidates: Annotated[
+        int | None, typer.Option(help="photos that the full classifier judges (default: what the index needs)")
+    ] = None,
+    none_prior: Annotated[
+        float,
+        typer.Option(metavar="P", help="probability, before anything is felt, that the catalogue lacks the object"),
+    ] = 0.5,
+    json: Json = False,
+    html: Annotated[Path | None, typer.Option(help="write a page with photos and gel images")] = None,
+    no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
+) -> int:
+    """Which object is in the hand?"""
+    from retrieval.search import defaults
+
+    path, why = defaults.find_index(index)
+    if index is None:
+        say(f"index: {path} ({why})")
+    from retrieval.search.answer import EXIT_CODES, in_words
+    from retrieval.search.searcher import Searcher
+
+    if html:
+        require_ours(html, PAGE)
+    searcher = Searcher.open(path, model=model, verify=not no_verify)
+    result = searcher.query(
+        [[Path(image) for image in grasp] for grasp in gelsight],
+        background=None if background is None else [Path(image) for image in background],
+        top=top,
+        candidates=candidates,
+        none_prior=none_prior,
+    )
+    if html:
+        from retrieval.report.query import query_html
+
+        write_output(html, text_bytes(query_html(result, searcher.catalogue)), PAGE)
+        say(f"page: {html}")
+    say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
+    if json:
+        print_json(result.to_dict())
+    else:
+        from retrieval.report.terminal import print_table
+
+        print_table(result)
+    say(in_words(result))
+    return EXIT_CODES[result.verdict]

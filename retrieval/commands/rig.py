@@ -1,0 +1,83 @@
+"""`retrieve rig`: what a rig of real devices is made of, and where its camera stands."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from retrieval.commands.options import Command, Json
+from retrieval.console.files import HAND_EYE, require_ours
+from retrieval.console.output import print_json, say, show
+from retrieval.errors import RetrievalError
+
+if TYPE_CHECKING:
+    from robot.sight.hand_eye import Errors
+
+HELP = "See what a rig of real devices is made of, and calibrate its camera."
+
+app = typer.Typer(name="rig", help=HELP, short_help=HELP, subcommand_metavar="TASK [ARGS]...")
+
+
+@app.command(cls=Command)
+def check(
+    *,
+    rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list what is connected)")] = None,
+    no_motion: Annotated[bool, typer.Option("--no-motion", help="leave arm and jaws where they are")] = False,
+    json: Json = False,
+) -> None:
+    """List what is connected, or exercise each device of a rig gently."""
+    from robot.drivers.discover import discover
+    from robot.rig import load_rig
+    from robot.rig_check import check_rig
+
+    if rig is None:
+        found = discover()
+        if json:
+            print_json({"found": [dataclasses.asdict(device) for device in found]})
+            return
+        for device in found:
+            for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
+                show(line)
+        say(f"{len(found)} device(s) found; the lines above go into a rig's file" if found else "no device was found")
+        return
+    rows = []
+    for row in check_rig(load_rig(rig, seed=0), motion=not no_motion):
+        rows.append(row)
+        if not json:
+            show(row.line())
+    if json:
+        print_json({"devices": [dataclasses.asdict(row) for row in rows]})
+    if failed := sum(row.failure is not None for row in rows):
+        raise RetrievalError(f"{failed} of {len(rows)} checks failed; see above")
+
+
+@app.command(cls=Command)
+def calibrate(
+    points: Annotated[
+        Path,
+        typer.Argument(help="CSV: camera_x_mm, camera_y_mm, camera_z_mm, rig_x_mm, rig_y_mm, rig_z_mm"),
+    ],
+    *,
+    out: Annotated[Path, typer.Option(help="file to write")] = Path("hand_eye.json"),
+) -> None:
+    """Where the camera stands, from points known in its frame and the rig's."""
+    from robot.sight.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
+
+    require_ours(out, HAND_EYE)
+    found = fit_hand_eye(*read_pairs(points))
+    for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
+        say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")
+    if found.warning:
+        say(f"warning: {found.warning}")
+    if found.rigid_errors.loo_mean_mm > SUSPECT_MM:
+        raise RetrievalError(f"nothing was written: an arm cannot be steered by points {SUSPECT_MM:g} mm off and more")
+    found.save(out)
+    say(f"{out}: written from {len(found.rig_mm)} points; name it as hand_eye under [camera]")
+
+
+def _off_by(errors: "Errors") -> str:
+    return (
+        f"points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "
+        f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
+    )
