@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from retrieval.commands import cli
+from retrieval.commands.main import main
 from retrieval.model.stored import read_header
 from retrieval.search.answer import EXIT_CODES
 from robot.recording.folder import RecordingWriter, read_recording
@@ -47,14 +47,14 @@ def test_a_recording(tmp_path, recording):
 
 def test_an_index_and_the_answer_to_a_query(tmp_path, catalogue, model, touch, capsys):
     index = tmp_path / "index"
-    assert cli.main(["build-index", str(catalogue), "--model", str(model), "--out", str(index)]) == 0
+    assert main(["build-index", str(catalogue), "--model", str(model), "--out", str(index)]) == 0
     generation = index / (index / "CURRENT").read_text().strip()
     check(2, json.loads((generation / "manifest.json").read_text()))
     check(3, json.loads(next(generation.glob("rows-*.jsonl")).read_text().splitlines()[0]))
     named = {re.sub(r"-\d+", "-000005", path.name) for path in generation.iterdir()}
     assert named <= set(re.findall(r"^ {0,2}(\S+\.\w+) ", text_of(PAGE), re.M))
     capsys.readouterr()
-    cli.main(["query", "--gelsight", *map(str, touch), "--index", str(index), "--json"])
+    main(["query", "--gelsight", *map(str, touch), "--index", str(index), "--json"])
     document = json.loads(capsys.readouterr().out)
     check(5, document)
     check(6, document["results"][0])
@@ -72,7 +72,7 @@ def test_the_exit_codes_of_a_query():
 @pytest.mark.slow
 def test_the_results_of_an_evaluation(tmp_path, recording):
     quick = ["--preset", "tiny", "--iterations", "2", "--methods", "late_fusion,chance"]
-    assert cli.main(["evaluate", str(recording), "--out", str(tmp_path), *quick]) == 0
+    assert main(["evaluate", str(recording), "--out", str(tmp_path), *quick]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
     check(7, results)
     method = results["methods"]["late_fusion"]
