@@ -1,4 +1,5 @@
-"""docs/reference.md, from the docstrings of the public names: `python -m tests.reference` writes it anew."""
+"""docs/reference.md, from the docstrings of the public names, and docs/commands.md, from the commands' help:
+`python -m tests.reference` writes them anew."""
 
 import argparse
 import ast
@@ -7,15 +8,21 @@ import inspect
 import itertools
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import typer
+from typer.testing import CliRunner
 
 import indexes
 import retrieval
 import robot
+from retrieval.commands.main import app
 
 PACKAGES = (retrieval, robot, indexes)
 PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
+COMMANDS = PAGE.with_name("commands.md")
 MADE_BY_HAND = (robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
 """Classes that a user makes an object of; all others come out of a function."""
 HEAD = """# Reference
@@ -24,6 +31,14 @@ The public names of the three packages, from their docstrings; `python -m tests.
 example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `model.safetensors` and the gel
 images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported when it is used: `import retrieval` alone
 costs nothing.
+"""
+WIDTH = 98
+"""Of help in a terminal of 100 columns."""
+COMMANDS_HEAD = """# Commands
+
+Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input; `query` adds 3 to 5 for its
+[verdicts](answers.md). With `--json`, stdout holds one JSON document, and everything else goes to stderr. `python -m
+tests.reference` writes this page from each command's `--help`.
 """
 
 
@@ -104,12 +119,26 @@ def _paragraph(text: str) -> str:
     return f"```\n{text}\n```" if columns else text
 
 
+def commands() -> str:
+    """The whole page of the commands."""
+    return COMMANDS_HEAD + "".join(_help("retrieve", typer.main.get_command(app)))
+
+
+def _help(title: str, command: Any) -> Iterator[str]:
+    """Of a command, and of those below it."""
+    asked = CliRunner().invoke(app, [*title.split()[1:], "--help"], prog_name="retrieve", terminal_width=WIDTH)
+    yield f"\n## {title}\n\n```\n{asked.stdout.strip()}\n```\n"
+    for name, below in getattr(command, "commands", {}).items():
+        yield from _help(f"{title} {name}", below)
+
+
 def main(arguments: list[str]) -> None:
-    """Write the page."""
+    """Write the pages."""
     argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__).parse_args(arguments)
     PAGE.parent.mkdir(exist_ok=True)
-    PAGE.write_text(reference(), "utf-8")
-    print(PAGE)
+    for page, text in ((PAGE, reference()), (COMMANDS, commands())):
+        page.write_text(text, "utf-8")
+        print(page)
 
 
 if __name__ == "__main__":

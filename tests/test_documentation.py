@@ -1,6 +1,7 @@
 """What README and docs/ tell people to run does run; the notebooks have tests/test_notebooks.py."""
 
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,8 @@ from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
 from tests import synthetic
 from tests.documents import PAGES, README, ROOT, blocks, text_of
+from tests.reference import COMMANDS
+from tests.reference import commands as commands_page
 from tests.replay_rig import replay_file
 from tests.test_project import pins
 from tests.test_retrieval_rig_commands import POINTS
@@ -115,10 +118,13 @@ def test_every_python_command_exists():
 
 
 @pytest.mark.skipif(typer.__version__ != pins("constraints.txt")["typer"], reason="typers lay help out differently")
-def test_the_help_in_the_pages_is_what_the_program_prints(monkeypatch, capsys):
+def test_the_help_of_every_command_stands_in_its_page(monkeypatch, capsys):
+    assert text_of(COMMANDS) == commands_page(), "run `python -m tests.reference`"
     monkeypatch.setenv("COLUMNS", "100")
-    assert main(["--help"]) == 0
-    assert capsys.readouterr().out.strip() in text_of(ROOT / "docs" / "commands.md")
+    for asked in re.findall("^## retrieve ?(.*)$", text_of(COMMANDS), re.M):
+        assert main([*asked.split(), "--help"]) == 0
+        assert capsys.readouterr().out.strip() in text_of(COMMANDS)
+    assert set(SHORTER) <= set(re.findall(r"^## retrieve (\S+)$", text_of(COMMANDS), re.M))
 
 
 class FakeGel:

@@ -26,7 +26,7 @@ def build_index(
     out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
     kind: Annotated[
         str | None,
-        typer.Option(help="candidate index (default: exact, unless a bound asks for more); see the README"),
+        typer.Option(help="candidate index (default: exact, unless a bound asks for more); see docs/catalogue.md"),
     ] = None,
     min_recall: Annotated[
         float | None,
