@@ -11,7 +11,6 @@ from retrieval.errors import ConfigError, DatasetError
 from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation, run
 from retrieval.lab.frontier.candidates import default_k, ranks
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.contact import Point as SimulationPoint
 from retrieval.lab.frontier.correlation import Problem, _by_covariance, _ours, known_problem
 from retrieval.lab.frontier.formats import FORMATS, encoders
 from retrieval.lab.frontier.grasps import sets_of
@@ -32,18 +31,6 @@ def panel(*points, tolerance=1.0):
     return Panel("errors", "one go", "%", "the truth", tolerance, made, 0.1)
 
 
-def simulation(calls=None):
-    def points(name):
-        def give(**settings):
-            if calls is not None:
-                calls.append(name)
-            return (SimulationPoint(f"{name}, layer", "8x8, tolerance 0.1", 1e-3, -2.0, "%", "a closed form", True),)
-
-        return give
-
-    return {name: points(name) for name in ("contact", "closing", "gel_optics")}
-
-
 @pytest.fixture(scope="module")
 def unseen(tmp_path_factory):
     """A recording of eight objects that no model was trained on, four grasps each."""
@@ -53,7 +40,7 @@ def unseen(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sample(unseen, model, tmp_path_factory):
-    return Sample(model, lambda: unseen, simulation(), tmp_path_factory.mktemp("features"), TINY, quiet=True)
+    return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY, quiet=True)
 
 
 @pytest.fixture(scope="module")
@@ -225,14 +212,13 @@ def test_images_have_the_default_size_in_a_query(rows, sample):
 
 
 def test_the_rig_solves_contacts_at_the_default():
-    from retrieval.lab.frontier.contact import contact_points
+    from retrieval.lab.frontier.contact import contact_panels
     from robot.sim.pinch import Hand
 
-    points = contact_points(rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)
+    panels = contact_panels(1, rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)
     hand = Hand()
     wanted = f"{hand.grid[0]}x{hand.grid[1]}, tolerance {hand.tolerance:g}"
-    assert {point.setting.removesuffix(", padded") for point in points if point.is_default} == {wanted}
-    assert sum(point.is_default for point in points) == 3
+    assert [panel.default.name for panel in panels] == [wanted] * 3
 
 
 # Sample ----------------------------------------------------------------------------------------------------
@@ -247,14 +233,14 @@ def test_no_grasp_gives_both_a_photo_and_a_touch_and_every_object_gives_both(sam
 
 def test_objects_that_the_model_was_trained_on_are_left_out(model, recording, tmp_path):
     split = load_checkpoint(model).split
-    own = Sample(model, lambda: recording, {}, tmp_path, TINY, quiet=True)
+    own = Sample(model, lambda: recording, tmp_path, TINY, quiet=True)
     assert {grasp.object_id for grasp in own.grasps} == set(split.test)
 
 
 def test_a_recording_of_trained_objects_only_is_refused(model, tmp_path):
     split = load_checkpoint(model).split
     few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
-    own = Sample(model, lambda: few, {}, tmp_path, TINY, quiet=True)
+    own = Sample(model, lambda: few, tmp_path, TINY, quiet=True)
     assert split is not None
     with pytest.raises(DatasetError, match="two objects or more that the model was not trained on"):
         _ = own.grasps
@@ -320,10 +306,17 @@ def nobody():
 
 
 @pytest.fixture
-def bare(model, tmp_path):
-    """A sample without a recording; and the simulated rig's calls."""
+def bare(model, tmp_path, monkeypatch):
+    """A sample without a recording; and the names of the rows that were measured, each of one point."""
     calls = []
-    return Sample(model, nobody, simulation(calls), tmp_path / "features", TINY, quiet=True), calls
+
+    def measuring(name):
+        if name not in APPROXIMATIONS:
+            return load_approximation(name)
+        return lambda sample: calls.append(name) or Row(name, "text", (panel((1e-3, 2)),))
+
+    monkeypatch.setattr(run, "load_approximation", measuring)
+    return Sample(model, nobody, tmp_path / "features", TINY, quiet=True), calls
 
 
 def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
@@ -334,8 +327,8 @@ def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
     assert list(document["rows"]) == ["contact", "closing"]
     assert json.loads((tmp_path / "frontier.json").read_text()) == document
     point = document["rows"]["contact"]["panels"][0]["points"][0]
-    assert (point["series"], point["setting"], point["error"]) == ("8x8", "tolerance 0.1", 2.0)
-    assert (point["recommended"], point["pareto"], point["is_default"]) == (True, True, True)
+    assert (point["setting"], point["error"], point["seconds"]) == ("s0", 2, 1e-3)
+    assert (point["recommended"], point["pareto"], point["is_default"]) == (True, True, False)
 
 
 def test_a_second_run_measures_nothing_again_unless_what_made_it_changed(bare, tmp_path):
@@ -355,15 +348,17 @@ def test_a_damaged_part_is_measured_again(bare, tmp_path):
     assert calls == ["contact"] * 2
 
 
-def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path):
+def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, monkeypatch):
     made, calls = bare
+    measuring = run.load_approximation
 
-    def stop(**settings):
+    def stop(sample):
         raise KeyboardInterrupt
 
-    stopped = dataclasses.replace(made, simulation={**made.simulation, "closing": stop})
-    with pytest.raises(KeyboardInterrupt):
-        run.measure(stopped, tmp_path, ["contact", "closing"])
+    with monkeypatch.context() as stopping:
+        stopping.setattr(run, "load_approximation", lambda name: stop if name == "closing" else measuring(name))
+        with pytest.raises(KeyboardInterrupt):
+            run.measure(made, tmp_path, ["contact", "closing"])
     run.measure(made, tmp_path, ["contact", "closing"])
     assert calls == ["contact", "closing"]
 

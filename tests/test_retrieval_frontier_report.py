@@ -1,7 +1,6 @@
 """`retrieve frontier` as users meet it: plots, a page, exit codes."""
 
 import json
-from dataclasses import dataclass
 
 import pytest
 
@@ -9,23 +8,11 @@ from retrieval.commands.main import main
 from retrieval.lab import reports as frontier_report
 from retrieval.lab.frontier.points import Panel, Point, Row
 from retrieval.lab.frontier.report import write_frontier
-from retrieval.lab.hard_cases import rig as of_robot
-from retrieval.lab.hard_cases.run import run_hard_cases
+from retrieval.lab.hard_cases import run
+from retrieval.lab.hard_cases.case import HardCase
 
-
-@dataclass(frozen=True)
-class Case:
-    kernel: str
-    case: str
-    must_hold: str
-    naive: str
-    ours: str
-    holds: bool
-    naive_holds: bool
-
-
-GOOD = Case("top k", "a <NaN>", "is refused", "ranked first", "refused", True, False)
-BAD = Case("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
+GOOD = HardCase("top k", "a <NaN>", "is refused", "ranked first", "refused", True, False)
+BAD = HardCase("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
 
 
 def document(*panels, skipped=None):
@@ -93,11 +80,9 @@ def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, caps
 @pytest.fixture
 def few_cases(monkeypatch):
     """Packages that have no hard case but what a test gives the robot."""
-    for place in ("retrieval.lab.hard_cases.vectors", "retrieval.lab.hard_cases"):
-        monkeypatch.setattr(f"{place}.hard_cases", tuple)
 
     def give(*cases):
-        monkeypatch.setattr(of_robot, "hard_cases", lambda: cases)
+        monkeypatch.setattr(run, "hard_cases", lambda package: cases if package == "robot" else ())
 
     return give
 
@@ -121,7 +106,8 @@ def test_a_hard_case_that_does_not_hold_is_exit_code_1(few_cases, tmp_path, caps
     assert "DOES NOT HOLD" in (tmp_path / "stability.html").read_text()
 
 
-def test_cases_name_the_package_that_they_are_of():
-    made = run_hard_cases({"one": lambda: (GOOD,), "other": lambda: (BAD,)}, quiet=True)
-    assert [case["package"] for case in made["cases"]] == ["one", "other"]
+def test_cases_name_the_package_that_they_are_of(monkeypatch):
+    monkeypatch.setattr(run, "hard_cases", lambda package: {"robot": [BAD], "indexes": [GOOD]}.get(package, []))
+    made = run.run_hard_cases(quiet=True)
+    assert [case["package"] for case in made["cases"]] == ["indexes", "robot"]
     assert made["failed"] == 1

@@ -340,13 +340,6 @@ def test_the_command_says_in_a_line_what_is_wrong(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: ")
 
 
-def test_the_frontier_has_a_point_for_each_degree_and_error_falls():
-    points = photometric.optics_points("gelsight_mini")
-    assert [point.setting for point in points] == [f"gelsight_mini, degree {degree}" for degree in (1, 2, 3, 4)]
-    assert points[0].error > points[1].error > points[2].error > 1
-    assert all(point.seconds > 0 for point in points)
-
-
 # Real presses ----------------------------------------------------------------------------------------------
 
 

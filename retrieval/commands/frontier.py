@@ -32,21 +32,9 @@ def frontier(
     from retrieval.lab import reports
 
     if stability:
-        from retrieval.lab.hard_cases import rig
-
-        document = reports.report_stability(out, robot=rig.hard_cases)
+        document = reports.report_stability(out)
     else:
-        from retrieval.lab.frontier.contact import closing_points, contact_points
-        from retrieval.lab.optics.photometric import optics_points
-
-        document = reports.report_frontier(
-            out,
-            model=model,
-            recording=recording,
-            simulation={"contact": contact_points, "closing": closing_points, "gel_optics": optics_points},
-            only=only or (),
-            quick=quick,
-        )
+        document = reports.report_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
     if json:
         print_json(document)
     if document.get("failed"):

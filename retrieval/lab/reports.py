@@ -1,7 +1,4 @@
-"""`retrieve frontier`: error against run time of every approximation, and the hard cases of every numerical kernel.
-
-What the simulated rig has to say is handed over: only the command line knows it.
-"""
+"""`retrieve frontier`: error against run time of every approximation, and the hard cases of every numerical kernel."""
 
 import json
 import os
@@ -15,9 +12,9 @@ from retrieval.console.output import say
 from retrieval.console.progress import CollectBar
 from retrieval.lab.frontier.report import write_frontier
 from retrieval.lab.frontier.run import measure
-from retrieval.lab.frontier.sample import QUICK, Sample, Scale, Simulation
+from retrieval.lab.frontier.sample import QUICK, Sample, Scale
 from retrieval.lab.hard_cases.report import write_stability
-from retrieval.lab.hard_cases.run import Source, lines, run_hard_cases
+from retrieval.lab.hard_cases.run import lines, run_hard_cases
 from retrieval.search import defaults
 from robot.collect import CollectSettings, collect
 from robot.rig import load_rig
@@ -31,7 +28,6 @@ def report_frontier(
     *,
     model: str | None,
     recording: Path | None,
-    simulation: Simulation,
     only: Sequence[str] = (),
     quick: bool = False,
 ) -> dict[str, Any]:
@@ -46,7 +42,7 @@ def report_frontier(
     say(f"model: {path} ({why})")
     out.mkdir(parents=True, exist_ok=True)
     grasps = partial(_recording, recording, out, quick)
-    sample = Sample(path, grasps, simulation, out / "features", QUICK if quick else Scale())
+    sample = Sample(path, grasps, out / "features", QUICK if quick else Scale())
     try:
         document = measure(sample, out, only)
     except KeyboardInterrupt:
@@ -76,16 +72,13 @@ def _recording(given: Path | None, out: Path, quick: bool) -> Path:
     return folder
 
 
-def report_stability(out: Path, *, robot: Source) -> dict[str, Any]:
+def report_stability(out: Path) -> dict[str, Any]:
     """Run the hard cases and write `out`/stability.json and stability.html; returns what the first holds.
 
-    robot: gives those of the simulated rig. "failed" counts those that do not hold.
+    "failed" counts those that do not hold.
     """
     _require_ours(out, "stability")
-    from retrieval.lab.hard_cases import hard_cases as of_retrieval
-    from retrieval.lab.hard_cases.vectors import hard_cases as of_indexes
-
-    document = run_hard_cases({"retrieval": of_retrieval, "indexes": of_indexes, "robot": robot})
+    document = run_hard_cases()
     out.mkdir(parents=True, exist_ok=True)
     write_output(out / "stability.json", (json.dumps(document, indent=1) + "\n").encode(), RESULTS)
     for line in lines(document):

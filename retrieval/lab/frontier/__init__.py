@@ -22,9 +22,9 @@ APPROXIMATIONS = {
     "grasps": "retrieval.lab.frontier.grasps:grasps",
     "cca_solver": "retrieval.lab.frontier.correlation:cca_solver",
     "cca_components": "retrieval.lab.frontier.correlation:cca_components",
-    "contact": "retrieval.lab.frontier.simulated:contact",
-    "closing": "retrieval.lab.frontier.simulated:closing",
-    "gel_optics": "retrieval.lab.frontier.simulated:gel_optics",
+    "contact": "retrieval.lab.frontier.contact:contact",
+    "closing": "retrieval.lab.frontier.contact:closing",
+    "gel_optics": "retrieval.lab.frontier.optics:gel_optics",
 }
 """Name -> the function that measures it, imported when it is used."""
 

@@ -1,18 +1,16 @@
-"""Error against run time of the simulation's approximations, as data: what is left out and what that costs."""
+"""The simulated rig's approximations: grid and tolerance of the gel's contact, time step of the closing jaws."""
 
 import math
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
 from retrieval.lab.contact.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
-from retrieval.lab.contact.closed_forms import closed_form_table as closed_form_table
 from retrieval.lab.contact.closing_jaws import Jaws, LinearLaw, Motion, close
-from retrieval.lab.hard_cases.contact import stability_sweep as stability_sweep
+from retrieval.lab.frontier.clock import timed
+from retrieval.lab.frontier.points import Panel, Point, Row, smallest
+from retrieval.lab.frontier.sample import Sample
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Contact, Layer, press
 from robot.sim.gel.optics import LedOptics
@@ -20,115 +18,98 @@ from robot.sim.gel.surface import Field, Surface
 from robot.sim.pinch import Hand
 
 LAYER = Layer(HALF_SPACE.modulus_mpa, 0.48, 2.0)
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Point:
-    """One setting of one approximation: what it costs in `seconds`, and its `error` in `unit` against `reference`.
-
-    is_default: whether the simulated rig uses it unless told otherwise.
-    """
-
-    approximation: str
-    setting: str
-    seconds: float
-    error: float
-    unit: str
-    reference: str
-    is_default: bool = False
-
-
-def timed(work: Callable[[], T], repeats: int = 5) -> tuple[float, T]:
-    """The shortest of `repeats` runs in s, after one that fills the caches, and what the work gave."""
-    result, best = work(), math.inf
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - start)
-    return best, result
-
+CAMERA_NOISE = 0.8
+"""Grey levels of a sensor's read noise: what the model can see lies above."""
 
 # Contact ---------------------------------------------------------------------------------------------------
 
 
-def contact_points(
-    *,
-    rows: tuple[int, ...] = (30, 60, 120, 240),
-    tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4),
-    reference_rows: int = 480,
-) -> tuple[Point, ...]:
-    """Grid, tolerance and padding of the contact solver, for a ball of 4 mm.
+def contact(sample: Sample) -> Row:
+    """Grid and tolerance of the gel's contact. Under a minute."""
+    text = (
+        "A ball pressed into the gel: on a half-space against Hertz's closed form, on a layer, which the simulated "
+        "fingers have, against a fine grid. Then what the camera sees of a ball with ridges 1.5 mm apart, the finest "
+        "that objects are drawn with: this decides the grid, since an error below the camera's noise is not seen. Each "
+        "colour is a grid, each point a tolerance of the solver."
+    )
+    repeats = sample.scale.repeats
+    panels = contact_panels(repeats, (30, 120), (1e-1, 1e-2), 240) if sample.scale.quick else contact_panels(repeats)
+    return Row("Contact of the gel: grid and tolerance", text, panels)
 
-    On the half-space against Hertz; on a layer of 2 mm against `reference_rows` at a tolerance of 1e-6, of which each
-    number of rows must be an even part; then the gel image of a ridged ball against the same grid's. About half a
-    minute.
+
+def contact_panels(
+    repeats: int,
+    rows: Sequence[int] = (30, 60, 120, 240),
+    tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
+    reference_rows: int = 480,
+) -> tuple[Panel, Panel, Panel]:
+    """Grid, tolerance and padding of the contact solver.
+
+    A ball of 4 mm on the half-space against Hertz; on a layer of 2 mm against `reference_rows` at a tolerance of 1e-6,
+    of which each number of rows must be an even part; then the gel image of a ridged ball against the same grid's.
     """
     return (
-        *_hertz_points(rows, tolerances),
-        *_layer_points(rows, tolerances, reference_rows),
-        *_picture_points(rows, tolerances, reference_rows),
+        _half_space(repeats, rows, tolerances),
+        _layer(repeats, rows, tolerances, reference_rows),
+        _gel_image(repeats, rows, tolerances, reference_rows),
     )
 
 
-def _hertz_points(rows: tuple[int, ...], tolerances: tuple[float, ...], force_n: float = 0.5) -> Iterator[Point]:
+def _half_space(repeats: int, rows: Sequence[int], tolerances: Sequence[float], force_n: float = 0.5) -> Panel:
     depth = hertz(force_n, BALL_MM, HALF_SPACE.plane_modulus_mpa)[1]
+    points, works = list[Point](), list[Callable[[], Contact]]()
     for grid in map(Grid.of_field, rows):
         for tolerance in tolerances:
-            seconds, contact = timed(partial(pressed_ball, grid, HALF_SPACE, force_n, tolerance))
-            error = percent(contact.approach_mm, depth)
-            setting = f"{grid}, tolerance {tolerance:g}"
-            yield Point(
-                "contact grid and tolerance, half-space",
-                setting,
-                seconds,
-                error,
-                "% of depth",
-                "Hertz",
-                _is_default(grid, tolerance),
-            )
+            works.append(partial(pressed_ball, grid, HALF_SPACE, force_n, tolerance))
+            points.append(_point(grid, tolerance, percent(works[-1]().approach_mm, depth)))
+    return _panel("half-space", "% of depth", "Hertz", 0.1, points, works, repeats)
 
 
-def _layer_points(rows: tuple[int, ...], tolerances: tuple[float, ...], reference_rows: int) -> Iterator[Point]:
+def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
     fine = pressed_ball(Grid.of_field(reference_rows), LAYER, 1.0, 1e-6)
-    reference = f"{Grid.of_field(reference_rows)}, tolerance 1e-06"
+    points, works = list[Point](), list[Callable[[], Contact]]()
     for grid in map(Grid.of_field, rows):
         exact = _at_centres(fine.displacement_mm, reference_rows // grid.rows)
         for padded in (False, True):
             for tolerance in tolerances:
-                seconds, contact = timed(partial(pressed_ball, grid, LAYER, 1.0, tolerance, padded))
-                error = 1e3 * math.sqrt(float(np.mean((contact.displacement_mm - exact) ** 2)))
-                setting = f"{grid}, tolerance {tolerance:g}, {'padded' if padded else 'periodic'}"
-                yield Point(
-                    "contact grid and tolerance, layer",
-                    setting,
-                    seconds,
-                    error,
-                    "um rms of surface",
-                    reference,
-                    padded and _is_default(grid, tolerance),
-                )
+                works.append(partial(pressed_ball, grid, LAYER, 1.0, tolerance, padded))
+                error = 1e3 * math.sqrt(float(np.mean((works[-1]().displacement_mm - exact) ** 2)))
+                points.append(_point(grid, tolerance, error, padded))
+    reference = f"{Grid.of_field(reference_rows)}, tolerance 1e-06"
+    return _panel("layer", "um rms of surface", reference, 0.1, points, works, repeats)
 
 
-def _picture_points(rows: tuple[int, ...], tolerances: tuple[float, ...], reference_rows: int) -> Iterator[Point]:
+def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
     """What the camera sees of ridges: the error that matters to who looks at gel images."""
     exact = _picture(_pressed_ridges(_of_gel(reference_rows), 1e-6))
-    reference = f"{_of_gel(reference_rows)}, tolerance 1e-06"
+    points, works = list[Point](), list[Callable[[], Contact]]()
     for grid in map(_of_gel, rows):
         for tolerance in tolerances:
-            seconds, contact = timed(partial(_pressed_ridges, grid, tolerance))
-            error = math.sqrt(float(np.mean((_picture(contact) - exact) ** 2)))
-            setting = f"{grid}, tolerance {tolerance:g}"
-            is_default = _is_default(grid, tolerance)
-            yield Point(
-                "contact grid and tolerance, gel image of ridges",
-                setting,
-                seconds,
-                error,
-                "grey levels rms",
-                reference,
-                is_default,
-            )
+            works.append(partial(_pressed_ridges, grid, tolerance))
+            error = math.sqrt(float(np.mean((_picture(works[-1]()) - exact) ** 2)))
+            points.append(_point(grid, tolerance, error))
+    reference = f"{_of_gel(reference_rows)}, tolerance 1e-06"
+    return _panel("gel image of ridges", "grey levels rms", reference, CAMERA_NOISE, points, works, repeats)
+
+
+def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Point:
+    """One setting of the solver; the default is what the gripper's contacts are solved with."""
+    hand, series = Hand(), f"{grid}" if padded else f"{grid} periodic"
+    is_default = padded and ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
+    return Point(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
+
+
+def _panel(
+    surface: str,
+    unit: str,
+    reference: str,
+    tolerance: float,
+    points: Sequence[Point],
+    works: Sequence[Callable[[], object]],
+    repeats: int,
+) -> Panel:
+    title, made = f"contact grid and tolerance, {surface}", timed(points, works, repeats)
+    return Panel(title, "one contact", unit, reference, tolerance, made, smallest(made))
 
 
 def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
@@ -149,12 +130,6 @@ def _picture(contact: Contact) -> Floats:
     return LedOptics().colours(surface, surface.slopes).astype(np.float64)
 
 
-def _is_default(grid: Grid, tolerance: float) -> bool:
-    """Whether the gripper's contacts are solved so."""
-    hand = Hand()
-    return ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
-
-
 def _at_centres(fine: Floats, factor: int) -> Floats:
     """A fine field at the centres of blocks of `factor` pixels: the mean of the four pixels that meet there."""
     rows, cols = (n // factor for n in fine.shape)
@@ -166,17 +141,30 @@ def _at_centres(fine: Floats, factor: int) -> Floats:
 # Closing ---------------------------------------------------------------------------------------------------
 
 
-def closing_points(*, steps_s: tuple[float, ...] = (2e-3, 1e-3, 5e-4, 2e-4, 1e-4)) -> tuple[Point, ...]:
-    """Step of the closing jaws: force over 50 ms against the oscillator's closed form, 1e5 N/m and 20 N."""
+def closing(sample: Sample) -> Row:
+    """Time step of the closing jaws."""
+    text = (
+        "Force of two jaws that close on a spring, implicit steps of order 2, against the closed form. The simulated "
+        "rig presses with a given force and needs no motion; the step is the caller's."
+    )
+    repeats = sample.scale.repeats
+    panel = closing_panel(repeats, (2e-3, 1e-3)) if sample.scale.quick else closing_panel(repeats)
+    return Row("Closing jaws: time step", text, (panel,))
+
+
+def closing_panel(repeats: int, steps_s: Sequence[float] = (2e-3, 1e-3, 5e-4, 2e-4, 1e-4)) -> Panel:
+    """Force over 50 ms against the oscillator's closed form, 1e5 N/m and 20 N."""
     stiffness, force = 100.0, 20.0
     motion = Motion(Jaws(force), (LinearLaw(stiffness), LinearLaw(stiffness)))
-    points = []
-    for step in steps_s:
-        seconds, (times, states) = timed(partial(close, motion, 0.05, step), 1)
+    points, works = list[Point](), [partial(close, motion, 0.05, step) for step in steps_s]
+    for step, work in zip(steps_s, works, strict=True):
+        times, states = work()
         travel = spring_closing(motion.jaws, stiffness, times)
         error = 100.0 * stiffness / force * float(np.abs(states[:, 0] - travel).max())
-        points.append(Point("closing step", f"{step:g} s", seconds, error, "% of force", "closed form of a spring"))
-    return tuple(points)
+        points.append(Point("", f"{step:g} s", error))
+    made = timed(points, works, repeats)
+    reference = "closed form of a spring"
+    return Panel("closing step", "50 ms of motion", "% of force", reference, 1.0, made, smallest(made))
 
 
 def spring_closing(jaws: Jaws, stiffness_n_mm: float, times_s: Floats) -> Floats:

@@ -5,11 +5,11 @@ Everything is made when it is first asked for: a row that needs no recording mak
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,29 +28,6 @@ Array = NDArray[np.float32]
 _BLOCK = 8192
 
 
-class SimulationPoint(Protocol):
-    """A point of the simulated rig's approximations, as `retrieval.lab.frontier.contact.Point` is one."""
-
-    @property
-    def approximation(self) -> str: ...
-    @property
-    def setting(self) -> str: ...
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def error(self) -> float: ...
-    @property
-    def unit(self) -> str: ...
-    @property
-    def reference(self) -> str: ...
-    @property
-    def is_default(self) -> bool: ...
-
-
-Simulation = Mapping[str, Callable[..., "Sequence[SimulationPoint]"]]
-"""Names of the simulated rig's approximations -> functions that give their `SimulationPoint`s."""
-
-
 @dataclass(frozen=True)
 class Scale:
     """How much is measured. photos: of the blended catalogue; queries: touches asked there; touches: touches whose
@@ -67,7 +44,7 @@ QUICK = Scale(photos=2000, queries=12, touches=12, repeats=2, quick=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Catalogue:
+class BlendedCatalogue:
     """N photos. halves (N, hidden) float16, as an index keeps them. embeddings: name of what made them -> (N, d)."""
 
     halves: NDArray[np.float16]
@@ -79,13 +56,12 @@ class Sample:
     """Grasps of objects that the model has not seen: of each object the photos of the first half of its grasps, and
     the touches of the others. No grasp gives both.
 
-    model: a checkpoint's file. recording: gives the folder, and may first collect it. simulation: functions of the
-    simulated rig. folder: where encoded features are kept.
+    model: a checkpoint's file. recording: gives the folder, and may first collect it. folder: where encoded features
+    are kept.
     """
 
     model: Path
     recording: Callable[[], Path]
-    simulation: Simulation
     folder: Path
     scale: Scale
     quiet: bool = False
@@ -176,7 +152,7 @@ class Sample:
     # Catalogue ---------------------------------------------------------------------------------------------
 
     @cached_property
-    def catalogue(self) -> Catalogue:
+    def catalogue(self) -> BlendedCatalogue:
         """`scale.photos` photos: each a blend w A + (1 - w) B of the features of two, w uniform in 1/2..1.
 
         Blends lie where the model's photos lie, in clumps around them; white noise would not.
@@ -188,7 +164,7 @@ class Sample:
             for name, part in self._codes(blended, photo=True).items():
                 blocks.setdefault(name, []).append(part)
         halves = np.concatenate([part.astype(np.float16) for part in blocks.pop("half")])
-        return Catalogue(halves, {name: np.concatenate(parts) for name, parts in blocks.items()})
+        return BlendedCatalogue(halves, {name: np.concatenate(parts) for name, parts in blocks.items()})
 
     @cached_property
     def queries(self) -> dict[str, Array]:

@@ -3,12 +3,17 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from indexes.errors import IndexesError
 from retrieval.errors import RetrievalError
+from robot.errors import RobotError
 
 
 @dataclass(frozen=True)
 class HardCase:
-    """`holds` says whether `must_hold` is true of `ours`, `naive_holds` whether it is of the obvious formula."""
+    """An input of a numerical kernel, what must be true of it, and what came out.
+
+    `holds` says whether `must_hold` is true of `ours`, `naive_holds` whether it is of the obvious formula.
+    """
 
     kernel: str
     case: str
@@ -23,6 +28,6 @@ def refused(work: Callable[[], object], *words: str) -> tuple[str, bool]:
     """What an error of ours says, and whether it holds all the words; what came out where nothing was refused."""
     try:
         result = work()
-    except RetrievalError as error:
+    except (RetrievalError, IndexesError, RobotError) as error:
         return f"refused: {error}", all(word in str(error) for word in words)
     return f"accepted: {result}", False

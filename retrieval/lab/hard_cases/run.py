@@ -1,52 +1,24 @@
-"""The hard cases of every numerical kernel, run: what must hold, what the naive formula gives, what ours gives."""
+"""The hard cases of every numerical kernel, run."""
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
 
 from retrieval.console.progress import Bar
+from retrieval.lab.hard_cases import KERNELS, hard_cases
 from retrieval.version import __version__
 
 
-class HardCase(Protocol):
-    """A row of the table; every package has its own of these fields.
-
-    kernel: which numerical kernel; case: its input; must_hold: what must be true; naive, ours: what came out; holds,
-    naive_holds: whether it is true of ours, and of the naive formula.
-    """
-
-    @property
-    def kernel(self) -> str: ...
-    @property
-    def case(self) -> str: ...
-    @property
-    def must_hold(self) -> str: ...
-    @property
-    def naive(self) -> str: ...
-    @property
-    def ours(self) -> str: ...
-    @property
-    def holds(self) -> bool: ...
-    @property
-    def naive_holds(self) -> bool: ...
-
-
-Source = Callable[[], Iterable[HardCase]]
-"""Gives the `HardCase`s of a package."""
-
-
-def run_hard_cases(sources: Mapping[str, Source], quiet: bool = False) -> dict[str, Any]:
-    """Run the hard cases of packages, by name; the content of stability.json."""
+def run_hard_cases(quiet: bool = False) -> dict[str, Any]:
+    """Run the hard cases of every package; the content of stability.json."""
     cases: list[dict[str, Any]] = []
-    with Bar("hard cases", len(sources), "packages", quiet=quiet) as bar:
-        for package, hard_cases in sources.items():
-            cases += [{"package": package, **_fields(case)} for case in hard_cases()]
+    with Bar("hard cases", len(KERNELS), "packages", quiet=quiet) as bar:
+        for package in KERNELS:
+            for case in hard_cases(package):
+                plain = {"holds": bool(case.holds), "naive_holds": bool(case.naive_holds)}  # numpy's bool is no JSON
+                cases.append({"package": package, **asdict(case), **plain})
             bar.advance()
     return {"software": __version__, "failed": sum(not case["holds"] for case in cases), "cases": cases}
-
-
-def _fields(case: HardCase) -> dict[str, Any]:
-    words = {name: getattr(case, name) for name in ("kernel", "case", "must_hold", "naive", "ours")}
-    return {**words, "holds": bool(case.holds), "naive_holds": bool(case.naive_holds)}
 
 
 def lines(document: Mapping[str, Any]) -> list[str]:

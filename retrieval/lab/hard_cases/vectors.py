@@ -1,66 +1,36 @@
-"""Stiff and extreme inputs of vector search: what must hold, what the naive formula gives, what ours gives.
-
-The naive formulae stand here to be shown failing; nothing else uses them.
-"""
+"""Stiff and extreme inputs of vector search."""
 
 import math
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 
 from indexes import load_kind
-from indexes.errors import IndexesError
 from indexes.kinds.base import VectorIndex
 from indexes.kinds.exact import ExactIndex
 from indexes.kinds.measure import recall_against_exact
 from indexes.kinds.scores import Floats, grid_scores, on_grid
 from indexes.store.folder import IndexStore
+from retrieval.lab.hard_cases.case import HardCase, refused
 
 _SEARCH, _UNIT, _SCORES = "top k", "unit vectors", "inner products"
 
 
-@dataclass(frozen=True)
-class HardCase:
-    """`holds` says whether `must_hold` is true of `ours`, `naive_holds` whether it is of the obvious formula."""
-
-    kernel: str
-    case: str
-    must_hold: str
-    naive: str
-    ours: str
-    holds: bool
-    naive_holds: bool
-
-
-def hard_cases() -> tuple[HardCase, ...]:
-    """Every hard case, in about a second."""
-    cases: tuple[Callable[[], HardCase], ...] = (
-        _nan_vector,
-        _nan_query,
-        _zero_vector,
-        _huge_vector,
-        _tiny_vector,
-        _ties_at_the_last_rank,
-        _more_than_there_are,
-        _removed_rows,
-        _another_order_of_the_sum,
-        _half_precision_scores,
-        _recall_among_equals,
-        _overflowing_half,
-    )
-    with np.errstate(all="ignore"):
-        return tuple(case() for case in cases)
-
-
-def refused(work: Callable[[], object], *words: str) -> tuple[str, bool]:
-    """What an error of ours says, and whether it holds all the words; what came out where nothing was refused."""
-    try:
-        result = work()
-    except IndexesError as error:
-        return f"refused: {error}", all(word in str(error) for word in words)
-    return f"accepted: {result}", False
+def hard_cases() -> Iterator[HardCase]:
+    """Cases of vector search, in about a second."""
+    yield _nan_vector()
+    yield _nan_query()
+    yield _zero_vector()
+    yield _huge_vector()
+    yield _tiny_vector()
+    yield _ties_at_the_last_rank()
+    yield _more_than_there_are()
+    yield _removed_rows()
+    yield _another_order_of_the_sum()
+    yield _half_precision_scores()
+    yield _recall_among_equals()
+    yield _overflowing_half()
 
 
 def _axes(count: int = 3) -> Floats:

@@ -7,8 +7,8 @@ the ball.
 
     labels       centre and contact radius of the held-out press are its label's
     aligned      these three numbers are found in its picture, the colours held fixed
-    (retrieval.lab.optics.least_squares) as shipped   aligned, and chosen so as to hold at other places and for other
-    objects than the presses
+                 (retrieval.lab.optics.least_squares)
+    as shipped   aligned, and chosen so as to hold at other places and for other objects than the presses
 
 Taxim's published figures (L1 5.565, SSIM .882, PSNR 30.97; Si & Yuan, RA-L 2022) are for other objects than balls,
 crops of 400 x 400 and a manual alignment: they say how good the field's pictures are, not who wins here.
@@ -16,7 +16,6 @@ crops of 400 x 400 and a manual alignment: they say how good the field's picture
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -25,21 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.lab.frontier.contact import Point, timed
 from retrieval.lab.optics.image_error import ImageError
 from retrieval.lab.optics.least_squares import Matrix
 from retrieval.lab.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, judged, select, to_optics
 from retrieval.lab.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses, taxim_change
 from robot.errors import BadRobotInput, RobotError
-from robot.sim.gel.fitted_optics import (
-    FORMAT,
-    FittedOptics,
-    feature_count,
-    fitted_document,
-    load_fitted,
-    optics_to_json,
-)
-from robot.sim.gel.surface import Field, Surface
+from robot.sim.gel.fitted_optics import FORMAT, optics_to_json
 
 FIT_COUNT = {"gelsight": 36, "gelsight_mini": 18}
 SPLITS = 5
@@ -203,43 +193,6 @@ def _run(folder: Path, name: str, out: Path) -> None:
         (out / f"{name}.json").write_text(content + "\n")
     except OSError as error:
         raise BadRobotInput(f"{out} cannot be written: {error.strerror}; give another --out") from error
-
-
-# For the frontier ------------------------------------------------------------------------------------------
-
-
-def optics_points(name: str = "gelsight") -> list[Point]:
-    """Error against time of a picture of 240 x 320 pixels, a point per degree of the fitted optics.
-
-    The error is the rms over held-out real presses, in grey levels, from the shipped file.
-    """
-    shipped = load_fitted(name)
-    figures = fitted_document(name)["held_out"]
-    return [
-        Point(
-            approximation="gel optics",
-            setting=f"{name}, degree {degree}",
-            seconds=_seconds(_of_degree(shipped, degree)),
-            error=math.sqrt(figures[by_degree(degree)]["mse"]["mean"]),
-            unit="grey levels rms",
-            reference="real presses held out",
-            is_default=degree == shipped.degree,
-        )
-        for degree in DEGREES
-    ]
-
-
-def _of_degree(optics: FittedOptics, degree: int) -> FittedOptics:
-    """Optics that cost what this degree costs; time does not depend on what the weights are."""
-    count = feature_count(degree, len(optics.reaches_mm)) * optics.places
-    return replace(optics, degree=degree, weights=((0.0, 0.0, 0.0),) * count)
-
-
-def _seconds(optics: FittedOptics) -> float:
-    """Time of one picture, its maps made before."""
-    x, y = Field().unit_positions()
-    surface = Surface(np.maximum(0, 0.5 - x * x - y * y), Field())
-    return timed(lambda: optics.colours(surface, surface.slopes), repeats=7)[0]
 
 
 if __name__ == "__main__":
