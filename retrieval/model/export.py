@@ -62,18 +62,14 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     try:
         write_atomically(unsettled, sealed(graph_of(checkpoint)))
         result = compare(checkpoint, unsettled, path)
-        _require_gain(result)
+        if not max(result.half_difference, result.embedding_difference) <= TOLERANCE:
+            raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
+        if result.onnx_ms >= result.torch_ms:
+            raise RetrievalError(f"nothing is exported, as PyTorch is as fast on this machine. {result}")
         unsettled.replace(path)
     finally:
         unsettled.unlink(missing_ok=True)
     return result
-
-
-def _require_gain(result: Exported) -> None:
-    if not max(result.half_difference, result.embedding_difference) <= TOLERANCE:
-        raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
-    if result.onnx_ms >= result.torch_ms:
-        raise RetrievalError(f"nothing is exported, as PyTorch is as fast on this machine. {result}")
 
 
 def graph_of(checkpoint: Checkpoint) -> bytes:
@@ -108,7 +104,7 @@ class _TouchEncoder(nn.Module):
         super().__init__()
         self.matcher = for_inference(matcher, ["touch_tower"])
         if isinstance(matcher.touch_norm, nn.BatchNorm1d):
-            self.matcher.add_module("touch_norm", _Standardise(matcher.touch_norm))
+            self.matcher.add_module("touch_norm", _FixedNorm(matcher.touch_norm))
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower = self.matcher.touch_tower
@@ -119,7 +115,7 @@ class _TouchEncoder(nn.Module):
         return (code.half, code.embedding) if readings is None else (code.half, code.embedding, readings)
 
 
-class _Standardise(nn.Module):
+class _FixedNorm(nn.Module):
     """Batch normalisation in evaluation mode, written out: the exporter wants to know the width of its input."""
 
     def __init__(self, norm: nn.BatchNorm1d) -> None:

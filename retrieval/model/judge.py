@@ -69,9 +69,8 @@ class GelCheck:
         names = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(data, Mapping) or set(data) != set(names) or not isinstance(data["shares"], Mapping):
             raise BadInput(f"a check of gel images must hold {', '.join(names)}; got {data!r}")
-        for name, value in [(name, data[name]) for name in names[:-1] if data[name] is not None] + [
-            *data["shares"].items()
-        ]:
+        thresholds = [(name, data[name]) for name in names[:-1] if data[name] is not None]
+        for name, value in [*thresholds, *data["shares"].items()]:
             if not isinstance(name, str) or type(value) not in (int, float) or not abs(value) <= _MOST:
                 raise BadInput(f"a check of gel images must hold finite numbers; {name} is {value!r}")
         return cls(**{**data, "shares": dict(data["shares"])})
@@ -107,7 +106,7 @@ class Judge:
         """Sum over grasps of the match logits of the photos at `rows` (all where None): (len(rows),).
 
         touch_halves (G, H) of G grasps of ONE object; photo_halves (N, H) in any float type, memory-mapped or not,
-        read in blocks and reckoned with in float32. Adding logits takes the grasps as independent given the object,
+        read in blocks and computed with in float32. Adding logits takes the grasps as independent given the object,
         and a flat prior. Raises NumericalError for a NaN or infinite logit: sorting would rank it first.
         """
         count = len(photo_halves) if rows is None else len(rows)
@@ -117,7 +116,10 @@ class Judge:
                 part = slice(start, min(start + BLOCK, count))
                 photos = photo_halves[part] if rows is None else photo_halves[rows[part]]
                 scores[part] = self._sum_of_logits(touch_halves, as_float32(photos))
-        _require_finite(scores, rows)
+        if not np.isfinite(scores).all():
+            bad = int(np.flatnonzero(~np.isfinite(scores))[0])
+            name = bad if rows is None else int(rows[bad])
+            raise NumericalError(f"every match logit must be finite; photo row {name} has {scores[bad]}")
         return scores
 
     def _sum_of_logits(self, touch_halves: Floats, photos: Floats) -> Floats:
@@ -131,13 +133,6 @@ class Judge:
             np.maximum(second, 0, out=second)
             total += second @ self.out
         return total
-
-
-def _require_finite(scores: Floats, rows: NDArray[np.int64] | None) -> None:
-    if not np.isfinite(scores).all():
-        bad = int(np.flatnonzero(~np.isfinite(scores))[0])
-        name = bad if rows is None else int(rows[bad])
-        raise NumericalError(f"every match logit must be finite; photo row {name} has {scores[bad]}")
 
 
 def as_float32(values: Halves) -> Floats:

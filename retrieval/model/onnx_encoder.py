@@ -46,8 +46,10 @@ class OnnxEncoder:
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
         """Of touches, each its fingers' images in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
+        if self._process != os.getpid():  # a fork opens its own
+            self._process, self._session = os.getpid(), self._open()
         try:
-            half, embedding, *more = self._own_session().run(None, {"images": images})
+            half, embedding, *more = self._session.run(None, {"images": images})
         except Exception as error:  # its errors have no common base
             raise CheckpointError(f"the export of this checkpoint cannot be run ({error}); export it again") from error
         codes = TouchCodes(half, embedding, more[0] if more else None)
@@ -60,13 +62,6 @@ class OnnxEncoder:
                     "export the checkpoint again"
                 )
         return codes
-
-    def _own_session(self) -> Any:
-        """The session of this process; a fork opens its own."""
-        if self._process != os.getpid():
-            self._session = self._open()
-            self._process = os.getpid()
-        return self._session
 
 
 _sessions: WeakSet[Any] = WeakSet()

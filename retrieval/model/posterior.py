@@ -116,7 +116,9 @@ class Posterior:
             )
         weight = self.weight(grasps)
         each = math.log1p(-none_prior) - math.log(len(judged) + unjudged) + self.offset
-        others = each + math.log(unjudged) + _log_mean_exp(weight * drawn) if unjudged else -math.inf
+        others = -math.inf
+        if unjudged:  # so many times the mean of the sample
+            others = each + math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(weight * drawn))
         none = math.log(none_prior) if none_prior else -math.inf
         # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN.
         terms = np.concatenate([[none, others], each + weight * judged])
@@ -148,11 +150,6 @@ def _finite(values: ArrayLike, what: str) -> Floats:
     if not np.isfinite(array).all():
         raise NumericalError(f"{what} must be finite; got {array[~np.isfinite(array)][0]}")
     return array
-
-
-def _log_mean_exp(values: Floats) -> float:
-    top = values.max()
-    return float(top + np.log(np.mean(np.exp(values - top))))
 
 
 # Fitting ---------------------------------------------------------------------------------------------------

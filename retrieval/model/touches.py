@@ -48,14 +48,6 @@ class GivenImage:
         """(H, W, 3) float32 RGB in 0..1; the same numbers however a picture is given. Raises ImageError."""
         return read_image(self.image, self.name)
 
-    def loaded(self) -> "GivenImage":
-        """Itself. A Pillow image reads its file when it is first asked for pixels, which two threads must not do at
-        once: it does so here, before they do."""
-        if isinstance(self.image, Image.Image):
-            with suppress(Exception):  # told by `read`
-                self.image.load()
-        return self
-
 
 def read_image(image: AnyImage, name: str) -> RgbImage:
     """An image however it is given as (H, W, 3) float32 RGB in 0..1; `name` stands for it where it is no file.
@@ -66,10 +58,8 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
         return read_rgb(os.fspath(image))
     if isinstance(image, bytes | bytearray | memoryview):
         return decode_rgb(bytes(image), name)
-    return pillow_rgb(image, name) if isinstance(image, Image.Image) else _array_rgb(image, name)
-
-
-def _array_rgb(image: NDArray[Any], name: str) -> RgbImage:
+    if isinstance(image, Image.Image):
+        return pillow_rgb(image, name)
     if image.dtype != np.uint8:
         raise ImageError(
             name,
@@ -92,10 +82,25 @@ def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str
     what: how one grasp is called in messages. of: what they begin with, such as "object 3, ". Raises BadInput where
     the nesting or the number of images is not as the text above says.
     """
-    grasps = [_images_of(grasp, of) for grasp in _lists(given, of)]
+    if _is_image(given):
+        grasps: list[list[Any]] = [[given]]
+    else:
+        items = _items(given, of)
+        images = [_is_image(item) for item in items]
+        if any(images) and not all(images):
+            raise BadInput(f"{of}images and lists of images stand side by side; {_NESTED}")
+        grasps = [items] if any(images) else [_items(item, of) for item in items]
+    if wrong := [image for grasp in grasps for image in grasp if not _is_image(image)]:
+        raise BadInput(
+            f"{of}an image must be {_WANTED}, got {type(wrong[0]).__name__}; {_NESTED}; several objects go to "
+            "query_many"
+        )
     if not grasps:
         raise BadInput(f"{of}give at least one {what}: {_NESTED}")
-    named = [[_given(image, g, f, of) for f, image in enumerate(grasp)] for g, grasp in enumerate(grasps, start=1)]
+    named = [
+        [GivenImage(image, _name(image, f"{of}grasp {g}, finger", f)) for f, image in enumerate(grasp)]
+        for g, grasp in enumerate(grasps, start=1)
+    ]
     for grasp in named:
         if len(grasp) != fingers:
             raise BadInput(
@@ -103,30 +108,6 @@ def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str
                 f"{', '.join(image.name for image in grasp)} ({_NESTED})"
             )
     return named
-
-
-def _lists(given: AnyTouches, of: str) -> list[Any]:
-    """A list for each grasp, by the depth of nesting."""
-    if _is_image(given):
-        return [[given]]
-    items = _items(given, of)
-    images = [_is_image(item) for item in items]
-    if not any(images):
-        return items
-    if not all(images):
-        raise BadInput(f"{of}images and lists of images stand side by side; {_NESTED}")
-    return [items]
-
-
-def _images_of(grasp: Any, of: str) -> list[AnyImage]:
-    images = _items(grasp, of)
-    for image in images:
-        if not _is_image(image):
-            raise BadInput(
-                f"{of}an image must be {_WANTED}, got {type(image).__name__}; {_NESTED}; several objects go to "
-                "query_many"
-            )
-    return images
 
 
 def _is_image(item: object) -> bool:
@@ -141,19 +122,17 @@ def _items(given: object, of: str) -> list[Any]:
     raise BadInput(f"{of}an image must be {_WANTED}, got {type(given).__name__}; {_NESTED}")
 
 
-def _given(image: AnyImage, grasp: int, finger: int, of: str) -> GivenImage:
+def _name(image: AnyImage, place: str, finger: int) -> str:
     if isinstance(image, str | os.PathLike):
-        return GivenImage(image, os.fspath(image))
-    letter = ascii_lowercase[finger] if finger < len(ascii_lowercase) else str(finger + 1)
-    return GivenImage(image, f"{of}grasp {grasp}, finger {letter} ({_kind(image)})")
-
-
-def _kind(image: Any) -> str:
+        return os.fspath(image)
     if isinstance(image, np.ndarray):
-        return f"array {' x '.join(map(str, image.shape))} {image.dtype}"
-    if isinstance(image, Image.Image):
-        return f"Pillow image {image.width} x {image.height} {image.mode}"
-    return f"{len(bytes(image))} bytes"
+        kind = f"array {' x '.join(map(str, image.shape))} {image.dtype}"
+    elif isinstance(image, Image.Image):
+        kind = f"Pillow image {image.width} x {image.height} {image.mode}"
+    else:
+        kind = f"{len(bytes(image))} bytes"
+    letter = ascii_lowercase[finger] if finger < len(ascii_lowercase) else str(finger + 1)
+    return f"{place} {letter} ({kind})"
 
 
 BATCH = 32
@@ -225,10 +204,6 @@ class TouchReader:
         self.encoder, self.fingers, self._compares = encoder, config.matcher.fingers, compares
         self._preprocessing = config.preprocessing
 
-    def grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
-        """The grasps of one object, by `retrieval.model.touches.read_grasps`; no image is read."""
-        return read_grasps(touches, self.fingers, of=of)
-
     def references(self, background: Sequence[AnyImage] | None) -> Sequence[RgbImage | None]:
         """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
         that is missing, and for one that would not be looked at."""
@@ -275,8 +250,12 @@ class TouchReader:
 
         The threads end with the call, for a fork of the process would not have them.
         """
-
         subtracts = self._preprocessing.background != "none"
+        for given in (given for grasp in grasps for given in grasp):
+            # A Pillow image reads its file when it is first asked for pixels, which two threads must not do at once.
+            if isinstance(given.image, Image.Image):
+                with suppress(Exception):  # told by `read`
+                    given.image.load()
 
         def view(given: GivenImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
             image = given.read()
@@ -285,7 +264,7 @@ class TouchReader:
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
-                [threads.submit(view, given.loaded(), frame) for given, frame in zip(grasp, references, strict=True)]
+                [threads.submit(view, given, frame) for given, frame in zip(grasp, references, strict=True)]
                 for grasp in grasps
             ]
             return [[job.result() for job in grasp] for grasp in jobs]

@@ -26,6 +26,7 @@ from retrieval.model.touches import (
     Stopwatch,
     TouchCodes,
     TouchReader,
+    read_grasps,
 )
 from retrieval.search import defaults
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
@@ -130,7 +131,7 @@ class Searcher:
         """
         held = self._held()
         limit = held._limit(top, candidates)
-        return held._answers([held.reader.grasps(touches)], background, top, limit, none_prior)[0]
+        return held._answers([read_grasps(touches, held.reader.fingers)], background, top, limit, none_prior)[0]
 
     def query_many(
         self,
@@ -148,7 +149,10 @@ class Searcher:
         """
         held = self._held()
         limit = held._limit(top, candidates)
-        asked = [held.reader.grasps(touches, of=f"object {number}, ") for number, touches in enumerate(objects, 1)]
+        asked = [
+            read_grasps(touches, held.reader.fingers, of=f"object {number}, ")
+            for number, touches in enumerate(objects, 1)
+        ]
         return held._answers(asked, background, top, limit, none_prior) if asked else []
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
@@ -159,7 +163,8 @@ class Searcher:
         `searcher.judge.logits(halves, photo_halves)`, added over the grasps.
         """
         held = self._held()
-        grasps, references = held.reader.grasps(touches), held.reader.references(background)
+        grasps = read_grasps(touches, held.reader.fingers)
+        references = held.reader.references(background)
         codes = held.reader.encode(grasps, references, Stopwatch())
         return Encoded(codes.embeddings, codes.halves)
 
