@@ -19,7 +19,6 @@ import robot
 from retrieval.data.dataset import Split
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (
-    file_digest,
     load_checkpoint,
     read_tensors,
     save_checkpoint,
@@ -29,7 +28,7 @@ from retrieval.model.checkpoint import (
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.judge import GelCheck
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored import read_stored
+from retrieval.model.stored import file_digest, read_stored
 from retrieval.version import __version__
 from tests.conftest import TINY
 

@@ -28,8 +28,6 @@ from retrieval.model.posterior import Posterior
 from retrieval.model.stored import (
     FORMAT,
     Stored,
-    file_digest,
-    matcher_header,
     read_header,
     stored_of,
     unreadable,
@@ -84,7 +82,7 @@ def save_checkpoint(
 ) -> None:
     """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
 
-    float16: weights are stored so, at half the size, and reckoned with in float32 when they are loaded.
+    float16: weights are stored so, at half the size, and float32 again when they are loaded.
     """
     require_writable(path)
     header = {
@@ -96,7 +94,9 @@ def save_checkpoint(
     }
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
     if float16:
-        state = {name: _half(path, name, tensor) for name, tensor in state.items()}
+        state = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
+        if over := [name for name, tensor in state.items() if not bool(torch.isfinite(tensor).all())]:
+            raise CheckpointError(f"{path} cannot hold {over[0]} as float16, which ends at 65504; store it as float32")
     if queries is not None:
         state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
@@ -105,24 +105,8 @@ def save_checkpoint(
 
 def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> None:
     """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
-    save_checkpoint(
-        path,
-        made.matcher,
-        made.config,
-        split=made.split,
-        provenance=made.provenance,
-        posterior=made.posterior,
-        gel_check=made.gel_check,
-        queries=made.queries,
-        float16=float16,
-    )
-
-
-def _half(path: Path, name: str, tensor: Tensor) -> Tensor:
-    half = tensor.half() if tensor.is_floating_point() else tensor
-    if not bool(torch.isfinite(half).all()):
-        raise CheckpointError(f"{path} cannot hold {name} as float16, which ends at 65504; store it as float32")
-    return half
+    about = {name: getattr(made, name) for name in ("split", "provenance", "posterior", "gel_check", "queries")}
+    save_checkpoint(path, made.matcher, made.config, **about, float16=float16)
 
 
 def require_writable(path: Path) -> None:
@@ -150,7 +134,7 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
 
     known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
-    digest nor checksum is reckoned again.
+    digest nor checksum is computed again.
 
     >>> from pathlib import Path
     >>> retrieval.load_checkpoint(Path("model.safetensors")).config.matcher.fingers
@@ -160,26 +144,36 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
     retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
     state, header = read_tensors(path, check=known is None)
-    header = matcher_header(path, header)
-    about = known or stored_of(path, file_digest(path), header)
+    about = known or stored_of(path, header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         queries = state.pop(_QUERIES, None)
-        matcher = _matcher(about.config, state)
-        kept = None if queries is None else _queries(about.config, queries)
+        hidden = about.config.matcher.hidden
+        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (hidden,)):
+            raise CheckpointError(
+                f"{_QUERIES} must be float16 (touches, {hidden}); got {queries.dtype} {tuple(queries.shape)}"
+            )
+        try:
+            with torch.device("meta"):  # shapes alone: a header may ask for more memory than there is
+                _require_fit(_unloaded(about.config, state), state)
+        except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+            raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
+        matcher = _unloaded(about.config, state)
+        matcher.load_state_dict(state)
     except BadInput as error:
         raise unusable(path, error) from error
     return Checkpoint(
-        path, about.digest, about.config, about.provenance, about.gel_check, matcher, split, posterior, kept
+        path,
+        about.digest,
+        about.config,
+        about.provenance,
+        about.gel_check,
+        matcher.eval(),
+        split,
+        posterior,
+        None if queries is None else np.asarray(queries.numpy()),
     )
-
-
-def _matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
-    _require_fit(_without_memory(config, state), state)
-    matcher = _unloaded(config, state)
-    matcher.load_state_dict(state)
-    return matcher.eval()
 
 
 def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
@@ -188,23 +182,6 @@ def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
     if any(name.startswith(_GEL_HEAD) for name in state):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
     return matcher
-
-
-def _without_memory(config: Config, state: Mapping[str, Tensor]) -> Matcher:
-    """The matcher with shapes alone: a header may ask for more memory than there is, or than can be counted."""
-    try:
-        with torch.device("meta"):
-            return _unloaded(config, state)
-    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
-
-
-def _queries(config: Config, queries: Tensor) -> NDArray[np.float16]:
-    if queries.dtype != torch.float16 or queries.ndim != 2 or queries.shape[1] != config.matcher.hidden:
-        raise CheckpointError(
-            f"{_QUERIES} must be float16 (touches, {config.matcher.hidden}); got {queries.dtype} {tuple(queries.shape)}"
-        )
-    return np.asarray(queries.numpy())
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
@@ -226,7 +203,8 @@ def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
     """Write tensors and a JSON header as one safetensors file with a checksum over both, atomically."""
     content = {"format": FORMAT, "software": __version__, **header}
-    text = json.dumps({**content, "sha256": _checksum(state, content)}, allow_nan=False)
+    # Over both, as the format itself takes a flipped bit in a weight or a setting for what it is.
+    text = json.dumps({**content, "sha256": tensors_digest(state, json.dumps(content))}, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, save(state, {HEADER: text}))
 
@@ -243,16 +221,11 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
         if tensor.dtype not in _DTYPES:
             raise CheckpointError(f"{path} holds {name} as {tensor.dtype}, which no checkpoint of ours does")
     checksum = header.pop("sha256", None)
-    if check and checksum != _checksum(state, header):
+    if check and checksum != tensors_digest(state, json.dumps(header)):
         raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
     if check and any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
         raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
     return state, header
-
-
-def _checksum(state: Mapping[str, Tensor], header: Mapping[str, Any]) -> str:
-    """SHA-256 of header and tensors: the format itself takes a flipped bit in a weight or a setting for what it is."""
-    return tensors_digest(state, json.dumps(header))
 
 
 def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:

@@ -15,7 +15,6 @@ from retrieval.model.config import Config
 from retrieval.model.judge import GelCheck, Judge
 
 FORMAT = 1
-_PARTS = ("config", "split", "provenance")
 _JUDGE = ("head.second.weight", "head.second.bias", "head.out.weight", "head.out.bias")
 
 
@@ -39,17 +38,29 @@ def fingerprint(checkpoint: Stored) -> dict[str, str]:
 def read_stored(path: Path) -> Stored:
     """Read what a checkpoint says of itself. Its weights are neither read nor checked: whoever knows the digest that
     the file must have compares it. Raises CheckpointError."""
-    header = matcher_header(path, read_header(path))
-    return stored_of(path, file_digest(path), header)
+    return stored_of(path, read_header(path))
 
 
-def stored_of(path: Path, digest: str, header: dict[str, Any]) -> Stored:
-    """What a matcher's header says. Raises CheckpointError."""
+def stored_of(path: Path, header: dict[str, Any]) -> Stored:
+    """What the header of a matcher's file says. Raises CheckpointError for that of another file."""
+    if "task" in header:
+        raise CheckpointError(
+            f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
+            "`retrieve train` makes matchers"
+        )
+    if not isinstance(header.get("provenance", {}), dict):
+        raise unusable(path, "its provenance must be an object")
+    if lacking := [name for name in ("config", "split", "provenance") if name not in header]:
+        raise CheckpointError(
+            f"{path} is not a checkpoint: its header has no {lacking[0]}; a file in .state.safetensors is the state of "
+            "an unfinished training, the checkpoint lies beside it"
+        )
     try:
+        config = Config.from_dict(header["config"])
         check = None if header.get("gel_check") is None else GelCheck.from_dict(header["gel_check"])
     except BadInput as error:
         raise unusable(path, error) from error
-    return Stored(path, digest, config_of(path, header), header["provenance"], check)
+    return Stored(path, file_digest(path), config, header["provenance"], check)
 
 
 def read_judge(path: Path) -> Judge:
@@ -88,46 +99,6 @@ def read_header(path: Path) -> dict[str, Any]:
             f"{path} holds weights but not our header; only checkpoints of `retrieve train` work here "
             "(give other weights to `retrieve train --init`)"
         )
-    return _parsed(path, text)
-
-
-def unreadable(path: Path, error: Exception) -> CheckpointError:
-    """What to raise where the format itself is broken."""
-    return CheckpointError(f"{path} is not a readable .safetensors file ({error}); it may be truncated")
-
-
-def matcher_header(path: Path, header: dict[str, Any]) -> dict[str, Any]:
-    """The header, if it is that of a matcher. Raises CheckpointError."""
-    if "task" in header:
-        raise CheckpointError(
-            f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
-            "`retrieve train` makes matchers"
-        )
-    if not isinstance(header.get("provenance", {}), dict):
-        raise unusable(path, "its provenance must be an object")
-    lacking = [name for name in _PARTS if name not in header]
-    if lacking:
-        raise CheckpointError(
-            f"{path} is not a checkpoint: its header has no {lacking[0]}; a file in .state.safetensors is the state of "
-            "an unfinished training, the checkpoint lies beside it"
-        )
-    return header
-
-
-def config_of(path: Path, header: dict[str, Any]) -> Config:
-    """The settings in a matcher's header. Raises CheckpointError."""
-    try:
-        return Config.from_dict(header["config"])
-    except BadInput as error:
-        raise unusable(path, error) from error
-
-
-def unusable(path: Path, error: object) -> CheckpointError:
-    """What to raise where a file holds what no matcher of this version is made of."""
-    return CheckpointError(f"{path} is not a checkpoint that this version can use: {error}")
-
-
-def _parsed(path: Path, text: str) -> dict[str, Any]:
     try:
         header = parse_json(text)
         version = header["format"]
@@ -139,6 +110,16 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
             f"that wrote it ({header.get('software')}) or train again"
         )
     return dict(header)
+
+
+def unreadable(path: Path, error: Exception) -> CheckpointError:
+    """What to raise where the format itself is broken."""
+    return CheckpointError(f"{path} is not a readable .safetensors file ({error}); it may be truncated")
+
+
+def unusable(path: Path, error: object) -> CheckpointError:
+    """What to raise where a file holds what no matcher of this version is made of."""
+    return CheckpointError(f"{path} is not a checkpoint that this version can use: {error}")
 
 
 def file_digest(path: Path) -> str:

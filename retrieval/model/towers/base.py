@@ -34,7 +34,17 @@ class Tower(nn.Module):
 
         Raises BadInput for another shape, type or range, NumericalError for a NaN or infinite pixel.
         """
-        _check_images(images)
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise BadInput(f"a tower takes RGB images shaped (B, 3, H, W); got {tuple(images.shape)}")
+        if images.dtype != torch.float32:
+            raise BadInput(f"a tower takes float32 images in 0..1; got {images.dtype}; divide 8-bit images by 255")
+        if images.shape[0] == 0:
+            raise BadInput("a tower takes at least one image; got an empty batch")
+        low, high = (float(bound) for bound in torch.aminmax(images))
+        if not (abs(low) < float("inf") and abs(high) < float("inf")):
+            raise NumericalError("a tower takes finite pixels; got a NaN or infinite one")
+        if max(-low, high) > 1.0 + 1e-4:  # averages of pixels may round past 1
+            raise BadInput(f"a tower takes pixels within -1..1; got {low:.3g}..{high:.3g}; divide 8-bit images by 255")
         return self._encode((images - self.mean) / self.std)
 
     def _encode(self, images: Tensor) -> Tensor:
@@ -57,17 +67,3 @@ def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
         # Not the root of the variance, whose slope is infinite where a map is constant; that of `std` is 0 there.
         parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
     return torch.cat(parts, dim=1)
-
-
-def _check_images(images: Tensor) -> None:
-    if images.ndim != 4 or images.shape[1] != 3:
-        raise BadInput(f"a tower takes RGB images shaped (B, 3, H, W); got {tuple(images.shape)}")
-    if images.dtype != torch.float32:
-        raise BadInput(f"a tower takes float32 images in 0..1; got {images.dtype}; divide 8-bit images by 255")
-    if images.shape[0] == 0:
-        raise BadInput("a tower takes at least one image; got an empty batch")
-    low, high = (float(bound) for bound in torch.aminmax(images))
-    if not (abs(low) < float("inf") and abs(high) < float("inf")):
-        raise NumericalError("a tower takes finite pixels; got a NaN or infinite one")
-    if max(-low, high) > 1.0 + 1e-4:  # averages of pixels may round past 1
-        raise BadInput(f"a tower takes pixels within -1..1; got {low:.3g}..{high:.3g}; divide 8-bit images by 255")

@@ -70,7 +70,13 @@ class MobileNetV2(Tower):
             self.feature_count = 1000 if output == "classes" else 1280
         self.features = nn.Sequential(*layers)
         self.classifier = nn.Sequential(nn.Dropout(0.2), nn.Linear(1280, 1000)) if output == "classes" else None
-        _initialise(self)
+        # He initialisation by fan-out for convolutions, N(0, 0.01) for the classifier, as for the published weights.
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out")
+            elif isinstance(module, nn.Linear):
+                nn.init.normal_(module.weight, std=0.01)
+                nn.init.zeros_(module.bias)
 
     def _encode(self, images: Tensor) -> Tensor:
         if self.output == "stages":
@@ -89,30 +95,18 @@ class MobileNetV2(Tower):
         """Map the flat key layout of early checkpoints (`features.1.conv.3.weight`) to today's nested one."""
         if "features.2.conv.0.0.weight" in state or "features.2.conv.0.weight" not in state:
             return state
-        return {_nested_key(key): value for key, value in state.items()}
+        renamed = {}
+        for key, value in state.items():
+            if match := re.fullmatch(r"features\.(\d+)\.conv\.(\d+)\.(\w+)", key):
+                block, layer, name = int(match[1]), int(match[2]), match[3]
+                key = f"features.{block}.conv.{(_NESTED_FIRST if block == 1 else _NESTED)[layer]}.{name}"
+            renamed[key] = value
+        return renamed
 
 
 # A flat block lists conv, bn, relu of the expansion (absent in the first block) and the depthwise step, then conv, bn.
 _NESTED = {0: "0.0", 1: "0.1", 3: "1.0", 4: "1.1", 6: "2", 7: "3"}
 _NESTED_FIRST = {0: "0.0", 1: "0.1", 3: "1", 4: "2"}
-
-
-def _nested_key(key: str) -> str:
-    match = re.fullmatch(r"features\.(\d+)\.conv\.(\d+)\.(\w+)", key)
-    if match is None:
-        return key
-    block, layer, name = int(match[1]), int(match[2]), match[3]
-    return f"features.{block}.conv.{(_NESTED_FIRST if block == 1 else _NESTED)[layer]}.{name}"
-
-
-def _initialise(tower: nn.Module) -> None:
-    """He initialisation by fan-out for convolutions, N(0, 0.01) for the classifier, as for the published weights."""
-    for module in tower.modules():
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, mode="fan_out")
-        elif isinstance(module, nn.Linear):
-            nn.init.normal_(module.weight, std=0.01)
-            nn.init.zeros_(module.bias)
 
 
 def mobilenet_v2(output: str) -> MobileNetV2:

@@ -88,7 +88,10 @@ class ResNet(Tower):
         # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the one before.
         counts = {"classes": 1000, "pooled": inputs, "stages": 3 * (inputs + inputs // 2 + inputs // 4)}
         self.feature_count = counts[output]
-        _initialise(self)
+        # He initialisation by fan-out, as for the published weights; the linear layer keeps PyTorch's own.
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def _encode(self, images: Tensor) -> Tensor:
         x = self.maxpool(self.relu(self.bn1(self.conv1(images))))
@@ -100,13 +103,6 @@ class ResNet(Tower):
             return stage_statistics(maps[1:])
         x = torch.flatten(nn.functional.adaptive_avg_pool2d(x, 1), 1)
         return x if self.fc is None else self.fc(x)
-
-
-def _initialise(tower: nn.Module) -> None:
-    """He initialisation by fan-out, as for the published weights; linear layers keep PyTorch's own."""
-    for module in tower.modules():
-        if isinstance(module, nn.Conv2d):
-            nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
 
 def resnet18(output: str) -> ResNet:

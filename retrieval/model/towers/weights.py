@@ -79,12 +79,8 @@ def _imagenet_file(name: str) -> Path:
         raise CheckpointError(f"there are ImageNet weights for {', '.join(IMAGENET_URLS)}; none for {name!r}")
     url = IMAGENET_URLS[name]
     path = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
-    if not path.is_file():
-        _download(url, path)
-    return path
-
-
-def _download(url: str, path: Path) -> None:
+    if path.is_file():
+        return path
     path.parent.mkdir(parents=True, exist_ok=True)
     log.warning("downloading %s to %s", url, path)
     try:
@@ -95,3 +91,4 @@ def _download(url: str, path: Path) -> None:
         ) from error
     except RuntimeError as error:  # torch reports a wrong hash so
         raise CheckpointError(f"the download of {url} is damaged ({error}); try again") from error
+    return path
