@@ -89,49 +89,25 @@ class QueryResult:
 
 def in_words(result: QueryResult) -> str:
     """The verdict as a sentence for people, and which grasps were left out."""
-    left_out = [number for number, shown in enumerate(result.grasps, start=1) if shown == NO_CONTACT]
-    remark = f"; grasps without contact were left out: {_listed(left_out)}" if left_out and result.results else ""
-    return _SENTENCES[result.verdict](result) + remark
 
+    def grasps(shown: str) -> str:
+        return ", ".join(str(number) for number, what in enumerate(result.grasps, start=1) if what == shown)
 
-def _match_words(result: QueryResult) -> str:
-    best = result.results[0]
-    return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {result.none_probability:.2f}"
-
-
-def _none_words(result: QueryResult) -> str:
-    best = result.results[0]
-    return (
-        f"none of these: that the catalogue lacks the object has probability {result.none_probability:.2f}, its "
-        f"nearest, {best.object_id}, {best.probability:.2f}; more grasps may tell, and --none-prior says how likely it "
-        "is beforehand"
-    )
-
-
-def _no_contact_words(result: QueryResult) -> str:
-    return "no contact: the gels look untouched; close the jaws on the object, or press harder, and query again"
-
-
-def _not_a_gel_words(result: QueryResult) -> str:
-    numbers = [number for number, shown in enumerate(result.grasps, start=1) if shown == NOT_A_GEL]
-    return (
-        f"not a gel image: what was given for grasp {_listed(numbers)} does not look like a gel that the model knows "
-        f"(trained on: {result.index['trained_on']}); give gel images, or a model trained on this sensor"
-    )
-
-
-def _uncalibrated_words(result: QueryResult) -> str:
-    return f"uncalibrated: {result.results[0].object_id} comes first; this model has no probabilities"
-
-
-def _listed(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers))
-
-
-_SENTENCES = {
-    MATCH: _match_words,
-    NONE_OF_THESE: _none_words,
-    NO_CONTACT: _no_contact_words,
-    NOT_A_GEL: _not_a_gel_words,
-    UNCALIBRATED: _uncalibrated_words,
-}
+    if result.verdict == NO_CONTACT:
+        return "no contact: the gels look untouched; close the jaws on the object, or press harder, and query again"
+    if result.verdict == NOT_A_GEL:
+        return (
+            f"not a gel image: what was given for grasp {grasps(NOT_A_GEL)} does not look like a gel that the model "
+            f"knows (trained on: {result.index['trained_on']}); give gel images, or a model trained on this sensor"
+        )
+    best, none = result.results[0], result.none_probability
+    remark = f"; grasps without contact were left out: {grasps(NO_CONTACT)}" if NO_CONTACT in result.grasps else ""
+    if result.verdict == MATCH:
+        return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {none:.2f}{remark}"
+    if result.verdict == NONE_OF_THESE:
+        return (
+            f"none of these: that the catalogue lacks the object has probability {none:.2f}, its nearest, "
+            f"{best.object_id}, {best.probability:.2f}; more grasps may tell, and --none-prior says how likely it is "
+            f"beforehand{remark}"
+        )
+    return f"uncalibrated: {best.object_id} comes first; this model has no probabilities{remark}"

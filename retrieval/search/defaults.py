@@ -43,8 +43,14 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     """
     if given is not None:
         return Path(given), "given"
-    here = _trained_here()
-    if manifest := _manifest(index):
+    from indexes.errors import IndexesError
+    from indexes.store.folder import IndexStore
+    from indexes.store.manifest import read_manifest
+
+    here, manifest = _trained_here(), None
+    with suppress(IndexesError):  # no usable index is none
+        manifest = read_manifest(index / IndexStore(index).current())
+    if manifest is not None:
         own = model_of(manifest)
         newer = f"; {here} was trained in this folder too: name it to take it" if here not in (None, own) else ""
         return own, f"the one that {index} was built with{newer}"
@@ -104,17 +110,6 @@ def _trained_here() -> Path | None:
     """The last model trained from the working folder, while it is there."""
     path = Path(_noted().get("model", ""))
     return path if path.is_file() else None
-
-
-def _manifest(index: Path) -> "Manifest | None":
-    """Of the index in this folder, if there is a usable one."""
-    from indexes.errors import IndexesError
-    from indexes.store.folder import IndexStore
-    from indexes.store.manifest import read_manifest
-
-    with suppress(IndexesError):
-        return read_manifest(index / IndexStore(index).current())
-    return None
 
 
 def _noted() -> dict[str, str]:

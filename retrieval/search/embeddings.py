@@ -29,12 +29,9 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
     """
     if not photos:
         raise BadInput("give at least one photo to embed")
-    checkpoint = model if isinstance(model, Checkpoint) else load_checkpoint(_path(model))
-    view = checkpoint.config.preprocessing.photo
+    if not isinstance(model, Checkpoint):
+        model = load_checkpoint(find_model(None)[0] if model is None else Path(model))
+    view = model.config.preprocessing.photo
     images = (view(read_image(photo, f"photo {number}")) for number, photo in enumerate(photos, start=1))
-    code = encode_photos(checkpoint.matcher, images)
+    code = encode_photos(model.matcher, images)
     return Encoded(code.embedding.numpy(), code.half.numpy())
-
-
-def _path(model: str | Path | None) -> Path:
-    return find_model(None)[0] if model is None else Path(model)

@@ -1,19 +1,58 @@
-"""From match logits of photos to objects: what each object's logit is, which are best, and a sample of the others."""
+"""The photos of an index, checked as they are read, for an index may come from anyone; and its objects: from the match
+logits of photos to what each object's logit is, which are best, and a sample of the others."""
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from pathlib import PurePosixPath
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from retrieval.model.posterior import Posterior
-from retrieval.search.listing import listed_photo
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 SAMPLE = 100
 """Objects, drawn once, that stand for those that a query does not judge."""
+
+
+@dataclass(frozen=True)
+class ListedPhoto:
+    """A row of an index. path: inside the catalogue, relative to it; metadata: the user's own."""
+
+    object_id: str
+    path: str
+    metadata: dict[str, Any]
+
+
+def listed_photo(row: dict[str, Any]) -> ListedPhoto:
+    """The photo of a row. Raises CorruptIndex for one whose parts are missing or that lies outside the catalogue, from
+    where its picture would be put into pages."""
+    object_id, path, metadata = (row.get(name) for name in ("object_id", "path", "metadata"))
+    if not (isinstance(object_id, str) and isinstance(path, str) and isinstance(metadata, dict)):
+        raise CorruptIndex(f"row {row['id']!r} must have an object_id, a path and metadata; {AGAIN}")
+    parts = PurePosixPath(path)
+    if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\0" in path:
+        raise CorruptIndex(f"row {row['id']!r} must name a photo inside the catalogue, names {path!r}; {AGAIN}")
+    return ListedPhoto(object_id, path, metadata)
+
+
+def require_usable(generation: Generation, hidden: int) -> None:
+    """Raise CorruptIndex unless the index says where its catalogue and checkpoint lie, and holds halves of `hidden`
+    numbers."""
+    about, halves = generation.manifest.about, generation.arrays.get("halves")
+    candidates = about.get("candidates")
+    k = candidates.get("k") if isinstance(candidates, dict) else None
+    if candidates is not None and not (type(k) is int and 1 <= k < 2**31):
+        raise CorruptIndex(f"{generation.folder}: its number of candidates must be 1 or more; {AGAIN}")
+    if not all(isinstance(about.get(name), str) and "\0" not in about[name] for name in ("catalogue", "checkpoint")):
+        raise CorruptIndex(f"{generation.folder}: it must say its catalogue and its checkpoint; {AGAIN}")
+    if halves is None or halves.ndim != 2 or halves.shape[1] != hidden or halves.dtype.kind != "f":
+        got = "none" if halves is None else f"{halves.dtype} {halves.shape}"
+        raise CorruptIndex(f"{generation.folder}: it must hold halves of {hidden} numbers, holds {got}; {AGAIN}")
 
 
 class JudgedObjects(NamedTuple):
@@ -30,7 +69,10 @@ class Objects:
     def __init__(self, generation: Generation) -> None:
         self._rows = generation.rows
         self._of_row = generation.codes("object_id")
-        self._original = _originals(generation.codes("digest"))
+        contents = generation.codes("digest")
+        first = np.unique(contents, return_index=True)[1]
+        self._original = first[contents] if len(first) < len(contents) else None
+        """For each photo the first one of equal bytes; None where no two are equal."""
         self._photos = np.bincount(self._of_row)
 
     @property
@@ -58,16 +100,16 @@ class Objects:
 
     def best(self, judged: JudgedObjects, top: int) -> Rows:
         """Places in `judged` of the `top` objects of largest logit; ties by name."""
-        near = _largest(judged.logits, top)
-        order = np.lexsort((self._ranks(judged.rows[near], judged.logits[near]), -judged.logits[near]))
+        near = np.arange(len(judged.logits))
+        if top < len(near):  # and all that equal the least of them
+            near = np.flatnonzero(judged.logits >= np.partition(judged.logits, -top)[-top])
+        logits = judged.logits[near]
+        if len(np.unique(logits)) == len(near):  # no tie asks for names, for which rows are parsed
+            order = np.argsort(-logits)
+        else:
+            names = np.array([listed_photo(self._rows[row]).object_id for row in judged.rows[near]])
+            order = np.lexsort((names, -logits))
         return np.asarray(near[order[:top]])
-
-    def _ranks(self, rows: Rows, logits: NDArray[np.float64]) -> Rows:
-        """Of each row, its object's place in the order of names; all 0 where no tie asks for it, as it parses rows."""
-        if len(np.unique(logits)) == len(logits):
-            return np.zeros(len(rows), dtype=np.int64)
-        names = np.array([listed_photo(self._rows[row]).object_id for row in rows])
-        return np.unique(names, return_inverse=True)[1]
 
     def rest_of(self, numbers: Rows, rows: Rows) -> Rows:
         """Rows of the photos of these objects that are not among `rows`, which are sorted."""
@@ -87,16 +129,3 @@ class Objects:
         drawn[np.random.default_rng(0).permutation(self.count)[:SAMPLE]] = True
         rows = np.flatnonzero(drawn[self._of_row])
         return rows, self._of_row[rows]
-
-
-def _originals(contents: Rows) -> Rows | None:
-    """For each photo the first one of equal bytes, which `contents` numbers; None where no two are equal."""
-    _, first = np.unique(contents, return_index=True)
-    return first[contents] if len(first) < len(contents) else None
-
-
-def _largest(values: NDArray[np.float64], count: int) -> Rows:
-    """Places of the `count` largest values, and of all that equal the least of them."""
-    if count >= len(values):
-        return np.arange(len(values))
-    return np.flatnonzero(values >= np.partition(values, len(values) - count)[len(values) - count])

@@ -24,14 +24,12 @@ from retrieval.model.touches import (
     Encoder,
     GivenImage,
     Stopwatch,
-    TouchCodes,
     TouchReader,
     read_grasps,
 )
 from retrieval.search import defaults
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
-from retrieval.search.listing import listed_photo, require_usable
-from retrieval.search.objects import JudgedObjects, Objects
+from retrieval.search.objects import JudgedObjects, Objects, listed_photo, require_usable
 
 DEFAULT_CANDIDATES = 1000
 COMPLETED = 20
@@ -62,7 +60,14 @@ class Searcher:
         self.gel_check = checkpoint.gel_check
         compares = self.gel_check is not None and self.gel_check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares)
-        self.posterior = _posterior_of(index, generation)
+        self.posterior: Posterior | None = None  # where the model was never calibrated
+        if "calibration" in generation.documents:
+            try:
+                self.posterior = Posterior.from_dict(generation.documents["calibration"])
+            except BadInput as error:
+                raise UnsupportedFormat(
+                    f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
+                ) from error
         self.catalogue = Path(generation.manifest.about["catalogue"])
         self.objects = Objects(generation)
         self._closed = False
@@ -86,11 +91,14 @@ class Searcher:
         """
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
-        _require(generation, stored)
+        if stored.digest != generation.fingerprint.get("checkpoint"):
+            from retrieval.model.checkpoint import load_checkpoint
+
+            load_checkpoint(stored.path)  # a damaged one says so
+        generation.require(fingerprint(stored))
         require_usable(generation, stored.config.matcher.hidden)
-        return cls(
-            Path(index), generation, stored, exported_beside(stored) or _torch_encoder(stored), read_judge(stored.path)
-        )
+        encoder = exported_beside(stored) or torch_encoder(stored)
+        return cls(Path(index), generation, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
         """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""
@@ -203,27 +211,22 @@ class Searcher:
         references = self.reader.references(background)
         codes = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
         ends = np.cumsum([len(grasps) for grasps in asked])[:-1]
-        shown = np.split(np.array(self._shown(codes)), ends)
-        felt = [_felt(own) for own in shown]
-        halves, embeddings = np.split(codes.halves, ends), np.split(codes.embeddings, ends)
-        with clock("candidates"):
-            rows = [self._candidates(own[used], limit) for own, used in zip(embeddings, felt, strict=True)]
-        with clock("rerank"):
-            judged = [
-                self._judged(own[used], found, top, none_prior)
-                for own, used, found in zip(halves, felt, rows, strict=True)
-            ]
+        shown = np.full(len(codes.halves), CONTACT)
+        if self.gel_check is not None and codes.readings is not None:
+            shown = np.array(self.gel_check.judge(codes.readings, codes.levels))
+        parts = list(zip(*(np.split(of_all, ends) for of_all in (shown, codes.halves, codes.embeddings)), strict=True))
+        judged = []
+        for own, halves, embeddings in parts:
+            felt = (own == CONTACT) & (own != NOT_A_GEL).all()
+            with clock("candidates"):
+                rows = self._candidates(embeddings[felt], limit)
+            with clock("rerank"):
+                judged.append(self._judged(halves[felt], rows, top, none_prior))
         timing_ms = clock.finished(len(asked))
         return [
             self._answer(grasps, own.tolist(), timing_ms, found, top, none_prior)
-            for grasps, own, found in zip(asked, shown, judged, strict=True)
+            for grasps, (own, *_), found in zip(asked, parts, judged, strict=True)
         ]
-
-    def _shown(self, codes: TouchCodes) -> list[str]:
-        """What each grasp shows, as far as the model has a check."""
-        if self.gel_check is None or codes.readings is None:
-            return [CONTACT] * len(codes.halves)
-        return self.gel_check.judge(codes.readings, codes.levels)
 
     def _candidates(self, embeddings: Floats, k: int) -> Rows:
         """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
@@ -255,7 +258,11 @@ class Searcher:
         if self.posterior is None:
             return _Judged(len(rows), len(halves), objects, None)
         unjudged = self.objects.count - len(objects.numbers)
-        sample = self._sample_logits(halves, objects) if unjudged else np.zeros(0)
+        # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
+        # expected to be.
+        sample = objects.logits.min(keepdims=True)
+        if unjudged and len(drawn := self.objects.sample_without(objects.numbers)):
+            sample = self.objects.judged(drawn, self._logits(halves, drawn), meaning, len(halves)).logits
         belief = self.posterior.believe(
             objects.logits, len(halves), none_prior=none_prior, unjudged=unjudged, sample=sample
         )
@@ -266,15 +273,6 @@ class Searcher:
         every = len(rows) == self.generation.count
         logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
         return self.objects.equal_for_equals(rows, logits)
-
-    def _sample_logits(self, halves: Floats, judged: JudgedObjects) -> NDArray[np.float64]:
-        """Logits of a sample of the objects without a judged photo; where the sample holds none of them, they are taken
-        to be like the least of the judged ones, which candidates are not expected to be."""
-        rows = self.objects.sample_without(judged.numbers)
-        if not len(rows):
-            return np.array([judged.logits.min()])
-        meaning = self.posterior or Posterior()
-        return self.objects.judged(rows, self._logits(halves, rows), meaning, len(halves)).logits
 
     def _answer(
         self,
@@ -289,7 +287,18 @@ class Searcher:
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,
-            index=self._about(judged.photos if judged else 0),
+            index={
+                "path": str(self.index),
+                "generation": self.generation.name,
+                "kind": self.generation.manifest.kind,
+                "photos": self.generation.count,
+                "objects": self.objects.count,
+                "scored": judged.photos if judged else 0,
+                "encoder": self.encoder.name,
+                "catalogue": str(self.catalogue),
+                "model": str(self.checkpoint.path),
+                "trained_on": self.checkpoint.provenance.get("source", "unknown"),
+            },
             timing_ms=timing_ms,
             verdict=_verdict(shown, belief),
             none_probability=belief.none if belief else None,
@@ -299,20 +308,13 @@ class Searcher:
 
     def _ranking(self, judged: "_Judged", top: int) -> list[Match]:
         objects, belief = judged.objects, judged.belief
-        return [
-            self._match(
-                rank,
-                int(objects.rows[place]),
-                float(objects.logits[place]),
-                None if belief is None else float(belief.objects[place]),
-            )
-            for rank, place in enumerate(self.objects.best(objects, top), start=1)
-        ]
-
-    def _match(self, rank: int, row_number: int, logit: float, probability: float | None) -> Match:
-        photo = listed_photo(self.generation.rows[row_number])
-        path = self.catalogue.absolute() / photo.path
-        return Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path)
+        ranking = []
+        for rank, place in enumerate(self.objects.best(objects, top), start=1):
+            photo = listed_photo(self.generation.rows[int(objects.rows[place])])
+            probability = None if belief is None else float(belief.objects[place])
+            path, logit = self.catalogue.absolute() / photo.path, float(objects.logits[place])
+            ranking.append(Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path))
+        return ranking
 
     def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
         """The formula of the probabilities, with the numbers of this answer."""
@@ -327,32 +329,6 @@ class Searcher:
             "unjudged_probability": judged.belief.unjudged,
         }
 
-    def _about(self, scored: int) -> dict[str, Any]:
-        return {
-            "path": str(self.index),
-            "generation": self.generation.name,
-            "kind": self.generation.manifest.kind,
-            "photos": self.generation.count,
-            "objects": self.objects.count,
-            "scored": scored,
-            "encoder": self.encoder.name,
-            "catalogue": str(self.catalogue),
-            "model": str(self.checkpoint.path),
-            "trained_on": self.checkpoint.provenance.get("source", "unknown"),
-        }
-
-
-def _posterior_of(index: Path, generation: Generation) -> Posterior | None:
-    """What the index keeps of its model's probabilities; None where the model was never calibrated."""
-    if "calibration" not in generation.documents:
-        return None
-    try:
-        return Posterior.from_dict(generation.documents["calibration"])
-    except BadInput as error:
-        raise UnsupportedFormat(
-            f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
-        ) from error
-
 
 class _Judged(NamedTuple):
     """What was judged for one object in the hand: so many photos, by so many grasps."""
@@ -361,11 +337,6 @@ class _Judged(NamedTuple):
     grasps: int
     objects: JudgedObjects
     belief: Belief | None
-
-
-def _felt(shown: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Which grasps are judged: those with contact, and none where an image is no gel image."""
-    return np.asarray((shown == CONTACT) & (shown != NOT_A_GEL).all())
 
 
 def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
@@ -378,16 +349,7 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
     return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
 
 
-def _require(generation: Generation, stored: Stored) -> None:
-    wanted = fingerprint(stored)
-    if wanted["checkpoint"] != generation.fingerprint.get("checkpoint"):
-        from retrieval.model.checkpoint import load_checkpoint
-
-        load_checkpoint(stored.path)  # a damaged one says so
-    generation.require(wanted)
-
-
-def _torch_encoder(stored: Stored) -> Encoder:
+def torch_encoder(stored: Stored) -> Encoder:
     """The towers in PyTorch, whose import takes longer than all the rest."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder

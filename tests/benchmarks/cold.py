@@ -40,7 +40,7 @@ from pathlib import Path
 import retrieval.search.searcher as search
 generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: search.read_stored(Path(model)))
-encoder = step("make the encoder", lambda: search.exported_beside(stored) or search._torch_encoder(stored))
+encoder = step("make the encoder", lambda: search.exported_beside(stored) or search.torch_encoder(stored))
 judge = step("read the head", lambda: search.read_judge(Path(model)))
 searcher = step("number objects", lambda: search.Searcher(Path(index), generation, stored, encoder, judge))
 result = searcher.query([touch])
