@@ -2,10 +2,10 @@
 
 Importing this package needs only numpy; FAISS is imported when one of its kinds is used.
 
-    indexes.store.folder        `IndexStore`, the folder of generations
-    indexes.kinds.choice       which kind meets a latency budget, by measurement
-    indexes.kinds.measure      recall against the exact search
-    indexes.errors       every error
+    indexes.store.folder     `IndexStore`, the folder of generations
+    indexes.kinds.base       `VectorIndex`, what every kind of index is and says of itself
+    indexes.kinds.measure    recall against the exact search
+    indexes.errors           every error
 
 >>> import indexes, numpy
 >>> axes = numpy.eye(3, dtype=numpy.float32)
@@ -22,7 +22,6 @@ from indexes.errors import ParameterError
 if TYPE_CHECKING:
     from indexes.errors import IndexesError as IndexesError
     from indexes.kinds.base import VectorIndex as VectorIndex
-    from indexes.kinds.choice import choose_kind as choose_kind
     from indexes.kinds.measure import recall_against_exact as recall_against_exact
     from indexes.store.folder import IndexStore as IndexStore
     from indexes.store.generation import Generation as Generation
@@ -30,12 +29,13 @@ if TYPE_CHECKING:
 KINDS = {
     "exact": "indexes.kinds.exact:ExactIndex",
     "flat": "indexes.kinds.flat:FlatIndex",
-    "hnsw": "indexes.kinds.hnsw:HNSWIndex",
     "ivf_flat": "indexes.kinds.ivf:IVFFlatIndex",
     "ivf_sq8": "indexes.kinds.ivf:IVFSQ8Index",
     "ivf_pq": "indexes.kinds.ivf:IVFPQIndex",
+    "hnsw": "indexes.kinds.hnsw:HNSWIndex",
 }
-"""Name of a kind -> where its class stands. A new kind is one file and one line here."""
+"""Name of a kind -> where its class stands, the quickest to build first. A new kind is one file and one line here; what
+others need to know of it, its class says (`indexes.kinds.base.VectorIndex`)."""
 
 
 def load_kind(name: str) -> "type[VectorIndex]":
@@ -45,7 +45,7 @@ def load_kind(name: str) -> "type[VectorIndex]":
     (True, False)
     >>> indexes.load_kind("octree")
     Traceback (most recent call last):
-    indexes.errors.ParameterError: the kind of index must be one of exact, flat, hnsw, ...; got 'octree'
+    indexes.errors.ParameterError: the kind of index must be one of exact, flat, ivf_flat, ...; got 'octree'
     """
     if name not in KINDS:
         raise ParameterError(f"the kind of index must be one of {', '.join(KINDS)}; got {name!r}")
@@ -59,7 +59,6 @@ _PLACES = {
     "IndexStore": "store.folder",
     "IndexesError": "errors",
     "VectorIndex": "kinds.base",
-    "choose_kind": "kinds.choice",
     "recall_against_exact": "kinds.measure",
 }
 """Public name -> its module in this package, imported when it is used."""

@@ -151,7 +151,7 @@ def test_the_collector_knows_the_contract_and_no_rig():
 
 
 def test_indexes_import_with_numpy_alone():
-    code = "import indexes, indexes.store.folder, indexes.kinds.exact, indexes.kinds.choice"
+    code = "import indexes, indexes.store.folder, indexes.kinds.exact, indexes.kinds.measure"
     done = run_blocked(code, ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn"))
     assert done.returncode == 0, done.stderr
 

@@ -96,7 +96,7 @@ def test_codes_are_trained_without_a_warning(count, capfd):
 
 @pytest.mark.parametrize(("dim", "parts"), [(8, 8), (12, 6), (13, 1), (64, 8), (128, 16), (512, 64)])
 def test_code_bytes_divide_the_vector(dim, parts):
-    assert IVFPQIndex._resolve(IVFPQParameters(), 1000, dim).code_bytes == parts
+    assert IVFPQIndex.resolved(IVFPQParameters(), 1000, dim).code_bytes == parts
 
 
 def test_code_bytes_that_do_not_divide_are_refused():

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ from indexes.store.generation import Generation
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 from tests.waiting import first_line, running
 
-STEPS = ("fsync", "rename", "replace", "link", "mkdir", "unlink", "rmdir")
+STEPS = ("fsync", "rename", "replace", "mkdir", "unlink", "rmdir")
 
 KILLED_AT_EVERY_STEP = """
 import json, os, shutil, signal, sys
@@ -96,9 +97,8 @@ def run(program: str, *arguments: str) -> str:
 NAMES = [f"{number:02d}" for number in range(40)]
 CHANGES = {
     "fresh": (["00", "01", "02"], ["01", "03"]),
-    "grown": (NAMES[:30], NAMES[2:33]),  # the parent's files are shared, rows are removed and added
-    "joined": (NAMES[:3], NAMES[:20]),  # the new segment takes in the old one
-    "compacted": (NAMES[:30], NAMES[9:31]),
+    "grown": (NAMES[:30], NAMES[2:33]),  # rows are removed and added, slots stay
+    "renumbered": (NAMES[:30], NAMES[9:31]),
 }
 
 
@@ -169,20 +169,18 @@ def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
     filled(tmp_path)
     steps = Steps(monkeypatch, None)
     filled(tmp_path, kind="hnsw", arrays={"halves": np.ones((20, 2))}, documents={"calibration": {}})
-    beside, suffix = f"CURRENT.tmp-{os.getpid()}", f".tmp-{os.getpid()}"
-    calls = [call for call in steps.calls if call[0] != "mkdir"]
+    suffix = f".tmp-{os.getpid()}"
+    calls = [(step, re.sub(r"^\.CURRENT\..*", "beside", name)) for step, name in steps.calls if step != "mkdir"]
     assert calls == [
-        *(("fsync", f"{name}.new") for name in ("rows", "embeddings", "halves")),
-        ("rename", "rows.new"),
-        ("fsync", "table-000002.npy"),
-        *(("rename", f"{name}.new") for name in ("halves", "embeddings")),
+        *(("fsync", name) for name in ("rows.jsonl", "embeddings.npy", "halves.npy", "table.npy")),
         *(("fsync", name) for name in ("calibration.json", "vectors.faiss")),
         ("fsync", "manifest.json"),
         ("fsync", f"gen-000002{suffix}"),
         ("rename", f"gen-000002{suffix}"),
         ("fsync", tmp_path.name),
-        ("fsync", beside),
-        ("replace", beside),
+        ("fsync", "beside"),
+        ("replace", "beside"),
+        ("unlink", "beside"),
         ("fsync", tmp_path.name),
     ]
 
@@ -219,11 +217,11 @@ def test_an_interrupted_writer_cleans_up_and_gives_the_lock_back(tmp_path, monke
 
 
 def test_a_writer_killed_before_the_first_switch_leaves_no_index_and_no_obstacle(tmp_path, monkeypatch):
-    def killed(path, text):
+    def killed(path, data):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(files, "replace_text", killed)
+        patch.setattr(files, "write_atomically", killed)
         with pytest.raises(KeyboardInterrupt):
             filled(tmp_path)
     with pytest.raises(NoIndex):

@@ -1,14 +1,11 @@
-"""Recall, the check of claimed results, and the choice of a kind by measurement."""
-
-import itertools
+"""Recall, and the check of claimed results."""
 
 import numpy as np
 import pytest
 
+from indexes import load_kind
 from indexes.errors import ParameterError
-from indexes.kinds import choice
 from indexes.kinds.base import VectorIndex
-from indexes.kinds.choice import Choice, choose_kind, operating_points
 from indexes.kinds.exact import ExactIndex
 from indexes.kinds.measure import disagreements, query_ms, recall_against_exact, sample_queries
 
@@ -103,7 +100,7 @@ def test_recall_without_queries_is_refused():
 
 def test_recall_of_the_whole_is_the_mean_over_any_partition():
     vectors = unit(800, 16)
-    index = choice.load_kind("ivf_flat").build(vectors).tuned(probes=1)
+    index = load_kind("ivf_flat").build(vectors).tuned(probes=1)
     queries = sample_queries(vectors, 60)
     parts = [recall_against_exact(index, queries[start : start + 20]) for start in (0, 20, 40)]
     assert np.mean(parts) == pytest.approx(recall_against_exact(index, queries))
@@ -122,105 +119,3 @@ def test_sampled_queries_are_unit_vectors_near_the_data_and_follow_the_seed():
 def test_the_time_of_a_query_is_the_median_without_the_first():
     ticks = iter([0.0, 0.001, 1.0, 1.009, 2.0, 2.002])
     assert query_ms(ExactIndex.build(AXES), AXES[:3], 2, clock=lambda: next(ticks)) == pytest.approx(2.0)
-
-
-def scripted(monkeypatch, **ms: float) -> list[str]:
-    """Let each kind take the given milliseconds; returns the kinds that were built, as they are built."""
-    built: list[str] = []
-    real = choice.load_kind
-
-    def counting(name):
-        built.append(name)
-        return real(name)
-
-    monkeypatch.setattr(choice, "load_kind", counting)
-    monkeypatch.setattr(choice, "query_ms", lambda index, queries, k, clock: ms[index.kind])
-    return built
-
-
-VECTORS = unit(900, 16)
-
-
-def test_without_a_budget_exact_search_is_taken_and_nothing_is_measured():
-    def no_clock() -> float:
-        raise AssertionError("nothing should be timed")
-
-    got = choose_kind(VECTORS, None, clock=no_clock)
-    assert (got.kind, got.measured_ms, got.recall) == ("flat", None, 1.0)
-    assert got.reason == "Exact search: no time budget was asked for."
-
-
-def test_exact_search_within_the_budget_is_kept_and_nothing_else_is_built(monkeypatch):
-    built = scripted(monkeypatch, flat=3.0)
-    got = choose_kind(VECTORS, 5)
-    assert set(built) == {"flat"}
-    assert got.reason == "Exact search: it takes 3 ms, within the budget of 5 ms."
-
-
-def test_a_graph_is_taken_when_exact_search_breaks_the_budget_and_its_recall_is_said(monkeypatch):
-    built = scripted(monkeypatch, flat=30.0, hnsw=0.5)
-    got = choose_kind(VECTORS, 5)
-    assert "ivf_flat" not in built
-    assert (got.kind, got.exact_ms, got.measured_ms) == ("hnsw", 30.0, 0.5)
-    assert got.recall >= 0.99
-    assert got.reason == (
-        "hnsw: exact search takes 30 ms, over the budget of 5 ms; this takes 0.5 ms, "
-        f"with a measured recall@10 of {got.recall:.3f}."
-    )
-
-
-def test_inverted_lists_are_taken_when_the_graph_is_too_slow(monkeypatch):
-    scripted(monkeypatch, flat=30.0, hnsw=8.0, ivf_flat=2.0)
-    got = choose_kind(VECTORS, 5)
-    assert (got.kind, got.measured_ms) == ("ivf_flat", 2.0)
-    assert got.recall >= 0.99
-
-
-def test_a_budget_that_nothing_meets_gets_the_fastest_and_says_so(monkeypatch):
-    scripted(monkeypatch, flat=30.0, hnsw=8.0, ivf_flat=9.0)
-    got = choose_kind(VECTORS, 5)
-    assert got.kind == "hnsw"
-    assert "over the budget too but the fastest" in got.reason
-
-
-def test_exact_search_stays_where_nothing_faster_is_good_enough(monkeypatch):
-    scripted(monkeypatch, flat=30.0, hnsw=40.0, ivf_flat=50.0)
-    got = choose_kind(VECTORS, 5)
-    assert (got.kind, got.recall) == ("flat", 1.0)
-    assert "nothing faster reaches a recall@10 of 0.99" in got.reason
-
-
-def test_a_kind_with_too_little_recall_is_not_taken(monkeypatch):
-    scripted(monkeypatch, flat=30.0, hnsw=0.1, ivf_flat=0.1)
-    monkeypatch.setattr(choice, "recall_against_exact", lambda index, queries, k: 0.98)
-    assert choose_kind(VECTORS, 5, min_recall=0.99).kind == "flat"
-    assert choose_kind(VECTORS, 5, min_recall=0.98).kind == "hnsw"
-
-
-@pytest.mark.parametrize(("budget", "recall"), [(0, 0.9), (-1, 0.9), (float("nan"), 0.9), (1, 0), (1, 1.1)])
-def test_budgets_and_recalls_out_of_range_are_refused(budget, recall):
-    with pytest.raises(ParameterError, match="budget must be above 0 ms"):
-        choose_kind(VECTORS, budget, recall)
-
-
-def test_copies_are_left_out_of_the_measurement(monkeypatch):
-    scripted(monkeypatch, flat=30.0, hnsw=0.5)
-    got = choose_kind(np.repeat(VECTORS[:50], 30, axis=0), 5)
-    assert (got.kind, got.recall) == ("hnsw", 1.0)
-
-
-def test_operating_points_come_for_each_kind_and_setting_with_the_exact_one_at_recall_one():
-    ticks = itertools.count()
-    points = list(operating_points(VECTORS, ("flat", "hnsw", "ivf_flat", "ivf_pq"), clock=lambda: next(ticks)))
-    assert [point.kind for point in points] == ["flat"] + ["hnsw"] * 6 + ["ivf_flat"] * 5 + ["ivf_pq"] * 5
-    assert points[0].recall == 1.0
-    assert all(point.ms == 1000.0 for point in points)
-    assert points[6].recall >= points[1].recall
-
-
-def test_a_choice_is_made_on_this_machine():
-    got = choose_kind(VECTORS, 1e9)
-    assert isinstance(got, Choice)
-    assert got.kind == "flat"
-    assert got.exact_ms is not None
-    assert got.exact_ms > 0

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from indexes import KINDS
 from indexes.errors import MismatchedIndex, ParameterError, RowError, SelfRetrievalFailed, VectorError
 from indexes.kinds.hnsw import HNSWParameters
 from indexes.kinds.ivf import IVFPQParameters
@@ -17,7 +18,7 @@ from indexes.store.generation import Generation
 
 DIM = 8
 FINGERPRINT = {"checkpoint": "abc", "preprocessing": "def"}
-EVERY_KIND = ["exact", "flat", "hnsw", "ivf_flat", "ivf_sq8", "ivf_pq"]
+EVERY_KIND = list(KINDS)
 
 
 def unit(count: int, dim: int = DIM, seed: int = 0) -> np.ndarray:
@@ -82,10 +83,10 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
     folder = tmp_path / "gen-000001"
     found = sorted(path.name for path in folder.iterdir())
-    segment = ["embeddings-000001.npy", "rows-000001.jsonl", "table-000001.npy"]
-    assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *segment])
+    tables = ["embeddings.npy", "rows.jsonl", "table.npy"]
+    assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["format"] == 2
+    assert manifest["format"] == 3
     assert manifest["generation"] == "gen-000001"
     assert manifest["parent"] is None
     assert manifest["fingerprint"] == FINGERPRINT
@@ -94,14 +95,12 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     assert manifest["kind"] == "hnsw"
     assert manifest["metric"] == "inner_product"
     assert manifest["dim"] == DIM
-    counts = {"rows": 20, "records": 20, "slots": 20, "tombstones": 0, "built_slots": 20, "structure_slots": 20}
-    assert manifest["counts"] == counts
-    assert manifest["segments"] == {"records": [1], "vectors": [1]}
+    assert manifest["counts"] == {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20, "structure_slots": 20}
     assert manifest["recall"]["value"] == 1.0
     assert sorted(manifest["files"]) == [name for name in found if name != "manifest.json"]
-    first = json.loads((folder / "rows-000001.jsonl").read_text().splitlines()[0])
+    first = json.loads((folder / "rows.jsonl").read_text().splitlines()[0])
     assert first == {"id": "p00000", "digest": "1"}
-    assert np.array_equal(np.load(folder / "embeddings-000001.npy"), unit(20))
+    assert np.array_equal(np.load(folder / "embeddings.npy"), unit(20))
 
 
 @pytest.mark.parametrize("kind", ["exact", "flat"])
@@ -322,10 +321,10 @@ def test_bad_input_is_refused_in_words_and_leaves_the_old_index(tmp_path, change
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        (None, r"the parent has the arrays \['halves'\], the new rows have \[\]"),
-        ({"halves": np.zeros((1, 2)), "more": np.zeros(1)}, "the parent has the arrays"),
-        ({"halves": np.zeros((1, 3))}, r"must be float64 \(2,\)"),
-        ({"halves": np.zeros((1, 2), np.float32)}, "got float32"),
+        (None, r"the same arrays: halves float64 \(2,\); got none"),
+        ({"halves": np.zeros((1, 2)), "more": np.zeros(1)}, r"got halves float64 \(2,\), more float64 \(\)"),
+        ({"halves": np.zeros((1, 3))}, r"got halves float64 \(3,\)"),
+        ({"halves": np.zeros((1, 2), np.float32)}, r"got halves float32 \(2,\)"),
     ],
 )
 def test_arrays_that_differ_from_the_parents_are_refused(tmp_path, arrays, words):
@@ -451,7 +450,7 @@ import sys
 for name in ("faiss", "torch", "cv2", "PIL", "scipy", "sklearn", "retrieval", "robot"):
     sys.modules[name] = None
 import numpy as np
-import indexes, indexes.errors, indexes.kinds.choice, indexes.kinds.measure
+import indexes, indexes.errors, indexes.kinds.measure
 from indexes.store.folder import IndexStore
 store = IndexStore(sys.argv[1])
 made = store.write([{"id": "a"}, {"id": "b"}], np.eye(2, dtype=np.float32), fingerprint={}, kind="exact")

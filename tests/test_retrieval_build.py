@@ -18,9 +18,10 @@ from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import encode_photos, for_inference
 from retrieval.model.fusion import Matcher
-from retrieval.search import build, embed, operating
-from retrieval.search.ahead import ahead
+from retrieval.search import build, embed, measuring, operating
 from retrieval.search.build import build_index
+from retrieval.search.embed import ahead
+from retrieval.search.measuring import NeighbourBench, WinnerBench
 from retrieval.search.searcher import Searcher
 from tests import synthetic
 
@@ -249,7 +250,7 @@ def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, e
 
 def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
     build_index(own, checkpoint, index, quiet=True)
-    halves = index / "gen-000001" / "halves-000001.npy"
+    halves = index / "gen-000001" / "halves.npy"
     halves.write_bytes(halves.read_bytes()[:-1])
     report = build_index(own, checkpoint, index, quiet=True)
     assert report.embedded == 24
@@ -389,27 +390,26 @@ def test_the_error_of_halves_that_were_taken_over_is_not_forgotten(own, checkpoi
 def test_exact_search_is_the_default_and_an_impossible_budget_is_answered_aloud(own, checkpoint, index, monkeypatch):
     assert build_index(own, checkpoint, index, quiet=True).kind == "flat"
     report = build_index(own, checkpoint, index, max_ms=1e-9, quiet=True)
-    assert "over the budget of 1e-09 ms" in report.reason
+    assert "reaches 1e-09 ms; this is the nearest" in report.reason
     assert "hnsw" in "\n".join(build_index(own, checkpoint, index, kind="hnsw", quiet=True).lines())
     assert Searcher.open(index).generation.manifest.kind == "hnsw"
 
 
 def test_without_a_budget_no_vector_is_measured(own, checkpoint, index, monkeypatch):
-    asked = []
+    measured = []
 
-    def choose(vectors, budget_ms, **more):
-        asked.append((len(vectors), budget_ms))
-        return chosen(vectors, budget_ms, **more)
+    def bench(vectors):
+        measured.append(len(vectors))
+        return NeighbourBench(vectors)
 
-    chosen = build.choose_kind
-    monkeypatch.setattr(build, "choose_kind", choose)
+    monkeypatch.setattr(operating, "NeighbourBench", bench)
     build_index(own, checkpoint, index, quiet=True)
     build_index(own, checkpoint, index, max_ms=1000.0, quiet=True)
-    assert asked == [(24, 1000.0)]
+    assert measured == [24]
 
 
 def test_few_photos_are_all_judged_and_nothing_is_measured(own, queried, index, monkeypatch):
-    monkeypatch.setattr(build, "Bench", None)
+    monkeypatch.setattr(build, "WinnerBench", None)
     report = build_index(own, queried, index, quiet=True)
     assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
     assert "candidate search: flat. The classifier judges all 24 photos." in list(report.lines())
@@ -431,7 +431,7 @@ def queried(checkpoint, tmp_path):
 
 
 def test_the_measured_operating_point_stands_in_the_manifest_and_is_said(own, queried, index, monkeypatch):
-    monkeypatch.setattr(operating, "FIRST", 4)
+    monkeypatch.setattr(measuring, "FIRST", 4)
     report = build_index(own, queried, index, min_recall=0.5, quiet=True)
     record = IndexStore(index).open().manifest.about["candidates"]
     assert record == report.candidates
@@ -441,9 +441,11 @@ def test_the_measured_operating_point_stands_in_the_manifest_and_is_said(own, qu
 
 
 def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(own, queried, index, monkeypatch):
-    monkeypatch.setattr(operating, "FIRST", 4)
+    monkeypatch.setattr(measuring, "FIRST", 4)
     benches = []
-    monkeypatch.setattr(build, "Bench", lambda *made, **how: benches.append(made[1:]) or operating.Bench(*made, **how))
+    monkeypatch.setattr(
+        build, "WinnerBench", lambda *made, **how: benches.append(made[1:]) or WinnerBench(*made, **how)
+    )
     build_index(own, queried, index, quiet=True)
     other_picture(own / "newcomer" / "1.jpg", seed=78)
     assert build_index(own, queried, index, quiet=True).candidates["changed"] == 1

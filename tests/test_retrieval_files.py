@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval.console import files
+from indexes.store import files
+from indexes.store.files import write_atomically
 from retrieval.console.files import (
     CARD,
     CHECKPOINT,
@@ -26,7 +27,6 @@ from retrieval.console.files import (
     TIMINGS,
     require_ours,
     text_bytes,
-    write_atomically,
     write_output,
 )
 from retrieval.errors import BadInput
@@ -133,7 +133,7 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
 def test_what_a_killed_writer_left_is_swept_by_the_next_write_to_that_name(tmp_path):
     path = tmp_path / "m.safetensors"
     code = (
-        "import os, signal, sys\nfrom pathlib import Path\nfrom retrieval.console import files\n"
+        "import os, signal, sys\nfrom pathlib import Path\nfrom indexes.store import files\n"
         "files.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
         "files.write_atomically(Path(sys.argv[1]), b'half')"
     )

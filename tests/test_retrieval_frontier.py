@@ -20,7 +20,8 @@ from retrieval.lab.frontier.sample import Sample, Scale, blend
 from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.search.operating import Asked, Bench, settle
+from retrieval.search.measuring import WinnerBench
+from retrieval.search.operating import Asked, settle
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -159,7 +160,7 @@ class WithQueries:
 def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pruning_sample):
     photos = pruning_sample.catalogue
     slots = np.arange(len(photos.halves))
-    bench = Bench(WithQueries(pruning_sample), photos.embeddings["pruner"], slots, photos.halves)
+    bench = WinnerBench(WithQueries(pruning_sample), photos.embeddings["pruner"], slots, photos.halves)
     settled = settle(bench, Asked())
     assert default_k(pruning_sample) == settled.candidates["k"]
     kinds = load_approximation("index_kinds")(pruning_sample)

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 import torch
 
+from indexes import load_kind
 from indexes.errors import ParameterError
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import Matcher
-from retrieval.search import operating
+from retrieval.search import measuring
+from retrieval.search.measuring import NeighbourBench, Point, WinnerBench, can_measure, query_codes
 from retrieval.search.operating import (
     Asked,
-    Bench,
-    Point,
     all_judged,
-    can_measure,
     kept,
     needs_measuring,
     sentence,
     settle,
+    settle_by_neighbours,
 )
 from tests.conftest import TINY
 
@@ -56,7 +56,7 @@ def gallery(checkpoint):
 
 @pytest.fixture(autouse=True)
 def _short_ladder(monkeypatch):
-    monkeypatch.setattr(operating, "FIRST", 4)
+    monkeypatch.setattr(measuring, "FIRST", 4)
 
 
 def winners_found(checkpoint, vectors, slots, halves, k):
@@ -76,13 +76,13 @@ def winners_found(checkpoint, vectors, slots, halves, k):
 
 @pytest.mark.parametrize("k", [4, 8, 16, 32])
 def test_the_winner_recall_is_that_of_two_plain_loops(k, checkpoint, gallery):
-    bench = Bench(checkpoint, *gallery)
+    bench = WinnerBench(checkpoint, *gallery)
     point = bench.point(bench.built("flat"), k)
     assert (point.found, point.queries) == (winners_found(checkpoint, *gallery, k), TOUCHES)
 
 
 def test_judging_every_photo_finds_every_winner_and_searches_nothing(checkpoint, gallery, monkeypatch):
-    bench = Bench(checkpoint, *gallery)
+    bench = WinnerBench(checkpoint, *gallery)
     index = bench.built("flat")
     monkeypatch.setattr(index, "search", None)
     point = bench.point(index, PHOTOS)
@@ -90,7 +90,7 @@ def test_judging_every_photo_finds_every_winner_and_searches_nothing(checkpoint,
 
 
 def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall(checkpoint, gallery):
-    settled = settle(Bench(checkpoint, *gallery), Asked())
+    settled = settle(WinnerBench(checkpoint, *gallery), Asked())
     enough = [k for k in (4, 8, 16, 32, 64) if winners_found(checkpoint, *gallery, k) >= 0.99 * TOUCHES]
     assert settled.kind == "flat"
     assert settled.candidates["k"] == min([*enough, PHOTOS])
@@ -99,23 +99,23 @@ def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall
 
 
 def test_a_lower_recall_takes_fewer_candidates(checkpoint, gallery):
-    bench = Bench(checkpoint, *gallery)
+    bench = WinnerBench(checkpoint, *gallery)
     low, high = (settle(bench, Asked("flat", min_recall=recall)).candidates["k"] for recall in (0.3, 1.0))
     assert low < high
 
 
 def test_fewer_touches_are_asked_of_more_photos_but_never_too_few(checkpoint, gallery, monkeypatch):
     one = 2.0 * PHOTOS * checkpoint.config.matcher.hidden**2
-    monkeypatch.setattr(operating, "LEAST_QUERIES", 5)
+    monkeypatch.setattr(measuring, "LEAST_QUERIES", 5)
     for flops, queries in ((1e12, TOUCHES), (20 * one, 20), (one, 5)):
-        monkeypatch.setattr(operating, "MEASURING", flops)
-        assert Bench(checkpoint, *gallery).queries == queries
+        monkeypatch.setattr(measuring, "MEASURING", flops)
+        assert WinnerBench(checkpoint, *gallery).queries == queries
 
 
 def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_place(checkpoint, gallery, monkeypatch):
     """By a clock that the search and the judging put forward: 9, 1, 2 ms and 4, 6, 100 ms."""
     now = [0.0]
-    bench = Bench(checkpoint, *gallery, clock=lambda: now[0])
+    bench = WinnerBench(checkpoint, *gallery, clock=lambda: now[0])
     index, judged = bench.built("flat"), []
     search, searching, judging = index.search, iter((9, 1, 2)), iter((4, 6, 100))
 
@@ -127,41 +127,47 @@ def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_plac
         now[0] += next(judging) / 1e3
         judged.append(rows.tolist())
 
-    monkeypatch.setattr(operating, "TIMED", 3)
+    monkeypatch.setattr(measuring, "TIMED", 3)
     monkeypatch.setattr(index, "search", slow_search)
-    monkeypatch.setattr(operating, "score_halves", slow_judge)
+    monkeypatch.setattr(measuring, "score_halves", slow_judge)
     assert bench.times(index, 8) == pytest.approx((2.0, 6.0))
     for rows in judged:  # eight different photos, in the order in which they lie on the disk
         assert rows == sorted(set(rows))
         assert len(rows) == 8
 
 
+@dataclasses.dataclass
+class Built:
+    """A structure without settings to try."""
+
+    kind: str
+
+    def along_ladder(self):
+        yield self
+
+
 class Scripted:
     """A bench whose points are written down: {(kind, k): (found of 100, search ms, judging ms)}; k = 1000 is all."""
 
-    count, exhaustive_ms = 1000, 50.0
+    count, exhaustive_ms, steps = 1000, 50.0, (250, 500, 1000)
 
     def __init__(self, points):
         self.points, self.built_kinds = points, []
 
     def built(self, kind):
         self.built_kinds.append(kind)
-        return dataclasses.make_dataclass("Built", ["kind"])(kind)
+        return Built(kind)
+
+    def tried(self):
+        return ["ivf_sq8", "hnsw"]
 
     def point(self, index, k):
         found, search, judge = (100, 0.0, 50.0) if k >= self.count else self.points.get((index.kind, k), (0, 1.0, 1.0))
-        return Point(index.kind, operating.load_kind("flat").parameters_type(), k, found, 100, search, judge)
+        return Point(index.kind, load_kind("flat").parameters_type(), k, found, 100, search, judge)
 
     def times(self, index, k):
         point = self.point(index, k)
         return point.search_ms, point.judge_ms
-
-
-@pytest.fixture
-def flat_ladders(monkeypatch):
-    """Kinds without settings to try."""
-    monkeypatch.setattr(operating, "FIRST", 250)
-    monkeypatch.setattr(operating, "ladder", lambda built: iter([built]))
 
 
 EXACT = {("flat", 250): (97, 2.0, 1.0), ("flat", 500): (99, 2.0, 2.5), ("flat", 100): (90, 2.0, 0.5)}
@@ -177,7 +183,7 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
         (Asked(max_ms=5), QUICK, "flat", 500, ""),
         (Asked(max_ms=4), QUICK, "ivf_sq8", 500, ""),
         (Asked(max_ms=2.8), QUICK, "hnsw", 500, ""),
-        (Asked(max_ms=2.6), QUICK, "flat", 100, "reaches a winner recall of 0.99; this is the nearest"),
+        (Asked(max_ms=2.6), QUICK, "flat", 100, "reaches a recall of 0.99; this is the nearest"),
         (Asked(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the nearest"),
         (Asked(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the nearest"),
         (Asked("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
@@ -185,14 +191,14 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
         (Asked("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
     ],
 )
-def test_what_was_asked_for_decides(asked, points, kind, k, said, flat_ladders):
+def test_what_was_asked_for_decides(asked, points, kind, k, said):
     settled = settle(Scripted(points), asked)
     assert (settled.kind, settled.candidates["k"]) == (kind, k)
     assert said in settled.reason
     assert bool(said) == ("nearest" in settled.reason)
 
 
-def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do(flat_ladders):
+def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do():
     for asked, built in ((Asked(), {"flat"}), (Asked(max_ms=5), {"flat"}), (Asked(max_ms=4), {"flat", "ivf_sq8"})):
         bench = Scripted(QUICK)
         settle(bench, asked)
@@ -208,7 +214,7 @@ def test_few_photos_are_all_judged_unless_that_may_be_too_slow():
 
 
 def test_a_measurement_stands_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
-    made = settle(Bench(checkpoint, *gallery), Asked()).candidates
+    made = settle(WinnerBench(checkpoint, *gallery), Asked()).candidates
     assert kept(made, Asked(), PHOTOS, 0) == made
     after = kept(made, Asked(), PHOTOS + 4, 4)
     assert after == {**made, "changed": 4}
@@ -238,7 +244,7 @@ def test_measuring_needs_touches_and_embeddings_that_are_made_from_them():
     assert not can_measure(checkpoint_of(pruner_width=0))
     assert not can_measure(checkpoint_of(queries=0))
     with pytest.raises(BadInput, match="must keep touches to measure with"):
-        operating.query_codes(checkpoint_of(pruner_width=0))
+        query_codes(checkpoint_of(pruner_width=0))
 
 
 def test_what_cannot_be_asked_for_is_refused():
@@ -250,3 +256,64 @@ def test_what_cannot_be_asked_for_is_refused():
     for ms in (0, -1, float("nan")):
         with pytest.raises(BadInput, match="must be above 0 ms"):
             Asked(max_ms=ms)
+
+
+# By neighbours ------------------------------------------------------------------------------------------------------
+
+
+def unit(count, dim=16):
+    vectors = np.random.default_rng(0).normal(size=(count, dim))
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_without_a_bound_on_the_time_exact_search_is_taken_and_no_vector_is_read():
+    for asked in (Asked(), Asked(min_recall=0.9)):
+        settled = settle_by_neighbours(None, None, asked)
+        assert (settled.kind, settled.candidates) == ("flat", None)
+        assert "no time budget was asked for" in settled.reason
+    assert settle_by_neighbours(None, None, Asked("hnsw", max_ms=1.0)).kind == "hnsw"
+
+
+@pytest.fixture
+def timed(monkeypatch):
+    """Give every kind the milliseconds of a search that a test writes down; those built are listed."""
+    ms, built = {}, []
+    monkeypatch.setattr(measuring, "query_ms", lambda index, queries, k, clock: ms[index.kind])
+    real = NeighbourBench.built
+    monkeypatch.setattr(NeighbourBench, "built", lambda bench, kind: built.append(kind) or real(bench, kind))
+    return ms, built
+
+
+@pytest.mark.parametrize(
+    ("ms", "kind", "said"),
+    [
+        ({"flat": 3.0}, "flat", ""),
+        ({"flat": 30.0, "ivf_sq8": 0.5}, "ivf_sq8", ""),
+        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 2.0}, "hnsw", ""),
+        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 9.0}, "ivf_sq8", "reaches 5 ms; this is the nearest"),
+        ({"flat": 30.0, "ivf_sq8": 40.0, "hnsw": 50.0}, "flat", "reaches 5 ms; this is the nearest"),
+    ],
+)
+def test_the_first_kind_within_the_time_that_finds_the_neighbours_is_taken(ms, kind, said, timed):
+    timed[0].update(ms)
+    vectors = np.repeat(unit(900), 2, axis=0)  # copies are left out of the measurement
+    settled = settle_by_neighbours(vectors, np.repeat(np.arange(900), 2) * 2, Asked(max_ms=5))
+    assert settled.kind == kind
+    assert set(timed[1]) == set(ms)
+    assert said in settled.reason
+    assert bool(said) == ("nearest;" in settled.reason or "is the nearest" in settled.reason)
+    found, of = map(int, settled.reason.split(" finds ")[1].split(" neighbours")[0].split(" of "))
+    assert of == 640
+    assert found >= 0.99 * of
+
+
+def test_a_kind_that_needs_more_vectors_is_not_tried():
+    assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw"]
+    assert NeighbourBench(unit(600)).tried() == ["hnsw"]
+
+
+def test_the_time_of_a_search_among_neighbours_is_measured_on_this_machine():
+    bench = NeighbourBench(unit(100))
+    point = bench.point(bench.built("flat"), 10)
+    assert (point.recall, point.judge_ms) == (1.0, 0.0)
+    assert point.search_ms > 0

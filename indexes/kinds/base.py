@@ -2,17 +2,19 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
 from indexes.errors import ParameterError, VectorError
 from indexes.kinds.checks import check_k, check_unit
 from indexes.kinds.scores import Floats, Mask, Slots
-from indexes.kinds.stack import Stack, Vectors, parts_of
+
+Ladder: TypeAlias = tuple[str, tuple[int, ...]]
+"""The name of a parameter, and values of it to try."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +56,24 @@ class VectorIndex(ABC):
     kind: ClassVar[str]
     exact: ClassVar[bool] = False
     """Whether a search always finds the true best k."""
+    tried: ClassVar[bool] = False
+    """Whether `retrieve build-index` tries this kind, unasked, where exact search takes too long."""
     retrain_growth: ClassVar[float | None] = None
-    """Growth by `add`, as a multiple of the trained size, beyond which to build anew; None: any."""
+    """Growth, as a multiple of the trained size, beyond which to build anew; None: any."""
     structure_file: ClassVar[bool] = True
     """Whether `save` writes a file; without one the vectors alone are the index."""
     search_settings: ClassVar[frozenset[str]] = frozenset()
     """Parameters that a search reads and the structure does not depend on."""
+    search_ladder: ClassVar[Ladder | None] = None
+    """The one of them that trades time for recall, and values from the fastest on."""
+    build_ladder: ClassVar[Ladder | None] = None
+    """A parameter of the structure that trades memory for recall; `retrieve frontier` compares its values."""
     parameters_type: ClassVar[type[Parameters]] = Parameters
     fewest: ClassVar[int] = 1
     """Vectors that a build needs."""
     parameters: Parameters
 
-    def __init__(self, vectors: Vectors, parameters: Any, seed: int, threads: int | None) -> None:
+    def __init__(self, vectors: Floats, parameters: Any, seed: int, threads: int | None) -> None:
         """Used by `build` and `load`, which check what comes here."""
         self._vectors = vectors
         self.parameters = parameters
@@ -101,9 +109,9 @@ class VectorIndex(ABC):
         return asked
 
     @classmethod
-    def over(cls, vectors: Vectors, parameters: Parameters, *, seed: int = 0, threads: int | None = None) -> Self:
-        """`build` over vectors (M, d), M >= 1, that were checked before, in one array or in several."""
-        index = cls(vectors, cls._resolve(parameters, *vectors.shape), seed, check_threads(threads))
+    def over(cls, vectors: Floats, parameters: Parameters, *, seed: int = 0, threads: int | None = None) -> Self:
+        """`build` over vectors (M, d), M >= 1, that were checked before."""
+        index = cls(vectors, cls.resolved(parameters, *vectors.shape), seed, check_threads(threads))
         index._build()
         return index
 
@@ -111,7 +119,7 @@ class VectorIndex(ABC):
     def load(
         cls,
         path: str | Path | None,
-        vectors: Vectors,
+        vectors: Floats,
         parameters: Parameters,
         *,
         covered: int | None = None,
@@ -154,7 +162,7 @@ class VectorIndex(ABC):
         return int(self._vectors.shape[1])
 
     @property
-    def vectors(self) -> Vectors:
+    def vectors(self) -> Floats:
         """The vectors (M, d); not to be written to."""
         return self._vectors
 
@@ -162,10 +170,6 @@ class VectorIndex(ABC):
     def covered(self) -> int:
         """How many leading vectors the structure holds; those after them are scanned."""
         return 0
-
-    def shares_structure(self, other: "VectorIndex") -> bool:
-        """Whether both search one structure; False for a kind that has none."""
-        return False
 
     def settings(self) -> dict[str, Any]:
         """The parameters as a JSON object."""
@@ -190,9 +194,9 @@ class VectorIndex(ABC):
         """Append `vectors` (F, d) as slots M..M+F-1; F = 0 changes nothing."""
         fresh = check_unit(vectors, dim=self.dim, names=names)
         if len(fresh):
-            self.grow(Stack([*parts_of(self._vectors), fresh]))
+            self.grow(np.concatenate([self._vectors, fresh]))
 
-    def grow(self, vectors: Vectors) -> None:
+    def grow(self, vectors: Floats) -> None:
         """Search `vectors` (M', d), M' >= M, of which the first M are those of this index and all were checked."""
         self._vectors = vectors
         self._grown()
@@ -204,7 +208,7 @@ class VectorIndex(ABC):
         return self.structure_file
 
     def copy(self) -> Self:
-        """An index whose `add` leaves this one as it is. The vectors are shared."""
+        """An index whose `add` and `grow` leave this one as it is. The vectors are shared."""
         return copy.copy(self)
 
     def tuned(self, **settings: Any) -> Self:
@@ -217,9 +221,19 @@ class VectorIndex(ABC):
         other.parameters = replace(self.parameters, **settings)
         return other
 
+    def along_ladder(self) -> Iterator[Self]:
+        """The same structure with each value of its `search_ladder`; one without a ladder as it is."""
+        if self.search_ladder is None:
+            yield self
+            return
+        setting, values = self.search_ladder
+        for value in values:
+            yield self.tuned(**{setting: value})
+
     @classmethod
-    def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
-        """The parameters with every None filled in for `count` vectors of `dim` components; refuses too few."""
+    def resolved(cls, asked: Any, count: int, dim: int) -> Any:
+        """The parameters with every None filled in for `count` vectors of `dim` components, or `ParameterError` where
+        this kind cannot be built over so many."""
         if count < cls.fewest:
             raise ParameterError(f"{cls.kind} needs {cls.fewest} or more vectors to train its codes; got {count}")
         return asked

@@ -12,16 +12,12 @@ import numpy as np
 from indexes.errors import CorruptIndex, EngineError
 from indexes.kinds.base import VectorIndex
 from indexes.kinds.scores import Doubles, Floats, Mask, Slots, best, grid_scores, on_grid, scan, slack
-from indexes.kinds.stack import blocks_of, parts_of
 
 faiss: Any = _faiss
 """The library, untyped: its stubs leave out half of it."""
 
 GROWTH = 4
 """How much further each round looks than the one before."""
-
-MOST_SCANNED = 0.10
-"""Share of the vectors that may stand outside the structure, to be scanned by every search, before it takes them in."""
 
 ADDED_ROWS = 1 << 16
 """Vectors given to FAISS at once."""
@@ -42,14 +38,14 @@ def guarded(doing: str, threads: int | None) -> Iterator[None]:
 
 
 class FaissIndex(VectorIndex):
-    """A kind whose candidates come from a FAISS structure over the first slots and a scan of the others.
+    """A kind whose candidates come from a FAISS structure, and from a scan of the vectors that it does not hold.
 
     Rounds: structure and scan name some candidates; they are scored and ordered exactly; a query is settled when
     k live ones are there and, for an exact kind, no slot outside can reach the last of them. The unsettled
     look `GROWTH` times further, and once everything would be asked for the vectors are scanned instead.
 
-    Vectors that are added stand outside the structure until they are `MOST_SCANNED` of all; then a copy of it takes
-    them in. So an index may share its structure with the one that it was copied from.
+    A structure that was built or grown here holds all vectors; `flat` has none, and format 2 of the store let a tenth
+    of the vectors stand outside.
     """
 
     structure_type: ClassVar[str]
@@ -58,17 +54,11 @@ class FaissIndex(VectorIndex):
     """Threads of a build unless the caller names a number."""
 
     _structure: Any = None
-    _scanned: list[Floats]
-    """The vectors outside the structure, in arrays that follow one another."""
 
     @property
     def covered(self) -> int:
         """How many leading vectors the structure holds; those after them are scanned."""
         return 0 if self._structure is None else int(self._structure.ntotal)
-
-    def shares_structure(self, other: VectorIndex) -> bool:
-        """Whether both search one structure; False for a kind that has none."""
-        return isinstance(other, FaissIndex) and self._structure is not None and self._structure is other._structure
 
     def _make(self) -> Any:
         """An empty, untrained structure for the resolved parameters."""
@@ -83,7 +73,7 @@ class FaissIndex(VectorIndex):
 
     def _training(self) -> Floats:
         """The vectors to train the structure on."""
-        return np.ascontiguousarray(self._vectors[:])
+        return np.ascontiguousarray(self._vectors)
 
     def _first_fetch(self, k: int) -> int:
         """How many candidates the first round asks for when every slot is live."""
@@ -116,10 +106,10 @@ class FaissIndex(VectorIndex):
         parts, first = [], self.covered
         if first:
             parts.append(self._candidates(queries, min(fetch, first), effort))
-        for vectors in self._scanned:
-            rough, found = faiss.knn(queries, vectors, min(fetch, len(vectors)), faiss.METRIC_INNER_PRODUCT)
+        if first < self.count:
+            rest = self._vectors[first:]
+            rough, found = faiss.knn(queries, rest, min(fetch, len(rest)), faiss.METRIC_INNER_PRODUCT)
             parts.append((rough, found + first))
-            first += len(vectors)
         if len(parts) == 1:
             return parts[0]
         rough, found = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
@@ -145,29 +135,19 @@ class FaissIndex(VectorIndex):
             self._structure = self._make()
             if not self._structure.is_trained:
                 self._structure.train(self._training())
-        self._take_in()
+        self._add_missing()
 
     def _grown(self) -> None:
-        if self.count - self.covered > MOST_SCANNED * self.count:
+        if self.covered < self.count:
             with guarded(f"copying {self.kind}", None):
-                self._structure = faiss.clone_index(self._structure)
-            self._take_in()
-        self._set_scanned()
+                self._structure = faiss.clone_index(self._structure)  # this one may be another index's too
+            self._add_missing()
 
-    def _take_in(self) -> None:
-        """Give the structure the vectors that it does not have."""
+    def _add_missing(self) -> None:
+        """Give the structure the vectors that it does not hold."""
         with guarded(f"adding to {self.kind}", self._building_threads()):
-            for block in blocks_of(self._vectors[self.covered :], ADDED_ROWS):
-                self._structure.add(np.ascontiguousarray(block))
-        self._set_scanned()
-
-    def _set_scanned(self) -> None:
-        rest = self.covered
-        self._scanned = []
-        for part in parts_of(self._vectors):
-            if len(part) > rest:
-                self._scanned.append(part[rest:])
-            rest = max(0, rest - len(part))
+            for start in range(self.covered, self.count, ADDED_ROWS):
+                self._structure.add(np.ascontiguousarray(self._vectors[start : start + ADDED_ROWS]))
 
     def _write(self, path: Path) -> None:
         with guarded(f"writing {path}", None):
@@ -185,4 +165,3 @@ class FaissIndex(VectorIndex):
                 f"{path}: must hold (type, count, size, metric) {must}, holds {got}; build the index again"
             )
         self._structure = structure
-        self._set_scanned()

@@ -19,10 +19,10 @@ class FlatIndex(FaissIndex):
     structure_file: ClassVar[bool] = False
 
     def _build(self) -> None:
-        self._set_scanned()
+        """Nothing: no vector is in a structure, and so all are scanned."""
 
     def _grown(self) -> None:
-        self._set_scanned()
+        """Nothing, as for `_build`."""
 
     def _first_fetch(self, k: int) -> int:
         return k + SPARE

@@ -29,7 +29,9 @@ class HNSWIndex(FaissIndex):
     kind: ClassVar[str] = "hnsw"
     structure_type: ClassVar[str] = "IndexHNSWFlat"
     build_threads: ClassVar[int | None] = 1
+    tried: ClassVar[bool] = True
     search_settings: ClassVar[frozenset[str]] = frozenset({"ef_search"})
+    search_ladder: ClassVar[base.Ladder | None] = ("ef_search", (16, 32, 64, 128, 256, 512, 1000, 2000))
     parameters_type: ClassVar[type[base.Parameters]] = HNSWParameters
     parameters: HNSWParameters
 
@@ -38,10 +40,10 @@ class HNSWIndex(FaissIndex):
         structure.hnsw.efConstruction = self.parameters.ef_construction
         return structure
 
-    def _take_in(self) -> None:
+    def _add_missing(self) -> None:
         # A graph read from disk has lost its generator: seed it by what is there, read or not.
         self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self.covered)
-        super()._take_in()
+        super()._add_missing()
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         breadth = max(fetch, self.parameters.ef_search * effort)

@@ -63,12 +63,13 @@ class IVFFlatIndex(FaissIndex):
     structure_type: ClassVar[str] = "IndexIVFFlat"
     retrain_growth: ClassVar[float | None] = 2.0
     search_settings: ClassVar[frozenset[str]] = frozenset({"probes"})
+    search_ladder: ClassVar[base.Ladder | None] = ("probes", (1, 2, 4, 8, 16, 32, 64, 128, 256))
     parameters_type: ClassVar[type[base.Parameters]] = IVFParameters
     parameters: IVFParameters
 
     @classmethod
-    def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
-        asked = super()._resolve(asked, count, dim)
+    def resolved(cls, asked: Any, count: int, dim: int) -> Any:
+        asked = super().resolved(asked, count, dim)
         most = max(1, count // POINTS_PER_CENTRE)
         lists = min(most, asked.lists or round(4 * math.sqrt(count)))
         probes = min(lists, asked.probes or max(8, math.ceil(lists / 16)))
@@ -109,6 +110,7 @@ class IVFSQ8Index(IVFFlatIndex):
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"
+    tried: ClassVar[bool] = True
     fewest: ClassVar[int] = FEWEST_CODED
 
     def _make(self) -> Any:
@@ -130,14 +132,15 @@ class IVFPQIndex(IVFFlatIndex):
     structure_type: ClassVar[str] = "IndexIVFPQ"
     fewest: ClassVar[int] = FEWEST_CODED
     search_settings: ClassVar[frozenset[str]] = frozenset({"probes", "refine"})
+    build_ladder: ClassVar[base.Ladder | None] = ("code_bytes", (8, 16, 32))
     parameters_type: ClassVar[type[base.Parameters]] = IVFPQParameters
     parameters: IVFPQParameters
 
     @classmethod
-    def _resolve(cls, asked: Any, count: int, dim: int) -> Any:
+    def resolved(cls, asked: Any, count: int, dim: int) -> Any:
         if asked.code_bytes is not None and dim % asked.code_bytes:
             raise ParameterError(f"code_bytes must divide the vector size {dim}; got {asked.code_bytes}")
-        return replace(super()._resolve(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim))
+        return replace(super().resolved(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim))
 
     def _make(self) -> Any:
         bits = min(8, int(math.log2(self.count / POINTS_PER_CENTRE)))

@@ -10,13 +10,12 @@ from indexes.errors import ParameterError
 from indexes.kinds.base import VectorIndex
 from indexes.kinds.checks import check_k, check_unit
 from indexes.kinds.scores import Floats, Slots, scan, score_table
-from indexes.kinds.stack import Vectors
 
 Clock = Callable[[], float]
 """Seconds from some start."""
 
 
-def sample_queries(vectors: Vectors, count: int, *, seed: int = 0, noise: float = 0.5) -> Floats:
+def sample_queries(vectors: Floats, count: int, *, seed: int = 0, noise: float = 0.5) -> Floats:
     """`count` unit queries (count, d): vectors drawn at random, each moved by `noise` in a random direction.
 
     A noise of 0.5 leaves a cosine near 0.9 with the vector. Queries of another modality lie further away, so

@@ -12,7 +12,7 @@ The price is the rounding of the components, at most 2^-27 each: the score moves
 """
 
 import math
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,11 +57,11 @@ def best(scores: Floats, slots: Slots, k: int) -> tuple[Floats, Slots]:
     return scores[order], slots[order]
 
 
-def scan(vectors: Any, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
+def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
     """Score every slot: (Q, k) scores and slots ordered by (-score, slot), where `live` (M,) is true.
 
-    vectors (M, d) are an array or an `indexes.kinds.stack.Stack`, read block by block. k must not exceed the number of
-    live slots. This is the reference that every kind is measured against.
+    The vectors (M, d) are read block by block. k must not exceed the number of live slots. This is the reference that
+    every kind is measured against.
     """
     gridded = on_grid(queries)
     found = [(np.empty(0, np.float32), np.empty(0, np.int64))] * len(queries)
@@ -77,7 +77,7 @@ def scan(vectors: Any, queries: Floats, k: int, live: Mask | None = None) -> tup
     return np.stack([scores for scores, _ in found]), np.stack([slots for _, slots in found])
 
 
-def score_table(queries: Floats, vectors: Any) -> Floats:
+def score_table(queries: Floats, vectors: Floats) -> Floats:
     """Every inner product (Q, M) of queries (Q, d) and vectors (M, d), the vectors read block by block."""
     gridded = on_grid(queries)
     step = max(1, BLOCK_NUMBERS // max(1, vectors.shape[1]))

@@ -1,19 +1,26 @@
-"""Files that survive a crash: written whole, flushed to the disk, and named only then."""
+"""Files that survive a crash: written whole, flushed to the disk, and named only then.
 
+A file that replaces another is written beside its place under a hidden name and renamed. While it is written its writer
+holds a lock on it, which the system drops when the writer dies: what a killed one left is swept by the next write to
+the same name, on whichever host that runs and whatever process numbers have been given out since.
+"""
+
+import errno
+import fcntl
 import hashlib
 import json
 import os
+import secrets
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-from numpy.typing import NDArray
-
 from indexes.errors import RowError
 from indexes.store.regular import DEEPEST, is_deep, open_regular
+
+_ENDING = ".tmp"
 
 
 @contextmanager
@@ -40,13 +47,68 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Give `path` the content `text`: readers see the old or the new, whole, whenever the power fails."""
-    beside = path.with_name(f"{path.name}.tmp-{os.getpid()}")
-    with durable(beside) as handle:
-        handle.write(text.encode())
-    beside.replace(path)
-    sync(path.parent)
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before, whenever the power
+    fails. Where it is a link, the file that it leads to is written. Raises OSError that names `path`."""
+    with naming(path):
+        place = path.resolve() if path.is_symlink() else path
+        _sweep(place)
+        with _beside(place) as (temporary, descriptor):
+            with open(descriptor, "wb", closefd=False) as file:
+                file.write(data)
+            os.fsync(descriptor)
+            temporary.replace(place)
+        with suppress(PermissionError):  # a folder that may be written to, but not read
+            sync(place.parent)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """What the disk refuses, with the name of the file that was to be written: a write alone does not tell it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be written: {error.strerror or error}", str(path)) from error
+    except RuntimeError as error:  # of a link that leads to itself
+        raise OSError(errno.ELOOP, "cannot be written: its links go round in a circle", str(path)) from error
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[tuple[Path, int]]:
+    """A new file beside `path`, locked as long as it is written; gone afterwards unless it was renamed."""
+    while True:
+        name = path.with_name(f"{_beginning(path)}{secrets.token_hex(8)}{_ENDING}")
+        descriptor = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            with suppress(OSError):  # on a disk without locks nobody sweeps either
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            if not os.fstat(descriptor).st_nlink:  # swept before it was locked
+                continue
+            yield name, descriptor
+            return
+        finally:
+            name.unlink(missing_ok=True)
+            os.close(descriptor)
+
+
+def _sweep(path: Path) -> None:
+    """Delete what killed writers of `path` left beside it."""
+    with suppress(OSError), os.scandir(path.parent) as entries:
+        left = [one.path for one in entries if one.name.startswith(_beginning(path)) and one.name.endswith(_ENDING)]
+        for name in left:
+            _delete_unless_locked(name)
+
+
+def _delete_unless_locked(name: str) -> None:
+    with suppress(OSError), open_regular(name) as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.samestat(os.fstat(file.fileno()), os.lstat(name)):
+            os.unlink(name)
+
+
+def _beginning(path: Path) -> str:
+    """Of the hidden names beside `path`, short enough for every disk."""
+    return f".{os.fsdecode(os.fsencode(path.name)[:200])}."
 
 
 def remove_folder(folder: Path) -> None:
@@ -64,47 +126,6 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-class ArrayFile:
-    """A `.npy` file that grows row by row; its header, written last, says how many rows there are."""
-
-    HEADER_BYTES = 256
-
-    def __init__(self, path: Path, dtype: Any, row_shape: tuple[int, ...]) -> None:
-        self.path, self.dtype, self.row_shape, self.rows = path, np.dtype(dtype), row_shape, 0
-        self._handle = path.open("wb")
-        self._handle.write(bytes(self.HEADER_BYTES))
-
-    def append(self, block: NDArray[Any]) -> None:
-        """Add rows (n, *row_shape)."""
-        self._handle.write(np.ascontiguousarray(block, dtype=self.dtype).data.cast("B") if len(block) else b"")
-        self.rows += len(block)
-
-    def close(self) -> None:
-        """Write the header and flush the file to the disk."""
-        descr = np.lib.format.dtype_to_descr(self.dtype)
-        header = {"descr": descr, "fortran_order": False, "shape": (self.rows, *self.row_shape)}
-        prefix, text = np.lib.format.magic(1, 0), repr(header).encode()
-        room = self.HEADER_BYTES - len(prefix) - 2
-        self._handle.seek(0)
-        self._handle.write(prefix + room.to_bytes(2, "little") + text.ljust(room - 1) + b"\n")
-        finish(self._handle)
-
-    def abandon(self) -> None:
-        """Close without finishing."""
-        self._handle.close()
-
-
-def write_array(path: Path, dtype: Any, row_shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]) -> None:
-    """A `.npy` file (n, *row_shape) from blocks of rows, without holding more than one of them."""
-    file = ArrayFile(path, dtype, row_shape)
-    try:
-        for block in blocks:
-            file.append(block)
-        file.close()
-    finally:
-        file.abandon()
-
-
 def encoded(document: Any, *, indent: int | None = None) -> bytes:
     """JSON in UTF-8. Text that UTF-8 cannot hold (file names of unknown coding) is escaped."""
     try:
@@ -113,13 +134,17 @@ def encoded(document: Any, *, indent: int | None = None) -> bytes:
         return json.dumps(document, allow_nan=False, indent=indent).encode()
 
 
-def check_json(document: Any, what: str, row: str | None = None) -> None:
-    """`document` can be stored as JSON and read back the same, or `RowError` naming `what`."""
-    if is_deep(document):
-        raise RowError(f"{what} must not be nested deeper than {DEEPEST} levels", row)
+def json_of(document: Any, what: str, row: str | None = None, checked: bytes = b"") -> bytes:
+    """`document` as JSON that reads back the same, or `RowError` naming `what`. `checked` is JSON that is known to."""
     try:
-        same = json.loads(encoded(document)) == document
+        text = encoded(document)
+        if text == checked:
+            return text
+        if is_deep(document):
+            raise RowError(f"{what} must not be nested deeper than {DEEPEST} levels", row)
+        same = json.loads(text) == document
     except (ValueError, TypeError, RecursionError) as error:
         raise RowError(f"{what} must be JSON of finite numbers; {error}", row) from error
     if not same:
         raise RowError(f"{what} must read back from JSON as it is: text keys, lists rather than tuples", row)
+    return text

@@ -21,12 +21,13 @@ from indexes.errors import (
 from indexes.kinds.base import VectorIndex
 from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, row_norms
 from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
-from indexes.kinds.stack import Vectors, blocks_of, parts_of, stacked
+from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
+from indexes.store.older import joined, table_files
 from indexes.store.regular import read_json
-from indexes.store.rows import RECORD, Records, Rows, Segment, keys_of
+from indexes.store.rows import RECORD, Rows, keys_of
 
-STRUCTURE, ORDER = "vectors.faiss", "order.npy"
+ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
 SHOWN_IDS = 5
 CHECKED = 1000
 
@@ -37,11 +38,10 @@ class Generation:
     rows        the N rows as they were written, in their order, each parsed when it is asked for
     slots       (N,) int64, the slot of each row; rows with equal vectors share one
     embeddings  (S, d) float32 unit vectors, one for each slot, memory-mapped
-    arrays      name -> (N, ...) per-row array, memory-mapped; an array, or a `Stack` of several
+    arrays      name -> (N, ...) per-row array, memory-mapped
     documents   name -> JSON document
     manifest    what `manifest.json` says
     index       the vector index over the slots
-    identities  file name -> the file that was opened, as `file_identity` says
 
     >>> import numpy as np
     >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
@@ -55,20 +55,16 @@ class Generation:
         self,
         folder: Path,
         manifest: Manifest,
-        records: Records,
-        order: Slots | None,
-        embeddings: Vectors,
+        rows: Rows,
+        arrays: Mapping[str, NDArray[Any]],
         documents: Mapping[str, Any],
         index: VectorIndex,
-        identities: Mapping[str, tuple[int, int]],
     ) -> None:
-        self.folder, self.manifest, self.records = folder, manifest, records
-        self.rows = Rows(records, np.arange(len(records)) if order is None else order)
-        self.embeddings, self.documents, self.index, self.identities = embeddings, documents, index, identities
-        self.arrays: dict[str, Any] = {name: records.array(name, order) for name in manifest.arrays}
-        self.slots: Slots = records.column("slot", order)
+        self.folder, self.manifest, self.rows, self.documents, self.index = folder, manifest, rows, documents, index
+        self.arrays, self.embeddings = dict(arrays), index.vectors
+        self.slots: Slots = np.ascontiguousarray(rows.table["slot"])
         self._by_slot = np.argsort(self.slots, kind="stable")
-        self._per_slot = np.bincount(self.slots, minlength=len(embeddings))
+        self._per_slot = np.bincount(self.slots, minlength=len(self.embeddings))
         self._starts = np.cumsum(self._per_slot) - self._per_slot
         self._live: Mask | None = None if self._per_slot.all() else self._per_slot > 0
 
@@ -168,20 +164,6 @@ class Generation:
         must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
         return numbers[top < must]
 
-    def file_bytes(self, name: str) -> memoryview:
-        """The bytes of a file of a segment, whether it is still on the disk or not."""
-        numbers = self.manifest.segments
-        held: dict[str, NDArray[Any]] = {}
-        for number, segment in zip(numbers["records"], self.records.segments, strict=True):
-            columns = {"rows": segment.text, "table": segment.table} | dict(segment.arrays)
-            held |= {segment_name(column, number): array for column, array in columns.items()}
-        for number, part in zip(numbers["vectors"], parts_of(self.embeddings), strict=True):
-            held[segment_name("embeddings", number)] = part
-        array = held[name]
-        while isinstance(array.base, np.ndarray):
-            array = array.base
-        return memoryview(array.base)  # type: ignore[arg-type]  # the mapping of the whole file
-
     @cached_property
     def _digests(self) -> NDArray[np.bytes_]:
         return self.rows.keys("digest")
@@ -215,40 +197,26 @@ class Generation:
         return rows, spread
 
 
-def segment_name(what: str, number: int) -> str:
-    """The file of a segment: of "rows", "table", "embeddings" or an array, written by generation `number`."""
-    return f"{what}-{number:06d}.{'jsonl' if what == 'rows' else 'npy'}"
-
-
-def file_identity(path: Path) -> tuple[int, int]:
-    """What tells one file from another under the same name."""
-    status = path.stat()
-    return status.st_dev, status.st_ino
-
-
-def mapped(path: Path) -> NDArray[Any]:
-    """The array in a file, memory-mapped."""
-    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    return array
-
-
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:
     """Open a generation's folder, checked as `IndexStore.open` says."""
     manifest = read_manifest(folder)
-    _require_listed(folder, manifest)
     check_files(folder, manifest, verify=verify)
     try:
-        identities = {name: file_identity(folder / name) for name in manifest.files}
-        records = Records([_segment(folder, manifest, number) for number in manifest.segments["records"]])
-        order = mapped(folder / ORDER) if ORDER in manifest.files else None
-        names = [segment_name("embeddings", number) for number in manifest.segments["vectors"]]
-        embeddings = stacked([mapped(folder / name) for name in names])
+        rows, arrays, embeddings = _tables(folder, manifest)
         documents = {name: read_json(folder / f"{name}.json") for name in manifest.documents}
-        _check_counts(manifest, records, order, embeddings)
+        _check_counts(manifest, rows.table, embeddings)
         if verify:
             _check_vectors(folder, embeddings)
-        index = _read_index(folder, manifest, embeddings, threads)
-        return Generation(folder, manifest, records, order, embeddings, documents, index, identities)
+        kind = load_kind(manifest.kind)
+        index = kind.load(
+            folder / STRUCTURE if kind.structure_file else None,
+            embeddings,
+            kind.parameters_from(manifest.parameters),
+            covered=manifest.counts.structure_slots,
+            seed=manifest.seed,
+            threads=threads,
+        )
+        return Generation(folder, manifest, rows, arrays, documents, index)
     except ParameterError as error:
         raise UnsupportedFormat(f"{folder}: {error}. Update the software, or {AGAIN}") from error
     except IndexesError:
@@ -257,65 +225,38 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
-def _require_listed(folder: Path, manifest: Manifest) -> None:
-    """Every file that is opened is among those that are checked."""
-    needed = {f"{name}.json" for name in manifest.documents}
-    needed |= {segment_name("embeddings", number) for number in manifest.segments["vectors"]}
-    for number in manifest.segments["records"]:
-        needed |= {segment_name(what, number) for what in ("rows", "table", *manifest.arrays)}
-    if lacking := sorted(needed - set(manifest.files)):
+def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:
+    """The rows, per-row arrays and embeddings; memory-mapped, but those of a grown generation of format 2."""
+    tables = {name: [folder / file for file in files] for name, files in table_files(manifest).items()}
+    if lacking := sorted({path.name for paths in tables.values() for path in paths} - set(manifest.files)):
         raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
-
-
-def _segment(folder: Path, manifest: Manifest, number: int) -> Segment:
     # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
-    text = np.asarray(np.memmap(folder / segment_name("rows", number), np.uint8, "r"))
-    table = np.asarray(mapped(folder / segment_name("table", number)))
-    arrays = {name: mapped(folder / segment_name(name, number)) for name in manifest.arrays}
-    must = {"fields": RECORD, "bytes of text": len(text)} | dict.fromkeys(arrays, len(table))
-    got = {"fields": table.dtype, "bytes of text": int(table["stop"][-1])}
-    got |= {name: len(array) for name, array in arrays.items()}
+    texts = [np.asarray(np.memmap(path, np.uint8, "r")) for path in tables.pop("rows")]
+    parts = {name: [mapped(path) for path in paths] for name, paths in tables.items()}
+    text, whole = joined(folder, manifest, texts, parts)
+    table, embeddings = np.asarray(whole.pop("table")), whole.pop("embeddings")
+    must = {"fields": RECORD} | dict.fromkeys(whole, len(table))
+    got = {"fields": table.dtype} | {name: len(array) for name, array in whole.items()}
     if got != must:
-        raise CorruptIndex(f"{folder}: segment {number} must hold {must}, holds {got}; {AGAIN}")
+        raise CorruptIndex(f"{folder}: the tables must hold {must}, hold {got}; {AGAIN}")
     starts, stops = table["start"], table["stop"]
     if starts.min() < 0 or stops.max() > len(text) or not (starts < stops).all():
-        raise CorruptIndex(f"{folder}: the lines of segment {number} must lie in its text, and do not; {AGAIN}")
-    return Segment(text, table, arrays)
+        raise CorruptIndex(f"{folder}: the lines of {ROWS} must lie in its text, and do not; {AGAIN}")
+    return Rows(text, table), whole, embeddings
 
 
-def _check_vectors(folder: Path, embeddings: Vectors) -> None:
-    for block in blocks_of(embeddings, BLOCK_ROWS):
-        if not (np.abs(row_norms(block) - 1.0) <= NORM_TOLERANCE).all():
+def _check_vectors(folder: Path, embeddings: Floats) -> None:
+    for start in range(0, len(embeddings), BLOCK_ROWS):
+        if not (np.abs(row_norms(embeddings[start : start + BLOCK_ROWS]) - 1.0) <= NORM_TOLERANCE).all():
             raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
 
 
-def _check_counts(manifest: Manifest, records: Records, order: Slots | None, embeddings: Vectors) -> None:
-    counts = manifest.counts
-    if order is not None and (order.dtype != np.int64 or order.min() < 0 or order.max() >= len(records)):
-        raise CorruptIndex(f"{manifest.generation}: the order must name records 0 to {len(records) - 1}; {AGAIN}")
-    slots = records.column("slot", order)
+def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:
+    counts, slots = manifest.counts, table["slot"]
     if slots.min() < 0 or slots.max() >= counts.slots:
         raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")
-    got = {
-        "rows": len(slots),
-        "records": len(records),
-        "slots": len(embeddings),
-        "tombstones": counts.slots - int(np.count_nonzero(np.bincount(slots))),
-        "components": embeddings.shape[1],
-    }
-    must = {
-        "rows": counts.rows,
-        "records": counts.records,
-        "slots": counts.slots,
-        "tombstones": counts.tombstones,
-        "components": manifest.dim,
-    }
+    rows, slot_count, tombstones = len(slots), len(embeddings), counts.slots - int(np.count_nonzero(np.bincount(slots)))
+    got = {"rows": rows, "slots": slot_count, "tombstones": tombstones, "components": embeddings.shape[1]}
+    must = {name: getattr(counts, name) for name in ("rows", "slots", "tombstones")} | {"components": manifest.dim}
     if got != must:
         raise CorruptIndex(f"{manifest.generation}: the manifest says {must}, the files hold {got}; {AGAIN}")
-
-
-def _read_index(folder: Path, manifest: Manifest, embeddings: Vectors, threads: int | None) -> VectorIndex:
-    kind = load_kind(manifest.kind)
-    parameters = kind.parameters_from(manifest.parameters)
-    path, covered = folder / STRUCTURE if kind.structure_file else None, manifest.counts.structure_slots
-    return kind.load(path, embeddings, parameters, covered=covered, seed=manifest.seed, threads=threads)

@@ -13,7 +13,8 @@ from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
 from indexes.store.files import digest, durable, encoded
 from indexes.store.regular import open_regular, read_json
 
-FORMAT = 2
+FORMAT, OLDER = 3, 2
+"""Of what is written; also read."""
 NAME = "manifest.json"
 _NUMBER = range(10**9)
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
@@ -21,13 +22,12 @@ _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
 @dataclass(frozen=True)
 class Counts:
-    """Rows; records (those that no row shows any more too); slots (distinct vectors); tombstones (slots without a row).
+    """Rows; slots (distinct vectors); tombstones (slots without a row).
 
     built_slots were there when the structure was trained, structure_slots are in it; those after them are scanned.
     """
 
     rows: int
-    records: int
     slots: int
     tombstones: int
     built_slots: int
@@ -38,7 +38,7 @@ class Counts:
 class Manifest:
     """The fields of the file, in its order. `asked` are the parameters before None was filled in.
 
-    segments: "records" and "vectors" -> the numbers of the generations that wrote their segments, in order.
+    segments: see `indexes.store.older`; None in today's format, where the file has no such field.
     """
 
     generation: str
@@ -55,20 +55,16 @@ class Manifest:
     seed: int
     recall: dict[str, Any]
     counts: Counts
-    segments: dict[str, list[int]]
     arrays: list[str]
     documents: list[str]
     files: dict[str, dict[str, Any]]
-    format: int = FORMAT
-
-    def as_dict(self) -> dict[str, Any]:
-        """The content as JSON types, the format first."""
-        return {"format": self.format} | asdict(self)
+    segments: dict[str, list[int]] | None = None
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the file, with a digest of its own content at the end."""
-    content = manifest.as_dict()
+    content = {"format": FORMAT} | asdict(manifest)
+    del content["segments"]
     content["sha256"] = _own_digest(content)
     with durable(folder / NAME) as handle:
         handle.write(encoded(content, indent=2) + b"\n")
@@ -91,12 +87,9 @@ def read_manifest(folder: Path) -> Manifest:
     return _parsed(path, content)
 
 
-def sealed(folder: Path, known: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Size and SHA-256 of every file in the folder; those of the names in `known` are taken from there."""
-    return {
-        path.name: known.get(path.name) or {"bytes": path.stat().st_size, "sha256": digest(path)}
-        for path in sorted(folder.iterdir())
-    }
+def sealed(folder: Path) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of every file in the folder."""
+    return {path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -118,13 +111,14 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
 def _check_format(path: Path, version: object) -> None:
     if not isinstance(version, int) or isinstance(version, bool):
         raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
-    if version == FORMAT:
-        return
     if version > FORMAT:
         raise UnsupportedFormat(
-            f"{path}: has format {version}, this software reads {FORMAT}; update the software, or {AGAIN}"
+            f"{path}: has format {version}, this software reads {OLDER} to {FORMAT}; update the software, or {AGAIN}"
         )
-    raise UnsupportedFormat(f"{path}: has the older format {version}, this software reads {FORMAT}; {AGAIN}")
+    if version < OLDER:
+        raise UnsupportedFormat(
+            f"{path}: has the older format {version}, this software reads {OLDER} to {FORMAT}; {AGAIN}"
+        )
 
 
 def _own_digest(content: Mapping[str, Any]) -> str:
@@ -132,11 +126,15 @@ def _own_digest(content: Mapping[str, Any]) -> str:
 
 
 def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
-    known = {field.name for field in fields(Manifest)}
-    if set(content) != known:
-        odd = ", ".join(sorted(set(content) ^ known))
-        raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; differs in {odd}; {AGAIN}")
-    wrong = [name for name, is_right in _RIGHT.items() if not is_right(content[name])]
+    version, right = content.pop("format"), dict(_RIGHT)
+    if version == OLDER:
+        right["segments"] = _is_segments
+        if isinstance(content.get("counts"), dict):
+            content["counts"].pop("records", None)  # those that no row showed any more too
+    if set(content) != set(right):
+        odd = ", ".join(sorted(set(content) ^ set(right)))
+        raise CorruptIndex(f"{path}: must have exactly the fields of format {version}; differs in {odd}; {AGAIN}")
+    wrong = [name for name, is_right in right.items() if not is_right(content[name])]
     if wrong:
         raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
     return Manifest(**content | {"counts": Counts(**content["counts"])})
@@ -162,7 +160,10 @@ def _is_counts(value: object) -> bool:
 def _is_segments(value: object) -> bool:
     if not isinstance(value, dict) or set(value) != {"records", "vectors"}:
         return False
-    return all(isinstance(part, list) and part and all(map(_is_count, part)) for part in value.values())
+    return all(
+        isinstance(part, list) and part and all(map(_is_count, part)) and len(set(part)) == len(part)
+        for part in value.values()
+    )
 
 
 def _is_files(value: object) -> bool:
@@ -199,9 +200,8 @@ _RIGHT: Mapping[str, Callable[[object], bool]] = {
     "seed": _is(int),
     "recall": _is(dict),
     "counts": _is_counts,
-    "segments": _is_segments,
     "arrays": _is_words,
     "documents": _is_words,
     "files": _is_files,
 }
-"""What each field must be: whoever alters a file can reckon its digest again."""
+"""What each field must be: whoever alters a file can write the digest that fits."""

@@ -1,11 +1,6 @@
-"""Rows on the disk: text that is parsed when somebody looks, and a table of what searching needs of each.
+"""Rows on the disk: text that is parsed when somebody looks, and a table of what searching needs of each."""
 
-A segment of records is three kinds of files: the rows as lines of JSON, the table (`RECORD`) and the per-row arrays.
-A record never changes; a generation is a list of segments and the order in which it shows their records.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from typing import Any, overload
@@ -15,14 +10,13 @@ from numpy.typing import NDArray
 
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.kinds.scores import Slots
-from indexes.kinds.stack import stacked
 from indexes.store.regular import parse_json
 
 KEYS = ("id", "digest", "object_id")
 """Fields of a row that are compared over all rows, and so stand in the table as keys (see `key_of`)."""
 
 RECORD = np.dtype([("slot", "<i8"), ("start", "<i8"), ("stop", "<i8"), *((name, "S16") for name in KEYS)])
-"""A record's slot, the bytes of its line in its segment's text, and its keys."""
+"""What the table holds of a row: its slot, the bytes of its line in the text, and its keys."""
 
 
 def key_of(value: object) -> bytes:
@@ -40,50 +34,17 @@ def keys_of(values: Iterable[object]) -> NDArray[np.bytes_]:
     return np.array([key_of(value) for value in values], "S16")
 
 
-@dataclass(frozen=True)
-class Segment:
-    """Records of one writing: the bytes of their lines, their table (n,), and name -> per-row array (n, ...)."""
-
-    text: NDArray[np.uint8]
-    table: NDArray[Any]
-    arrays: Mapping[str, NDArray[Any]]
-
-
-class Records:
-    """The records of several segments, one after another: places 0..R-1."""
-
-    def __init__(self, segments: Sequence[Segment]) -> None:
-        self.segments = list(segments)
-        self._starts = np.cumsum([0, *(len(segment.table) for segment in segments)])
-
-    def __len__(self) -> int:
-        return int(self._starts[-1])
-
-    def column(self, name: str, places: Slots | None = None) -> NDArray[Any]:
-        """A column (n,) of the table at the places (all where None), in memory."""
-        whole = np.concatenate([segment.table[name] for segment in self.segments])
-        return whole if places is None else whole[places]
-
-    def array(self, name: str, order: Slots | None = None) -> Any:
-        """The per-row array of that name in the order of the places given."""
-        return stacked([segment.arrays[name] for segment in self.segments], order)
-
-    def line(self, place: int) -> bytes:
-        """The JSON of the record at a place, as it was written, without the end of its line."""
-        number = int(np.searchsorted(self._starts, place, side="right")) - 1
-        segment = self.segments[number]
-        record = segment.table[place - self._starts[number]]
-        return segment.text[int(record["start"]) : int(record["stop"]) - 1].tobytes()
-
-
 class Rows(Sequence[dict[str, Any]]):
-    """The rows of a generation, each parsed when it is asked for."""
+    """The rows of a generation, each parsed when it is asked for.
 
-    def __init__(self, records: Records, places: Slots) -> None:
-        self.records, self.places = records, places
+    text: the bytes of all lines of JSON; table (N,) of `RECORD`, in the order of the rows.
+    """
+
+    def __init__(self, text: NDArray[np.uint8], table: NDArray[Any]) -> None:
+        self.text, self.table = text, table
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.table)
 
     @overload
     def __getitem__(self, index: int) -> dict[str, Any]: ...
@@ -93,8 +54,8 @@ class Rows(Sequence[dict[str, Any]]):
 
     def __getitem__(self, index: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
         if isinstance(index, slice):
-            return [self._parsed(int(place)) for place in self.places[index]]
-        return self._parsed(int(self.places[index]))
+            return [self._parsed(number) for number in range(*index.indices(len(self)))]
+        return self._parsed(range(len(self))[index])
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Sequence):
@@ -103,9 +64,14 @@ class Rows(Sequence[dict[str, Any]]):
 
     __hash__ = None  # type: ignore[assignment]
 
+    def line(self, number: int) -> bytes:
+        """The JSON of a row as it was written, without the end of its line."""
+        record = self.table[number]
+        return self.text[int(record["start"]) : int(record["stop"]) - 1].tobytes()
+
     def keys(self, name: str) -> NDArray[np.bytes_]:
         """`key_of` the field `name`, one of `KEYS`, of every row (N,); nothing is parsed."""
-        return self.records.column(name, self.places)
+        return np.ascontiguousarray(self.table[name])
 
     def ids(self, numbers: Slots) -> list[str]:
         """The ids of the rows with these numbers."""
@@ -113,35 +79,36 @@ class Rows(Sequence[dict[str, Any]]):
 
     def find(self, ids: Iterable[str]) -> Slots:
         """For each id its row's number (n,), -1 where there is none."""
-        return self._found(ids, self._by_id)
+        return _found(ids, self._by_id)
 
     def holding(self, digests: Iterable[str]) -> Slots:
         """For each digest the number of a row of that content (n,), -1 where there is none."""
-        return self._found(digests, self._by_digest)
-
-    def _found(self, values: Iterable[str], sorted_keys: tuple[Slots, NDArray[np.bytes_]]) -> Slots:
-        wanted, (by_key, ranked) = keys_of(values), sorted_keys
-        place = np.minimum(np.searchsorted(ranked, wanted), len(ranked) - 1)
-        return np.where(ranked[place] == wanted, by_key[place], -1)
+        return _found(digests, self._by_digest)
 
     @cached_property
     def _by_id(self) -> tuple[Slots, NDArray[np.bytes_]]:
-        return self._sorted("id")
+        return _sorted(self.keys("id"))
 
     @cached_property
     def _by_digest(self) -> tuple[Slots, NDArray[np.bytes_]]:
-        return self._sorted("digest")
+        return _sorted(self.keys("digest"))
 
-    def _sorted(self, name: str) -> tuple[Slots, NDArray[np.bytes_]]:
-        keys = self.keys(name)
-        order = np.argsort(keys, kind="stable")
-        return order, keys[order]
-
-    def _parsed(self, place: int) -> dict[str, Any]:
+    def _parsed(self, number: int) -> dict[str, Any]:
         try:
-            row = parse_json(self.records.line(place))
+            row = parse_json(self.line(number))
         except ValueError as error:
-            raise CorruptIndex(f"the row at place {place} of the index cannot be read ({error}); {AGAIN}") from error
+            raise CorruptIndex(f"row {number} of the index cannot be read ({error}); {AGAIN}") from error
         if not isinstance(row, dict) or not isinstance(row.get("id"), str):
-            raise CorruptIndex(f"the row at place {place} of the index must be a plain object with an id; {AGAIN}")
+            raise CorruptIndex(f"row {number} of the index must be a plain object with an id; {AGAIN}")
         return row
+
+
+def _sorted(keys: NDArray[np.bytes_]) -> tuple[Slots, NDArray[np.bytes_]]:
+    order = np.argsort(keys, kind="stable")
+    return order, keys[order]
+
+
+def _found(values: Iterable[str], sorted_keys: tuple[Slots, NDArray[np.bytes_]]) -> Slots:
+    wanted, (order, ranked) = keys_of(values), sorted_keys
+    place = np.minimum(np.searchsorted(ranked, wanted), len(ranked) - 1)
+    return np.where(ranked[place] == wanted, order[place], -1)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from indexes.errors import WriteFailed
 from indexes.store import files
 from indexes.store.rows import key_of, keys_of
-from indexes.store.spool import Layouts
+from indexes.store.tables import Layouts
 
 FOLDER = "unfinished"
 
@@ -31,7 +31,7 @@ FOLDER = "unfinished"
 class Unfinished:
     """Records by digest, in the folder `index`/unfinished; use it under the index's lock. Threads may share it.
 
-    layouts: name of an array -> dtype and shape of one record's, as in `indexes.store.spool`.
+    layouts: name of an array -> dtype and shape of one record's, as in `indexes.store.tables`.
     """
 
     def __init__(self, index: Path, fingerprint: Mapping[str, str], layouts: Layouts) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from retrieval.console.files import EXPORT, require_ours, write_atomically
+from indexes.store.files import write_atomically
+from retrieval.console.files import EXPORT, require_ours
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from retrieval.console.files import write_atomically
+from indexes.store.files import write_atomically
 from retrieval.errors import RetrievalError
 
 Figure = Any

@@ -8,18 +8,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch  # before faiss, which the index imports: both bring OpenMP
-
 from indexes import load_kind
 from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
-from indexes.kinds.choice import choose_kind, require_buildable
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
-from indexes.store.spool import Block
+from indexes.store.tables import Block, Tables
 from indexes.store.unfinished import Unfinished
-from indexes.store.writing import RECALL_QUERIES, Chosen, Laid
+from indexes.store.writing import RECALL_QUERIES, Chosen
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.naming import FOLDER, Naming, doubts, per_object
 from retrieval.errors import BadInput
@@ -27,17 +23,16 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.stored import fingerprint
 from retrieval.search.build_report import BuildReport
 from retrieval.search.embed import Embedder, Part, layouts
+from retrieval.search.measuring import WinnerBench, can_measure, query_codes
 from retrieval.search.operating import (
     Asked,
-    Bench,
     Settled,
     all_judged,
-    can_measure,
     kept,
     needs_measuring,
-    query_codes,
     sentence,
     settle,
+    settle_by_neighbours,
 )
 from retrieval.version import __version__
 
@@ -75,7 +70,8 @@ def build_index(
     naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
     catalogue = list_catalogue(folder, naming)
     if kind is not None:
-        require_buildable(kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
+        chosen = load_kind(kind)
+        chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock():
         parent, why = _parent(store, checkpoint)
         if named_before not in (None, naming.text):
@@ -184,9 +180,9 @@ class _Job:
             queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
         )
 
-    def _settle(self, laid: Laid) -> Chosen:
+    def _settle(self, tables: Tables) -> Chosen:
         start = time.perf_counter()
-        settled = _settled(self.made, laid, self.asked, self.quiet)
+        settled = _settled(self.made, tables, self.asked, self.quiet)
         self.settling_s = time.perf_counter() - start
         about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
         return Chosen(settled.kind, settled.parameters, about)
@@ -208,9 +204,9 @@ def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | Non
         return None, f"The index there was not usable, so every photo was embedded again ({error})."
 
 
-def _settled(made: Embedder, laid: Laid, asked: Asked, quiet: bool) -> Settled:
+def _settled(made: Embedder, tables: Tables, asked: Asked, quiet: bool) -> Settled:
     """The kind to build and the candidates to judge, measured where there is something to measure with."""
-    photos, checkpoint = len(laid.slots), made.checkpoint
+    photos, checkpoint = len(tables.slots), made.checkpoint
     previous = None if made.parent is None else made.parent.manifest
     before = None if previous is None else previous.about.get("candidates")
     again = kept(before, asked, photos, made.embedded + made.resumed + made.removed)
@@ -221,16 +217,6 @@ def _settled(made: Embedder, laid: Laid, asked: Asked, quiet: bool) -> Settled:
         chosen, judged = asked.kind or "flat", all_judged(photos, asked)
         return Settled(chosen, load_kind(chosen).parameters_type(), sentence(judged), judged)
     if not can_measure(checkpoint):
-        return _by_neighbours(laid, asked)
-    return settle(Bench(checkpoint, laid.vectors, laid.slots, laid.arrays["halves"], quiet=quiet), asked)
-
-
-def _by_neighbours(laid: Laid, asked: Asked) -> Settled:
-    """The kind by its recall of nearest neighbours, where the checkpoint keeps no touches to find winners of."""
-    why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
-    if asked.kind is not None:
-        return Settled(asked.kind, load_kind(asked.kind).parameters_type(), f"It was asked for. {why}", None)
-    # Without a budget nothing is measured, so no vector need be read.
-    vectors = laid.vectors[:0] if asked.max_ms is None else laid.vectors[np.unique(laid.slots)]
-    choice = choose_kind(vectors, asked.max_ms, min_recall=asked.target, threads=torch.get_num_threads())
-    return Settled(choice.kind, choice.parameters, f"{choice.reason} {why}", None)
+        return settle_by_neighbours(tables.vectors, tables.slots, asked)
+    bench = WinnerBench(checkpoint, tables.vectors, tables.slots, tables.arrays["halves"], quiet=quiet)
+    return settle(bench, asked)

@@ -12,8 +12,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from indexes.store.files import write_atomically
 from indexes.store.regular import read_json
-from retrieval.console.files import write_atomically
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:

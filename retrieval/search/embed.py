@@ -4,25 +4,28 @@ Every thread takes a whole batch from its files to its halves and computes alone
 the towers, as PyTorch's default is, waits for those of its members whose core is decoding a file.
 """
 
-from collections import Counter
-from collections.abc import Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
-from indexes.store.spool import Layouts
+from indexes.store.tables import Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
 from retrieval.errors import DatasetError, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, encode_photos, one_thread
-from retrieval.search.ahead import ahead
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 BATCH = 16
 READ = 32
@@ -202,6 +205,24 @@ class Embedder:
         self.half_error = max(self.half_error, part.half_error)
         if self.parent is not None:
             self.known += int((self.parent.rows.find([row["id"] for row in part.rows]) >= 0).sum())
+
+
+def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
+    """`map(function, items)` on threads, in order, never more than `window` items ahead of the reader.
+
+    What waits is given up when the reader stops or an item fails; what runs is waited for.
+    """
+    waiting: deque[Future[R]] = deque()
+    pool = ThreadPoolExecutor(threads)
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= window:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def layouts(checkpoint: Checkpoint) -> Layouts:

@@ -15,48 +15,24 @@ What must be judged to know the winners grows with the catalogue: fewer touches 
 stands until a tenth of the photos has changed.
 """
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import takewhile
-from statistics import median
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from indexes import load_kind
 from indexes.kinds.base import Parameters, VectorIndex
-from indexes.kinds.choice import ladder
-from indexes.kinds.measure import Clock
 from indexes.kinds.scores import Floats, Slots
-from indexes.kinds.stack import Vectors
-from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
 from retrieval.metrics.binomial import binomial_interval
-from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion import score_halves
+from retrieval.search.measuring import FEWER, Bench, NeighbourBench, Point, candidate_steps
 
 TARGET = 0.99
 """Winner recall where none is asked for."""
 
-FIRST = 500
-"""With no more photos than this all are judged, and nothing is measured."""
-
-FEWER = (250, 100, 50, 25, 10)
-"""Candidates to try below `FIRST` where time is short."""
-
 WIDER = 4
 """How many times more candidates an approximate kind may take than exact search needs."""
-
-EXACT, APPROXIMATE = ("flat", "exact"), ("ivf_sq8", "hnsw")
-"""Kinds that find the best embeddings always; kinds to try where these take too long, the quickest to build first."""
-
-TIMED = 15
-LEAST_QUERIES = 50
-MEASURING = 3e12
-"""Floating-point operations to spend on finding winners: 150 touches over 100,000 halves of 256 numbers."""
 
 STALE = 0.10
 """Share of a catalogue that may change before its operating point is measured again."""
@@ -93,32 +69,6 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Point:
-    """One way to search: what it found of the winners, and median milliseconds of search and of judging.
-
-    k: candidates for one touch. found: of `queries` winners.
-    """
-
-    kind: str
-    parameters: Parameters
-    k: int
-    found: int
-    queries: int
-    search_ms: float
-    judge_ms: float
-
-    @property
-    def recall(self) -> float:
-        """Winner recall."""
-        return self.found / self.queries
-
-    @property
-    def ms(self) -> float:
-        """Milliseconds for one touch."""
-        return self.search_ms + self.judge_ms
-
-
-@dataclass(frozen=True)
 class Settled:
     """What to build, why in a sentence, and what the manifest says of it under "candidates" (None: nothing)."""
 
@@ -128,153 +78,67 @@ class Settled:
     candidates: dict[str, Any] | None
 
 
-class Bench:
-    """A catalogue to measure searches on, and touches whose winners are known.
-
-    vectors (S, d) float32 of norm 1, slots (N,) that say which of them is each photo's, and halves (N, hidden), which
-    are read where they lie. Finding the winners judges every photo for every touch; `quiet` shows no progress.
-    """
-
-    def __init__(
-        self,
-        checkpoint: Checkpoint,
-        vectors: Vectors,
-        slots: Slots,
-        halves: NDArray[np.floating[Any]],
-        *,
-        quiet: bool = True,
-        clock: Clock = time.perf_counter,
-    ) -> None:
-        self.count, self._clock = len(halves), clock
-        self._head, self._halves = checkpoint.matcher.head, halves
-        self._touches, self._queries = _queries(checkpoint, self.count)
-        used, self._first, places = np.unique(slots, return_index=True, return_inverse=True)
-        self._vectors = np.ascontiguousarray(vectors[used])
-        self._built: dict[str, VectorIndex] = {}
-        self._winners, self.exhaustive_ms = self._find_winners(places, quiet)
-
-    @property
-    def queries(self) -> int:
-        """How many touches are measured with."""
-        return len(self._queries)
-
-    def built(self, kind: str) -> VectorIndex:
-        """An index of that kind over the catalogue's distinct embeddings; each is built once."""
-        if kind not in self._built:
-            self._built[kind] = load_kind(kind).build(self._vectors, threads=torch.get_num_threads())
-        return self._built[kind]
-
-    def point(self, index: VectorIndex, k: int) -> Point:
-        """Winner recall and time of `index` with `k` candidates. With no fewer than there are photos, all are judged
-        and nothing is searched."""
-        about = (index.kind, index.parameters, k)
-        if k >= self.count:
-            return Point(*about, self.queries, self.queries, 0.0, self.exhaustive_ms)
-        found = index.search(self._queries, k)[1]
-        hits = int((found == self._winners[:, None]).any(axis=1).sum())
-        return Point(*about, hits, self.queries, *self.times(index, k))
-
-    def times(self, index: VectorIndex, k: int) -> tuple[float, float]:
-        """Median milliseconds of search and of judging, one touch at a time."""
-        taken = []
-        for query in range(min(TIMED, self.queries)):
-            start = self._clock()
-            slots = index.search(self._queries[query : query + 1], k)[1][0]
-            between = self._clock()
-            score_halves(self._head, self._touches[query : query + 1], self._halves, np.sort(self._first[slots]))
-            taken.append((between - start, self._clock() - between))
-        search, judge = zip(*taken, strict=True)
-        return 1e3 * median(search), 1e3 * median(judge)
-
-    def _find_winners(self, slots: Slots, quiet: bool) -> tuple[Slots, float]:
-        winners, taken = [], []
-        with Bar("measure", self.queries, "touches", quiet=quiet) as bar:
-            for touch in self._touches:
-                start = self._clock()
-                winners.append(slots[int(score_halves(self._head, touch[None], self._halves).argmax())])
-                taken.append(self._clock() - start)
-                bar.advance()
-        return np.array(winners, dtype=np.int64), 1e3 * median(taken)
-
-
 def needs_measuring(photos: int, asked: Asked) -> bool:
     """Whether there is something to find out: of few photos all are judged, unless that may be too slow."""
-    return photos > FIRST or asked.max_ms is not None
-
-
-def can_measure(checkpoint: Checkpoint) -> bool:
-    """Whether the checkpoint keeps touches to measure with, and embeddings that are made from what it keeps."""
-    return bool(checkpoint.queries is not None and len(checkpoint.queries)) and checkpoint.matcher.pruner is not None
-
-
-@torch.inference_mode()
-def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch.Tensor, Floats]:
-    """Halves (Q, hidden) and unit embeddings (Q, d), float32, of the first `count` touches that the checkpoint keeps.
-    Raises BadInput where `can_measure` says that there are none."""
-    if checkpoint.queries is None or checkpoint.matcher.pruner is None:
-        raise BadInput(f"{checkpoint.path} must keep touches to measure with, and a pruner; train it again")
-    halves = torch.from_numpy(checkpoint.queries[:count].astype(np.float32))
-    return halves, checkpoint.matcher.pruner.touch(halves).numpy()
-
-
-def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
-    """As many touches as `MEASURING` lets judge every photo, but `LEAST_QUERIES`; a judgement is a product with a
-    square matrix."""
-    affordable = MEASURING / (2.0 * photos * checkpoint.config.matcher.hidden**2)
-    return query_codes(checkpoint, max(LEAST_QUERIES, int(affordable)))
+    return len(candidate_steps(photos)) > 1 or asked.max_ms is not None
 
 
 def settle(bench: Bench, asked: Asked) -> Settled:
-    """The operating point for what was asked, measured on the bench."""
-    tried: list[Point] = []
-    taken = next((point for point in _noted(_points(bench, asked), tried) if _ends(point, asked)), None)
-    if taken is None:
-        taken = _nearest([*tried, *_hurried(bench, asked, tried)], asked)
+    """The operating point for what was asked, measured on the bench by winners."""
+    taken = _taken(bench, asked)
     candidates = _record(taken, asked, bench)
     return Settled(taken.kind, taken.parameters, sentence(candidates), candidates)
 
 
-def _noted(points: Iterator[Point], tried: list[Point]) -> Iterator[Point]:
-    for point in points:
+def settle_by_neighbours(vectors: Floats, slots: Slots, asked: Asked) -> Settled:
+    """The kind alone, for vectors (S, d) and the slots (N,) of the photos, where the checkpoint keeps no touches to
+    find winners of. Without a bound on the time nothing is measured."""
+    why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
+    if asked.kind is not None or asked.max_ms is None:
+        kind = asked.kind or "flat"
+        said = "Exact search: no time budget was asked for." if asked.kind is None else "It was asked for."
+        return Settled(kind, load_kind(kind).parameters_type(), f"{said} {why}", None)
+    taken = _taken(NeighbourBench(vectors[np.unique(slots)]), asked)
+    found = f"A search takes {taken.ms:.3g} ms and finds {taken.found} of {taken.queries} neighbours."
+    missed = _missed(taken.recall, taken.ms, asdict(asked))
+    return Settled(taken.kind, taken.parameters, f"{found}{missed} {why}", None)
+
+
+def _taken(bench: Bench, asked: Asked) -> Point:
+    """The first point that is good enough; where none is, the nearest."""
+    tried: list[Point] = []
+    for point in _points(bench, asked):
+        if _ends(point, asked):
+            return point
         tried.append(point)
-        yield point
+    return _nearest([*tried, *_hurried(bench, asked, tried)], asked)
 
 
 def _points(bench: Bench, asked: Asked) -> Iterator[Point]:
     """Exact search with more and more candidates until the recall is there; then the approximate kinds, if any is to
     be tried, with as many candidates and more."""
-    exact_is_allowed = asked.kind in (None, *EXACT)
-    exact = bench.built(asked.kind if asked.kind in EXACT else "flat")
-    for point in (bench.point(exact, k) for k in _steps(bench.count)):
-        if exact_is_allowed:
+    approximate = None if asked.kind is None or load_kind(asked.kind).exact else asked.kind
+    exact = bench.built("flat" if asked.kind is None or approximate else asked.kind)
+    for point in (bench.point(exact, k) for k in bench.steps):
+        if not approximate:
             yield point
         if point.recall >= asked.target:
             break
-    for kind in _approximate_kinds(asked) if point.k < bench.count else ():
+    others = [approximate] if approximate else bench.tried() if asked.kind is None and asked.bounded else []
+    for kind in others if point.k < bench.count else ():
         yield from _kind_points(bench, bench.built(kind), asked, least=point.k)
-    if not exact_is_allowed:
-        yield bench.point(bench.built(str(asked.kind)), bench.count)
-
-
-def _approximate_kinds(asked: Asked) -> tuple[str, ...]:
-    if asked.kind is not None:
-        return () if asked.kind in EXACT else (asked.kind,)
-    return APPROXIMATE if asked.bounded else ()
+    if approximate:
+        yield bench.point(bench.built(approximate), bench.count)
 
 
 def _kind_points(bench: Bench, built: VectorIndex, asked: Asked, least: int) -> Iterator[Point]:
     """Settings are tried only where there is a bound to meet; else the kind's own are taken."""
-    steps = [k for k in _steps(bench.count) if k >= least]
+    steps = [k for k in bench.steps if k >= least]
     if not asked.bounded:
         yield from (bench.point(built, k) for k in steps)
         return
-    for index in ladder(built):
+    for index in built.along_ladder():
         yield from (bench.point(index, k) for k in steps if k <= WIDER * least)
-
-
-def _steps(photos: int) -> list[int]:
-    doubled = takewhile(lambda k: k < photos, (FIRST << power for power in range(40)))
-    return [*doubled, photos]
 
 
 def _ends(point: Point, asked: Asked) -> bool:
@@ -292,8 +156,9 @@ def _hurried(bench: Bench, asked: Asked, tried: Sequence[Point]) -> Iterator[Poi
     if asked.max_ms is None or asked.min_recall is not None:
         return
     for kind in dict.fromkeys(point.kind for point in tried):
-        for index in ladder(bench.built(kind)):
-            k = next((k for k in FEWER if sum(bench.times(index, k)) <= asked.max_ms), None)
+        for index in bench.built(kind).along_ladder():
+            fewer = (k for k in FEWER if k < bench.steps[0])
+            k = next((k for k in fewer if sum(bench.times(index, k)) <= asked.max_ms), None)
             if k is not None:
                 yield bench.point(index, k)
 
@@ -355,15 +220,14 @@ def sentence(candidates: Mapping[str, Any]) -> str:
         f"touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms against "
         f"{candidates['exhaustive_ms']:.3g} ms for all."
     )
-    return text + _missed(candidates)
+    return text + _missed(candidates["winner_recall"], candidates["ms"], candidates["asked"])
 
 
-def _missed(candidates: Mapping[str, Any]) -> str:
-    asked = candidates["asked"]
+def _missed(recall: float, ms: float, asked: Mapping[str, Any]) -> str:
     target = TARGET if asked["min_recall"] is None else asked["min_recall"]
     missed = []
-    if candidates["winner_recall"] < target:
-        missed.append(f"a winner recall of {target:g}")
-    if asked["max_ms"] is not None and candidates["ms"] > asked["max_ms"]:
+    if recall < target:
+        missed.append(f"a recall of {target:g}")
+    if asked["max_ms"] is not None and ms > asked["max_ms"]:
         missed.append(f"{asked['max_ms']:g} ms")
     return f" Nothing measured here reaches {' and '.join(missed)}; this is the nearest." if missed else ""

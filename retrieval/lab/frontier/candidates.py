@@ -13,10 +13,9 @@ from indexes.kinds.base import VectorIndex
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.points import Panel, Point, Row, missed
 from retrieval.lab.frontier.sample import Array, Sample
-from retrieval.search.operating import FIRST, TARGET
+from retrieval.search.measuring import FEWER, FIRST, candidate_steps
+from retrieval.search.operating import TARGET
 
-LADDER = (10, 20, 50, 100, 200)
-"""Below the steps that `build-index` takes."""
 TOLERANCE = 100 * (1 - TARGET)
 """Percent of winners that `build-index` lets candidates miss unless it is told otherwise."""
 
@@ -39,7 +38,7 @@ def _winners(sample: Sample) -> Panel:
     for name, embeddings in photos.embeddings.items():
         found = ranks(sample.queries[name], embeddings, sample.winners)
         index = load_kind("flat").build(embeddings, threads=1)
-        for k in (*LADDER, *steps(count)):
+        for k in (*FEWER[::-1], *candidate_steps(count)[:-1]):
             points.append(missed(name, f"k = {k:,}", found >= k, k == default and is_used(sample, name)))
             works.append(_asking(sample, index, sample.queries, name, photos.halves, k))
     points.append(missed("no candidates", "all", sample.winners < 0, default == count))
@@ -73,19 +72,13 @@ def _asking(
     return ask
 
 
-def steps(count: int) -> list[int]:
-    """Numbers of candidates that `build-index` tries for so many photos, but all of them."""
-    return [k for k in (FIRST << power for power in range(8)) if k < count]
-
-
 def default_k(sample: Sample) -> int:
     """What `build-index` would write into the index of the blended catalogue, these touches asked: the first of its
     steps whose candidates hold enough winners."""
     photos = sample.catalogue
     used = next(name for name in photos.embeddings if is_used(sample, name))
     found = ranks(sample.queries[used], photos.embeddings[used], sample.winners)
-    good = (k for k in steps(len(photos.halves)) if np.mean(found < k) >= TARGET)
-    return next(good, len(photos.halves))
+    return next(k for k in candidate_steps(len(photos.halves)) if np.mean(found < k) >= TARGET)
 
 
 def is_used(sample: Sample, name: str) -> bool:
@@ -114,7 +107,7 @@ def _first_guesses(sample: Sample) -> Panel:
     whole = _wrong(sample, table, rows)
     for name in (name for name in asked if name != "half"):
         index = load_kind("flat").build(sample.own[name], threads=1)
-        for k in (k for k in (1, 2, 5, *LADDER, *steps(count)) if k < count):
+        for k in (k for k in (1, 2, 5, *FEWER[::-1], *candidate_steps(count)) if k < count):
             judged = _judged(table, index.search(asked[name], k)[1])
             points.append(missed(name, f"k = {k:,}", _wrong(sample, judged, rows) & ~whole))
             works.append(_asking(sample, index, asked, name, halves, k))

@@ -6,6 +6,7 @@ from itertools import cycle
 import numpy as np
 
 from indexes import KINDS, load_kind
+from indexes.errors import ParameterError
 from indexes.kinds.base import VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.lab.frontier.candidates import default_k, is_used
@@ -17,16 +18,6 @@ NEIGHBOURS = 10
 TOLERANCE = 1.0
 DEFAULT = "flat"
 """What `build-index` takes unless it is given a budget that exact search breaks."""
-PROBES = (1, 2, 4, 8, 16, 32, 64, 128)
-LADDERS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "hnsw": ("ef_search", (16, 32, 64, 128, 256, 512, 1000, 2000)),
-    "ivf_flat": ("probes", PROBES),
-    "ivf_sq8": ("probes", PROBES),
-    "ivf_pq": ("probes", PROBES),
-}
-"""Approximate kind -> the setting that trades time for what it finds; finer than `indexes.kinds.choice`, which looks
-for one point and not for the curve."""
-CODE_BYTES = (8, 16, 32)
 Measured = tuple[Point, Callable[[], object]]
 
 
@@ -81,22 +72,26 @@ def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, V
     for kind in KINDS:
         if kind == "exact":  # the oracle of the others
             continue
-        setting, values = LADDERS.get(kind, ("", ()))
-        values = values[::4] if sample.scale.quick else values
-        for name, index in _built(kind, embeddings, CODE_BYTES[:1] if sample.scale.quick else CODE_BYTES):
-            for value in values:
-                yield name, f"{setting} = {value}", index.tuned(**{setting: value})
-            if not values:
-                yield name, "", index
+        for name, built in _built(kind, embeddings, sample.scale.quick):
+            ladder = list(built.along_ladder())
+            for index in ladder[::4] if sample.scale.quick else ladder:
+                tuned = built.search_ladder and built.search_ladder[0]
+                yield name, f"{tuned} = {index.settings()[tuned]}" if tuned else "", index
 
 
-def _built(kind: str, embeddings: Array, code_bytes: tuple[int, ...]) -> Iterator[tuple[str, VectorIndex]]:
+def _built(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
+    """(series, index) of a kind, with each value of its `build_ladder` that these embeddings can have."""
     made = load_kind(kind)
-    if kind != "ivf_pq":
+    if made.build_ladder is None:
         yield kind, made.build(embeddings)
         return
-    for size in (size for size in code_bytes if embeddings.shape[1] % size == 0):
-        yield f"{kind}, {size} bytes", made.build(embeddings, made.parameters_from({"code_bytes": size}))
+    setting, values = made.build_ladder
+    for value in values[:1] if quick else values:
+        try:
+            index = made.build(embeddings, made.parameters_from({setting: value}))
+        except ParameterError:  # bytes of a code that do not divide the vector
+            continue
+        yield f"{kind}, {setting} = {value}", index
 
 
 def _matters(setting: str, k: int) -> bool:

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from indexes.store.files import write_atomically
 from indexes.store.regular import read_json
-from retrieval.console.files import write_atomically
 from retrieval.console.output import say
 from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation
 from retrieval.lab.frontier.clock import machine

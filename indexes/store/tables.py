@@ -1,0 +1,273 @@
+"""The tables of a new generation: what a writer is given, checked and put on the disk block by block."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.errors import MismatchedIndex, RowError, VectorError
+from indexes.kinds.checks import BLOCK_ROWS, check_unit
+from indexes.kinds.scores import Floats, Slots
+from indexes.store.arrays import ArrayFile, mapped, write_array
+from indexes.store.equal import first_of_equals
+from indexes.store.files import finish, json_of
+from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
+from indexes.store.rows import KEYS, RECORD, keys_of
+
+MOST_TOMBSTONES = 0.10
+"""Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
+
+RESERVED = {"rows", "table", "order", "embeddings", "vectors", "manifest"}
+
+Layouts: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
+"""Name of a per-row array -> its dtype, and the shape of one row of it."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows one after another, and embeddings (F, d) and arrays (F, ...) of those that the parent lacks, in order."""
+
+    rows: Sequence[Mapping[str, Any]]
+    embeddings: Floats | None = None
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What a generation will hold, on the disk and memory-mapped.
+
+    vectors (S, d), not all of which need have a row; slots (N,) of the rows; arrays: name -> (N, ...); parent: the
+    generation that rows were taken from, None where there were none; renumbered: whether slots are others than there.
+    """
+
+    vectors: Floats
+    slots: Slots
+    arrays: Mapping[str, NDArray[Any]]
+    parent: Generation | None
+    renumbered: bool
+
+
+class TableWriter:
+    """Takes blocks with `add`, writes them to files in `folder`, and maps what was written with `close`.
+
+    What comes is written once and in order. Embeddings are the parent's, then the new ones; where some of these are
+    equal, or many of those have no row any more, they are written again at the end.
+    """
+
+    def __init__(self, folder: Path, parent: Generation | None, fingerprint: Mapping[str, str]) -> None:
+        self.folder, self.parent, self._fingerprint = folder, parent, dict(fingerprint)
+        self._fits = parent is not None and parent.fingerprint == self._fingerprint
+        self._used = False
+        self._records: list[NDArray[Any]] = []
+        self._arrays: dict[str, ArrayFile] | None = None
+        self._vectors: ArrayFile | None = None
+        self._text = (folder / ROWS).open("wb")
+        if parent is not None and self._fits:
+            self._add_vectors(parent.embeddings)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._text.close()
+        for file in self._array_files():
+            file.abandon()
+
+    def add(self, block: Block) -> None:
+        """Take the next rows. Raises `RowError`, `VectorError` or `MismatchedIndex`, naming the row."""
+        if not block.rows:
+            raise RowError("a block must hold at least one row; got none")
+        ids = _checked_ids(block.rows)
+        numbers = self._known(block.rows, ids)
+        known = numbers >= 0
+        fresh_ids = [ids[number] for number in np.flatnonzero(~known)]
+        count = 0 if block.embeddings is None else len(block.embeddings)
+        if count != len(fresh_ids):
+            raise VectorError(f"one embedding is needed for each of the {len(fresh_ids)} new rows; got {count}")
+        records = np.zeros(len(ids), RECORD)
+        if self.parent is not None and known.any():
+            records["slot"][known] = self.parent.slots[numbers[known]]
+        if block.embeddings is not None and count:
+            dim = self._vectors.row_shape[0] if self._vectors else None
+            vectors = check_unit(block.embeddings, dim=dim, names=fresh_ids)
+            first = self._vectors.rows if self._vectors else 0
+            records["slot"][~known] = np.arange(first, first + count)
+            self._add_vectors(vectors)
+        self._add_arrays(block.arrays, numbers, fresh_ids)
+        self._add_lines(block.rows, ids, numbers, records)
+
+    def close(self) -> Tables:
+        """Finish the files, check that everything fits together, and map what was written."""
+        if self._vectors is None or not self._records:
+            raise RowError("an index needs at least one row; got none")
+        finish(self._text)
+        for file in self._array_files():
+            file.close()
+        table = np.concatenate(self._records)
+        self._check_distinct(table)
+        renumbered = self._number_slots(table)
+        write_array(self.folder / TABLE, RECORD, (), [table])
+        arrays = {name: mapped(file.path) for name, file in (self._arrays or {}).items()}
+        parent = self.parent if self._used else None
+        return Tables(mapped(self._vectors.path), np.ascontiguousarray(table["slot"]), arrays, parent, renumbered)
+
+    def _array_files(self) -> list[ArrayFile]:
+        return [*([self._vectors] if self._vectors else ()), *(self._arrays or {}).values()]
+
+    def _known(self, rows: Sequence[Mapping[str, Any]], ids: Sequence[str]) -> Slots:
+        """The parent's row (n,) to take each row's vector and arrays from, or -1."""
+        if self.parent is None:
+            return np.full(len(rows), -1)
+        numbers = self.parent.matching(ids, [row.get("digest") for row in rows])
+        if (numbers >= 0).any():
+            if not self._fits:
+                raise MismatchedIndex(
+                    f"vectors can be taken over only from an index with the same fingerprint {self._fingerprint}; "
+                    f"{self.parent.name} has {self.parent.fingerprint}. Build the index without a parent"
+                )
+            self._used = True
+        return numbers
+
+    def _add_vectors(self, vectors: Floats) -> None:
+        if self._vectors is None:
+            self._vectors = ArrayFile(self.folder / EMBEDDINGS, np.float32, vectors.shape[1:])
+        for start in range(0, len(vectors), BLOCK_ROWS):
+            self._vectors.append(vectors[start : start + BLOCK_ROWS])
+
+    def _add_arrays(self, given: Mapping[str, NDArray[Any]], numbers: Slots, fresh_ids: Sequence[str]) -> None:
+        """Write the arrays of a block: those given of its new rows, the parent's of the others."""
+        for name, array in given.items():
+            check_name(name)
+            _check_array(name, array, fresh_ids)
+        known = numbers >= 0
+        if self.parent is not None and known.any():
+            self._open_arrays(self.parent.arrays)
+        if fresh_ids or given:
+            self._open_arrays(given)
+        for name, file in (self._arrays or {}).items():
+            block = np.empty((len(numbers), *file.row_shape), file.dtype)
+            if fresh_ids:
+                block[~known] = given[name]
+            if self.parent is not None and known.any():
+                block[known] = self.parent.arrays[name][numbers[known]]
+            file.append(block)
+
+    def _open_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Open the files of arrays like these, which must be like those of all rows before."""
+        got: Layouts = {name: (array.dtype, array.shape[1:]) for name, array in arrays.items()}
+        if self._arrays is None:
+            self._arrays = {name: ArrayFile(self.folder / f"{name}.npy", *how) for name, how in got.items()}
+        must = {name: (file.dtype, file.row_shape) for name, file in self._arrays.items()}
+        if got != must:
+            got_text, must_text = (
+                ", ".join(f"{name} {dtype} {shape}" for name, (dtype, shape) in sorted(each.items())) or "none"
+                for each in (got, must)
+            )
+            raise RowError(f"all rows, the parent's too, must have the same arrays: {must_text}; got {got_text}")
+
+    def _add_lines(
+        self, rows: Sequence[Mapping[str, Any]], ids: Sequence[str], numbers: Slots, records: NDArray[Any]
+    ) -> None:
+        """Write the rows as text, and fill in their records but for the slots."""
+        lines, same = [], np.zeros(len(rows), bool)
+        for place, (row, name, number) in enumerate(zip(rows, ids, numbers.tolist(), strict=True)):
+            before = b"" if self.parent is None or number < 0 else self.parent.rows.line(number)
+            lines.append(json_of(dict(row), f"row {name!r}", name, checked=before))
+            same[place] = lines[place] == before
+        for name in KEYS:
+            if self.parent is not None and same.any():
+                records[name][same] = self.parent.rows.table[name][numbers[same]]
+            records[name][~same] = keys_of(rows[place].get(name) for place in np.flatnonzero(~same).tolist())
+        records["stop"] = self._text.tell() + np.cumsum([len(line) + 1 for line in lines])
+        records["start"] = np.concatenate([[self._text.tell()], records["stop"][:-1]])
+        self._text.writelines(line + b"\n" for line in lines)
+        self._records.append(records)
+
+    def _check_distinct(self, table: NDArray[Any]) -> None:
+        keys = np.ascontiguousarray(table["id"])
+        order = np.argsort(keys, kind="stable")
+        twice = keys[order][1:] == keys[order][:-1]
+        if twice.any():
+            record = table[order[int(np.argmax(twice))]]
+            with (self.folder / ROWS).open("rb") as text:
+                text.seek(int(record["start"]))
+                name = json.loads(text.readline())["id"]
+            raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
+
+    def _number_slots(self, table: NDArray[Any]) -> bool:
+        """Give equal vectors one slot, in the table and in the file; whether the parent's slots have other numbers.
+
+        The parent's slots stay, without rows too, until these are `MOST_TOMBSTONES` of all: a structure cannot forget.
+        Slots that are numbered anew are in the order of the rows.
+        """
+        if self._vectors is None:
+            return False
+        vectors = mapped(self._vectors.path)
+        slots = first_of_equals(vectors)[table["slot"]]
+        stay = np.zeros(len(vectors), bool)
+        stay[slots] = True
+        used = np.count_nonzero(stay)
+        if self.parent is not None and self._fits:
+            stay[: len(self.parent.embeddings)] = True
+        slots_kept = np.flatnonzero(stay)
+        renumbered = not self._used or len(slots_kept) - int(used) > MOST_TOMBSTONES * len(slots_kept)
+        if renumbered:
+            distinct, first = np.unique(slots, return_index=True)
+            slots_kept = distinct[np.argsort(first)]
+        number_of = np.full(len(vectors), -1)
+        number_of[slots_kept] = np.arange(len(slots_kept))
+        table["slot"] = number_of[slots]
+        if not np.array_equal(slots_kept, np.arange(len(vectors))):
+            beside = self._vectors.path.with_suffix(".new")
+            blocks = (
+                vectors[slots_kept[start : start + BLOCK_ROWS]] for start in range(0, len(slots_kept), BLOCK_ROWS)
+            )
+            write_array(beside, np.float32, vectors.shape[1:], blocks)
+            beside.replace(self._vectors.path)
+        return renumbered
+
+
+def check_documents(documents: Mapping[str, Any]) -> dict[str, Any]:
+    """The documents, named for files and of finite JSON, or `RowError`."""
+    for name, document in documents.items():
+        check_name(name)
+        json_of(document, f"document {name!r}")
+    return dict(documents)
+
+
+def check_name(name: str) -> None:
+    """`name` can be a file's name in a generation, or `RowError`."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
+        raise RowError(
+            f"names of arrays and documents must be lower-case words, not {', '.join(sorted(RESERVED))}; got {name!r}"
+        )
+
+
+def _checked_ids(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    for number, row in enumerate(rows):
+        if not isinstance(row.get("id"), str) or not row["id"]:
+            raise RowError(f"every row needs a text id; row {number} has {row.get('id')!r}")
+    return [row["id"] for row in rows]
+
+
+def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
+    if not isinstance(array, np.ndarray) or array.ndim < 1 or array.dtype.kind not in "biuf":
+        raise RowError(f"array {name!r} must be a numpy array of numbers; got {type(array).__name__}")
+    if 0 in array.shape[1:]:
+        raise RowError(f"array {name!r} must hold at least one number for each row; got {array.shape[1:]}")
+    if len(array) != len(ids):
+        raise RowError(f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}")
+    for start in range(0, len(array), BLOCK_ROWS):
+        block = array[start : start + BLOCK_ROWS]
+        good = np.isfinite(block).reshape(len(block), -1).all(axis=1)
+        if not good.all():
+            row = ids[start + int(np.argmin(good))]
+            raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)
