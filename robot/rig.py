@@ -14,7 +14,7 @@ from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.settings import build
 from robot.sight.cylinder import CylinderFit
-from robot.storage import read_regular
+from robot.storage import content_of
 
 RIGS = {"sim": "robot.sim.rig:SimRig", "real": "robot.real_rig:RealRig"}
 """Rigs by name, imported when asked for. A new rig is a file with a subclass of Rig, and a row here."""
@@ -188,9 +188,7 @@ def check_seed(seed: int) -> None:
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Name of the rig and its settings."""
     try:
-        document = tomllib.loads(read_regular(path).decode())
-    except OSError as error:
-        raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
+        document = tomllib.loads(content_of(path, RobotConfigError).decode())
     except (ValueError, RecursionError) as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)

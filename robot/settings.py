@@ -3,10 +3,11 @@
 Settings of one thing stand once, as a frozen dataclass of `TypedSettings`; a number's range stands beside its default.
 """
 
+import functools
 import inspect
 import math
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -38,9 +39,13 @@ class TypedSettings:
             value = getattr(self, each.name)
             check_type(each.name, hints[each.name], value)
             if isinstance(value, list):
-                object.__setattr__(self, each.name, tuple(value))
+                object.__setattr__(self, each.name, _as_tuple(value))
             if value is not None and "range" in each.metadata:
                 check_range(each.name, value, *each.metadata["range"])
+
+
+def _as_tuple(values: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(_as_tuple(each) if isinstance(each, list) else each for each in values)
 
 
 def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **given: Any) -> _T:
@@ -65,6 +70,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
 
 
+@functools.cache
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     """The keywords that a class takes: annotated type, and whether it must be said."""
     found: dict[str, tuple[Any, bool]] = {}
@@ -79,35 +85,52 @@ def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
 
 
 def check_type(name: str, hint: Any, value: object) -> None:
-    """Raise RobotConfigError for a plain value, table or list of plain values that is not of the annotated type, and
-    for numbers that are not finite or beyond 64 bits, which no setting means."""
-    for each in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(each, int | float) and not abs(each) < _MOST:  # also refuses NaN
-            raise RobotConfigError(f"{name} must be a finite number, within 64 bits, got {str(each)[:40]}")
+    """Raise RobotConfigError for a plain value, table or list that is not of the annotated type, and for numbers that
+    are not finite or beyond 64 bits, which no setting means."""
+    for number in _numbers(value):
+        if not abs(number) < _MOST:  # also refuses NaN
+            raise RobotConfigError(f"{name} must be a finite number, within 64 bits, got {str(number)[:40]}")
+    if not _is_of(hint, value):
+        raise RobotConfigError(f"{name} must be {_words(hint)}, got {value!r}")
+
+
+def _numbers(value: object) -> Iterator[float]:
+    if isinstance(value, int | float):
+        yield value
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from _numbers(each)
+
+
+def _is_of(hint: Any, value: object) -> bool:
+    """Python counts true and false among the whole numbers; a file of settings does not."""
     kind, inner = typing.get_origin(hint), typing.get_args(hint)
     if kind in (Sequence, tuple):
-        count = len(inner) if kind is tuple and inner[-1] is not ... else None
-        good = isinstance(value, list | tuple) and all(_is_plain(each, inner[0]) for each in value)
-        good = good and count in (None, len(typing.cast(Sequence[Any], value)))
-        words = f"a list{f' of {count}' if count else ''}, each of them {_PLAIN[inner[0]][1]}"
-    elif kind is Mapping:
-        good, words = isinstance(value, Mapping), "a table"
-    elif value is None and type(None) in inner:
-        return
-    else:
-        options = [each for each in inner if each is not type(None)] or [hint]
-        good = any(_is_plain(value, option) for option in options)
-        words = " or ".join(_PLAIN[option][1] for option in options if option in _PLAIN)
-    if not good:
-        raise RobotConfigError(f"{name} must be {words}, got {value!r}")
+        right_length = isinstance(value, list | tuple) and len(value) == (_length(hint) or len(value))
+        return right_length and all(_is_of(inner[0], each) for each in typing.cast(Sequence[Any], value))
+    if kind is Mapping:
+        return isinstance(value, Mapping)
+    if inner:  # one of several types, or None
+        return any(value is None if option is type(None) else _is_of(option, value) for option in inner)
+    return hint not in _PLAIN or (isinstance(value, _PLAIN[hint][0]) and (hint is bool or not isinstance(value, bool)))
+
+
+def _words(hint: Any) -> str:
+    kind, inner = typing.get_origin(hint), typing.get_args(hint)
+    if kind in (Sequence, tuple):
+        return f"a list{f' of {_length(hint)}' if _length(hint) else ''}, each of them {_words(inner[0])}"
+    if kind is Mapping:
+        return "a table"
+    return " or ".join(_PLAIN[option][1] for option in inner or (hint,) if option in _PLAIN)
+
+
+def _length(hint: Any) -> int | None:
+    """Of tuple[float, float] 2, of tuple[float, ...] or a sequence none."""
+    inner = typing.get_args(hint)
+    return len(inner) if typing.get_origin(hint) is tuple and inner[-1] is not ... else None
 
 
 def check_range(name: str, value: float, least: float, most: float, unit: str = "") -> None:
     """Raise RobotConfigError unless a setting is a finite number from `least` to `most`."""
     if not least <= value <= most or math.isinf(value):  # also refuses NaN
         raise RobotConfigError(f"{name} must be from {least:g} to {most:g}{unit and ' '}{unit}, got {value!r}")
-
-
-def _is_plain(value: object, hint: Any) -> bool:
-    """Python counts true and false among the whole numbers; a file of settings does not."""
-    return hint not in _PLAIN or (isinstance(value, _PLAIN[hint][0]) and (hint is bool or not isinstance(value, bool)))

@@ -2,17 +2,18 @@
 
 import contextlib
 import errno
+import json
 import os
 import stat
 from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from robot.errors import RecordingError, StorageError
+from robot.errors import RecordingError, RobotError, StorageError
 
 PART = ".part"
 ImageSource = npt.NDArray[Any] | bytes | str | Path
@@ -78,7 +79,10 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     """Return (file content, suffix): pixels as PNG, a file's own bytes as they are. Raises RecordingError."""
     if isinstance(source, np.ndarray):
         return _png(column, source), ".png"
-    data = source if isinstance(source, bytes) else _read(column, Path(source))
+    try:
+        data = source if isinstance(source, bytes) else content_of(source, RecordingError)
+    except RecordingError as error:
+        raise RecordingError(f"{column}: {error}") from error
     for magic, suffix in _SUFFIXES.items():
         if data.startswith(magic):
             return data, suffix
@@ -95,18 +99,34 @@ def read_regular(path: str | Path) -> bytes:
         return file.read()
 
 
+def content_of(path: str | Path, refusal: type[RobotError]) -> bytes:
+    """The bytes of a regular file. Raises `refusal`, which names it and what keeps it from being read."""
+    try:
+        return read_regular(path)
+    except OSError as error:
+        raise refusal(f"{path} cannot be read: {error.strerror}") from error
+
+
+def object_of(text: bytes, refusal: type[RobotError]) -> dict[str, Any]:
+    """The JSON object of a line or file. Raises `refusal` for anything else, NaN and infinity too."""
+    try:
+        value = json.loads(text.decode(), parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise refusal(f"must be JSON in UTF-8: {error}") from error
+    if not isinstance(value, dict):
+        raise refusal("must be one JSON object in braces")
+    return value
+
+
+def _refuse_constant(text: str) -> NoReturn:
+    raise ValueError(f"numbers must be finite, got {text}")
+
+
 def _require_regular(mode: int, path: str | Path) -> None:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
     if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, not a regular file", str(path))
-
-
-def _read(column: str, path: Path) -> bytes:
-    try:
-        return read_regular(path)
-    except OSError as error:
-        raise RecordingError(f"{column}: {path} cannot be read: {error.strerror}") from error
 
 
 def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:

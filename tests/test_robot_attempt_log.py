@@ -5,9 +5,7 @@ import json
 import pytest
 
 from robot.errors import RecordingError, StorageError
-from robot.recording.attempt_log import AttemptLog, LoggedAttempt, acceptance, acceptance_table, read_attempts, tally
-from robot.recording.folder import RecordingWriter, read_recording
-from tests.test_robot_recording import INFO, pictures
+from robot.recording.attempt_log import AttemptLog, LoggedAttempt, acceptance_table, read_attempts, tally
 from tests.test_robot_recording_crash import FullDisk
 
 HELD = LoggedAttempt("mug", 0, "held", True, 12.5, "mug-0000", 0.75, {"method": "circle", "error_mm": 0.3})
@@ -147,13 +145,3 @@ def test_the_table_has_a_line_an_object_and_says_who_was_given_up():
         "all               2   4     1       1        1        1",
     ]
     assert acceptance_table(list(tally(ALL).values()), wanted=2).count("gave up") == 2
-
-
-def test_acceptance_of_a_recording_whose_attempts_were_not_logged(tmp_path):
-    with RecordingWriter(tmp_path, INFO) as writer:
-        writer.append("1", "mug", pictures(), grasped=True, outcome="held")
-        writer.append("2", "mug", pictures(), grasped=False)
-        writer.append("3", "cup", pictures())
-    mug, cup = acceptance(read_recording(tmp_path))
-    assert (mug.attempts, mug.accepted, mug.outcomes) == (2, 1, {"held": 1})
-    assert (cup.attempts, cup.accepted, cup.outcomes) == (1, 1, {})

@@ -11,7 +11,7 @@ import math
 import time
 from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +24,8 @@ from robot.devices import Camera, Clock, TactileSensor
 from robot.drivers.video.rectify import CutSettings, in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
-from robot.recording.folder import INFO_FILE, parse_object, read_recording
+from robot.recording.folder import INFO_FILE, read_recording
+from robot.storage import object_of
 
 _KEPT = 8
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
@@ -275,7 +276,7 @@ def _intrinsics(path: Path) -> Intrinsics | None:
     if not path.is_file():
         return None
     try:
-        found: Mapping[str, Any] = parse_object(path.read_bytes())
+        found = object_of(path.read_bytes(), RecordingError)
     except RecordingError as error:
         raise DeviceError(f"{path}: {error}") from error
     names = ("fx", "fy", "cx", "cy")

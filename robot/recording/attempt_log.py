@@ -7,7 +7,6 @@ at most the last line is half or has no grasp, and then it does not count.
 """
 
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -16,10 +15,10 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Self
 
-from robot.errors import RecordingError
-from robot.recording.folder import Recording, parse_object
+from robot.errors import RecordingError, RobotConfigError
 from robot.recording.grasp import OUTCOMES
-from robot.storage import append_line, read_regular, storage_errors
+from robot.settings import build
+from robot.storage import append_line, content_of, object_of, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
 
@@ -46,23 +45,14 @@ class LoggedAttempt:
     def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Raises RecordingError for what `to_row` never writes."""
         try:
-            attempt = cls(**row)
-        except TypeError as error:
+            attempt = build(cls, row)
+        except RobotConfigError as error:
             raise RecordingError(f"is no attempt: {error}") from error
-        wrong = [name for name, types in _TYPES.items() if not isinstance(getattr(attempt, name), types)]
-        if wrong or attempt.outcome not in OUTCOMES or not math.isfinite(attempt.ended_s):
-            raise RecordingError(f"is no attempt: {(wrong or ['outcome or ended_s'])[0]} is wrong in {row!r}")
+        if attempt.outcome not in OUTCOMES:
+            raise RecordingError(
+                f"is no attempt: outcome must be one of {', '.join(OUTCOMES)}, got {attempt.outcome!r}"
+            )
         return attempt
-
-
-_TYPES: Mapping[str, Any] = {
-    "object_id": str,
-    "number": int,
-    "outcome": str,
-    "accepted": bool,
-    "ended_s": int | float,
-    "grasp_id": str | None,
-}
 
 
 def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
@@ -72,12 +62,9 @@ def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
 
 def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
     """Attempts that count, each with where its line ends in the file."""
-    try:
-        lines = read_regular(path).splitlines(keepends=True)
-    except FileNotFoundError:
+    if not path.exists():
         return []
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    lines = content_of(path, RecordingError).splitlines(keepends=True)
     found: list[tuple[LoggedAttempt, int]] = []
     made: Counter[str] = Counter()
     end = 0
@@ -85,7 +72,10 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
         last = number == len(lines)
         if last and not line.endswith(b"\n"):
             break
-        attempt = _parsed(path, number, line)
+        try:
+            attempt = LoggedAttempt.from_row(object_of(line, RecordingError))
+        except RecordingError as error:
+            raise RecordingError(f"{path}, line {number}: {error}") from error
         if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
             if last:
                 break
@@ -99,13 +89,6 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
         end += len(line)
         found.append((attempt, end))
     return found
-
-
-def _parsed(path: Path, number: int, line: bytes) -> LoggedAttempt:
-    try:
-        return LoggedAttempt.from_row(parse_object(line))
-    except RecordingError as error:
-        raise RecordingError(f"{path}, line {number}: {error}") from error
 
 
 class AttemptLog:
@@ -167,20 +150,6 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
     for attempt in attempts:
         tallies.setdefault(attempt.object_id, Tally(attempt.object_id)).add(attempt)
     return tallies
-
-
-def acceptance(recording: Recording) -> list[Tally]:
-    """Attempts, accepted ones and outcomes by object; of the grasps alone where the attempts were not logged."""
-    logged = read_attempts(recording.folder, {grasp.grasp_id for grasp in recording.grasps})
-    if logged:
-        return list(tally(logged).values())
-    tallies: dict[str, Tally] = {}
-    for grasp in recording.grasps:
-        each = tallies.setdefault(grasp.object_id, Tally(grasp.object_id))
-        each.attempts += 1
-        each.accepted += grasp.grasped is not False
-        each.outcomes.update([grasp.outcome] if grasp.outcome else [])
-    return list(tallies.values())
 
 
 def acceptance_table(tallies: Sequence[Tally], wanted: int | None = None) -> str:

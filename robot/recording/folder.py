@@ -24,7 +24,7 @@ import re
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
@@ -34,8 +34,9 @@ from robot.storage import (
     PART,
     ImageSource,
     append_line,
+    content_of,
     file_content,
-    read_regular,
+    object_of,
     storage_errors,
     sync_folder,
     write_file,
@@ -92,14 +93,14 @@ def read_recording(folder: str | Path) -> Recording:
     root = Path(folder)
     info = read_info(root)
     path = root / METADATA_FILE
-    lines, torn = _whole_lines(_read(path))
+    lines, torn = _whole_lines(content_of(path, RecordingError))
     grasps: dict[str, RecordedGrasp] = {}
     ignored: set[str] = set()
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            row = parse_object(line)
+            row = object_of(line, RecordingError)
             grasp = RecordedGrasp.from_row(row)
             if grasp.grasp_id in grasps:
                 raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
@@ -119,7 +120,7 @@ def read_info(root: Path) -> dict[str, Any]:
     if not os.path.exists(path):  # False, and no error, for a name that no disk takes
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
     try:
-        info = parse_object(_read(path))
+        info = object_of(content_of(path, RecordingError), RecordingError)
         _check_info(info)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
@@ -135,13 +136,6 @@ def _check_info(info: Mapping[str, Any]) -> None:
         check_name(key, info.get(key))
 
 
-def _read(path: Path) -> bytes:
-    try:
-        return read_regular(path)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
-
-
 def _whole_lines(data: bytes) -> tuple[list[bytes], bytes]:
     """Split into (lines, what a crash left of a last one); one that only lacks its newline is whole."""
     *lines, last = data.split(b"\n")
@@ -150,21 +144,6 @@ def _whole_lines(data: bytes) -> tuple[list[bytes], bytes]:
     except (ValueError, RecursionError):
         return lines, last
     return [*lines, last], b""
-
-
-def parse_object(text: bytes) -> dict[str, Any]:
-    """The JSON object of a line or file. Raises RecordingError for anything else, NaN and infinity too."""
-    try:
-        value = json.loads(text.decode(), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise RecordingError(f"must be JSON in UTF-8: {error}") from error
-    if not isinstance(value, dict):
-        raise RecordingError("must be one JSON object in braces")
-    return value
-
-
-def _refuse_constant(text: str) -> NoReturn:
-    raise RecordingError(f"numbers must be finite, got {text}")
 
 
 # Writing ---------------------------------------------------------------------------------------------------
@@ -192,7 +171,7 @@ class RecordingWriter:
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
         self.folder = Path(folder)
         wanted = _full_info(info)
-        _check_is_ours(self.folder)
+        _check_holds_nothing_else(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
@@ -211,7 +190,9 @@ class RecordingWriter:
             sync_folder(self.folder)
         recording = read_recording(self.folder)
         self.info = recording.info
-        _check_agrees(self.folder, self.info, wanted)
+        for key in _MUST_AGREE:
+            if (old := self.info.get(key)) != (new := wanted.get(key)):
+                raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
         self._grasp_ids = {grasp.grasp_id: None for grasp in recording.grasps}
         data = self._file.read()
         lines, torn = _whole_lines(data)
@@ -302,7 +283,7 @@ def software_version() -> str:
         return "unknown"
 
 
-def _check_is_ours(folder: Path) -> None:
+def _check_holds_nothing_else(folder: Path) -> None:
     """Refuse to mix a new recording into a folder of other files."""
     if (folder / INFO_FILE).is_file() or not folder.exists():
         return
@@ -315,10 +296,3 @@ def _check_is_ours(folder: Path) -> None:
         raise RecordingError(f"{folder} holds other files, such as {others[0]}; give a new or an empty folder")
     if grasps:
         raise RecordingError(f"{folder} has a {METADATA_FILE} but no {INFO_FILE}; restore it or give a new folder")
-
-
-def _check_agrees(folder: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    for key in _MUST_AGREE:
-        old, new = found.get(key), wanted.get(key)
-        if old != new:
-            raise RecordingError(f"{folder} was recorded with {key} {old!r}, not {new!r}; give another folder")

@@ -69,11 +69,6 @@ class CylinderFit:
     notes: tuple[str, ...] = ()
 
     @property
-    def orientation(self) -> str:
-        """upright or lying."""
-        return "lying" if self.method == "lying" else "upright"
-
-    @property
     def is_round(self) -> bool:
         """Whether its width is the same from all sides."""
         return self.method not in ("box", "lying")

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RobotConfigError
-from robot.storage import read_regular, storage_errors, sync_folder, write_file
+from robot.storage import content_of, object_of, storage_errors, sync_folder, write_file
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
@@ -70,14 +70,6 @@ class HandEye:
     affine_errors: Errors | None
     no_affine: str
     written: datetime
-
-    @property
-    def stretches(self) -> tuple[float, float, float] | None:
-        """By how much the affine map stretches its three main directions; 1 for a camera that measures right."""
-        if self.affine is None:
-            return None
-        first, second, third = np.linalg.svd(self.affine[:3, :3], compute_uv=False).tolist()
-        return first, second, third
 
     @property
     def warning(self) -> str | None:
@@ -174,13 +166,11 @@ def errors_of(fit: Fit, camera_mm: Points, rig_mm: Points) -> Errors:
 def read_pairs(path: Path) -> tuple[Points, Points]:
     """Camera and rig points from a CSV file with the columns COLUMNS, in any order. Raises RobotConfigError."""
     try:
-        with io.StringIO(read_regular(path).decode("utf-8-sig"), newline="") as file:
+        with io.StringIO(content_of(path, RobotConfigError).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
                 raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
             numbers = [_row(path, rows.line_num, row) for row in rows]
-    except OSError as error:
-        raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (csv.Error, UnicodeDecodeError) as error:
         raise RobotConfigError(f"{path} is not CSV text: {error}") from error
     pairs = np.array(numbers, dtype=np.float64).reshape(-1, 6)
@@ -216,13 +206,12 @@ def _check_age(path: Path, found: HandEye, max_age_days: float | None, now: date
 
 
 def _read(path: Path) -> dict[str, Any]:
+    data = content_of(path, RobotConfigError)
     try:
-        document = json.loads(read_regular(path))
-    except OSError as error:
-        raise RobotConfigError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise RobotConfigError(f"{path} is not JSON: {error}") from error
-    if not isinstance(document, dict) or document.get("version") != VERSION:
+        document = object_of(data, RobotConfigError)
+    except RobotConfigError as error:
+        raise RobotConfigError(f"{path}: {error}") from error
+    if document.get("version") != VERSION:
         raise RobotConfigError(f"{path} must be a hand-eye calibration of version {VERSION}; make it again")
     if unknown := sorted(set(document) - set(_KEYS)):
         raise RobotConfigError(f"{path}: unknown key {unknown[0]!r}; known: {', '.join(_KEYS)}")

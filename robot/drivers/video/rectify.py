@@ -16,7 +16,6 @@ A calibration file is JSON, written by hand or by a tool, with image_px and one 
     note        for people
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,8 +27,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
-from robot.settings import TypedSettings
-from robot.storage import read_regular
+from robot.settings import TypedSettings, build
+from robot.storage import content_of, object_of
 
 Picture = npt.NDArray[np.uint8]
 
@@ -44,12 +43,11 @@ class CutSettings(TypedSettings):
     output_px: Sequence[int] = ()
 
 
-_KEYS = {"image_px", "corners_px", "crop", "output_px", "note"}
-_MOST_PX, _MOST = 20_000, 1e9
+_MOST_PX = 20_000
 
 
 @dataclass(frozen=True)
-class Rectifier:
+class Rectifier(TypedSettings):
     """What to do with a picture. Everything left out, nothing; `crop` and `corners_px` exclude each other."""
 
     crop: tuple[float, ...] = ()
@@ -59,6 +57,7 @@ class Rectifier:
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for numbers that make no picture."""
+        super().__post_init__()
         if self.crop and self.corners_px:
             raise RobotConfigError("a picture is cut by crop or by corners_px; give one of them")
         for name in ("image_px", "output_px"):
@@ -144,45 +143,14 @@ def make_rectifier(settings: CutSettings, default_crop: Sequence[float] = ()) ->
 
 def load_rectifier(path: str | Path) -> Rectifier:
     """Read a calibration file. Raises RobotConfigError with the file's name."""
+    data = content_of(path, RobotConfigError)
     try:
-        return _from_json(json.loads(read_regular(path)))
-    except OSError as error:
-        raise RobotConfigError(f"calibration file {path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise RobotConfigError(f"calibration file {path} is not JSON: {error}") from error
+        found = object_of(data, RobotConfigError)
+        if not found.get("image_px") or ("crop" in found) == ("corners_px" in found):
+            raise RobotConfigError("it must have image_px, and one of corners_px and crop")
+        return build(Rectifier, {name: value for name, value in found.items() if name != "note"})
     except RobotConfigError as error:
         raise RobotConfigError(f"calibration file {path}: {error}") from error
-
-
-def _from_json(found: Any) -> Rectifier:
-    if not isinstance(found, dict):
-        raise RobotConfigError("it must be one JSON object in braces")
-    if unknown := sorted(set(found) - _KEYS):
-        raise RobotConfigError(f"unknown key {unknown[0]!r}; known: {', '.join(sorted(_KEYS))}")
-    if not found.get("image_px") or ("crop" in found) == ("corners_px" in found):
-        raise RobotConfigError("it must have image_px, and one of corners_px and crop")
-    corners = found.get("corners_px", [])
-    if not isinstance(corners, list):
-        raise RobotConfigError(f"corners_px must be a list of four points, got {corners!r}")
-    return Rectifier(
-        crop=_numbers("crop", found.get("crop", [])),
-        corners_px=tuple((*_numbers("corners_px", corner, count=2),) for corner in corners),  # type: ignore[misc]
-        image_px=_whole("image_px", found["image_px"]),
-        output_px=_whole("output_px", found.get("output_px", [])),
-    )
-
-
-def _numbers(name: str, values: Any, count: int | None = None) -> tuple[float, ...]:
-    good = isinstance(values, list) and all(type(value) in (int, float) and abs(value) < _MOST for value in values)
-    if not good or (count is not None and len(values) != count):
-        raise RobotConfigError(f"{name} must be a list of {count or 'finite'} numbers, got {values!r}")
-    return tuple(float(value) for value in values)
-
-
-def _whole(name: str, values: Any) -> tuple[int, ...]:
-    if not isinstance(values, list) or not all(type(value) is int for value in values):
-        raise RobotConfigError(f"{name} must be a list of whole numbers, got {values!r}")
-    return tuple(values)
 
 
 def _check_crop(crop: tuple[float, ...]) -> None:
