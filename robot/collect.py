@@ -101,9 +101,15 @@ def collect(
     """
     settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
     rig = make_rig()
-    _check_jobs(rig, jobs)
+    if jobs < 1:
+        raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
+    if jobs > 1 and not rig.can_run_jobs:
+        raise RobotConfigError(f"there is one such rig ({type(rig).__name__}), so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
-    _check_names(names)
+    if not names:
+        raise RobotConfigError("at least one object must be collected, got none")
+    if len(set(names)) != len(names):
+        raise RobotConfigError("objects must have different names; one was given twice")
     with rig:
         attempt = settings.attempt or rig.attempt
         info = _info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))
@@ -114,20 +120,6 @@ def collect(
             with Jobs(jobs, attempter, make_rig) as workers:
                 collection.run(workers)
     return [collection.tallies[name] for name in names]
-
-
-def _check_jobs(rig: Rig, jobs: int) -> None:
-    if jobs < 1:
-        raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
-    if jobs > 1 and not rig.can_run_jobs:
-        raise RobotConfigError(f"there is one such rig ({type(rig).__name__}), so jobs must be 1, got {jobs}")
-
-
-def _check_names(names: Sequence[str]) -> None:
-    if not names:
-        raise RobotConfigError("at least one object must be collected, got none")
-    if len(set(names)) != len(names):
-        raise RobotConfigError("objects must have different names; one was given twice")
 
 
 # What the recording says of its collection ------------------------------------------------------------------

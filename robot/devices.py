@@ -136,6 +136,16 @@ class Device(ABC):
             )
 
 
+class VirtualDevice(Device):
+    """A device that is not there: nothing is to be connected, closed, or stopped where it moves."""
+
+    def _connect(self) -> None: ...
+
+    def _close(self) -> None: ...
+
+    def _stop(self) -> None: ...
+
+
 class Actuator(Device):
     """Something that moves, at most at `max_speed_mm_s`. An exception, Ctrl-C included, leaves it standing still.
 

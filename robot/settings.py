@@ -55,7 +55,8 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
     the table of a file. Raises RobotConfigError for an unknown setting, a missing one, or one of another type than is
     annotated; the class itself checks ranges.
     """
-    keywords = {name: each for name, each in _keywords(cls).items() if name not in given}
+    taken = _keywords(cls)  # type: ignore[arg-type]  # a class is hashable
+    keywords = {name: each for name, each in taken.items() if name not in given}
     known = ", ".join(sorted(keywords))
     if unknown := sorted(set(settings) - set(keywords)):
         raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; it knows {known}")
@@ -65,7 +66,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
     try:
         for name, value in settings.items():
             check_type(name, keywords[name][0], value)
-        return cls(**settings, **{name: value for name, value in given.items() if name in _keywords(cls)})
+        return cls(**settings, **{name: value for name, value in given.items() if name in taken})
     except RobotConfigError as error:
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
 

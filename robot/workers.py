@@ -39,7 +39,7 @@ class Jobs:
         self.window = 1 if jobs == 1 else 2 * jobs
         self._environment: dict[str, str | None] = {}
         self._threads = cv2.getNumThreads()
-        self._not_ours = set(multiprocessing.active_children())
+        self._before = set(multiprocessing.active_children())
         if jobs > 1:
             self._environment = {name: os.environ.get(name) for name in _THREADS}
             self._pool = ProcessPoolExecutor(
@@ -71,7 +71,7 @@ class Jobs:
         """Waits for the attempts that have begun; the others are not made."""
         cv2.setNumThreads(self._threads)
         if self._pool is not None:
-            _end(self._pool, set(multiprocessing.active_children()) - self._not_ours)
+            _end(self._pool, set(multiprocessing.active_children()) - self._before)
 
 
 def _end(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:

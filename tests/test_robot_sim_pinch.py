@@ -13,7 +13,7 @@ from robot.sim.camera import Placement
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.body import Body
 from robot.sim.objects.draw import draw_object
-from robot.sim.pinch import GRAVITY_M_S2, Hand, Pinch
+from robot.sim.pinch import GRAVITY_M_S2, Grip, Hand, Pinch
 
 SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}
 ANY = draw_object(0, 0)
@@ -58,9 +58,7 @@ def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_m
     return Pinch(
         obj=obj,
         placement=placement or Placement(),
-        pose=Pose(0.0, y_mm, z_mm, yaw),
-        force_n=force_n,
-        opening_mm=opening_mm,
+        grip=Grip(Pose(0.0, y_mm, z_mm, yaw), force_n, opening_mm),
         sensors=SENSORS if sensors is None else sensors,
         hand=Hand(),
         seed=1,

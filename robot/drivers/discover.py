@@ -72,15 +72,11 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[Found]:
 def _numbered_cameras(dev: Path, sys: Path) -> list[Found]:
     found = []
     for entry in _entries(sys / "class" / "video4linux"):
-        if entry.name.startswith("video") and _index_of(entry) == "0":
+        # Several numbers belong to one camera; its `index` 0 gives the pictures.
+        if entry.name.startswith("video") and (_text(entry / "index") or "0") == "0":
             device, label = str(dev / entry.name), _label(sys, entry.name)
             found.append(Found("camera", device, label, _camera_toml(device, label) + "\nallow_index = true"))
     return found
-
-
-def _index_of(entry: Path) -> str:
-    """Several numbers belong to one camera; its `index` 0 gives the pictures."""
-    return _text(entry / "index") or "0"
 
 
 def _label(sys: Path, name: str) -> str:

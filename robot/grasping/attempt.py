@@ -21,7 +21,7 @@ from robot.grasping.plan import GraspPlan, plan_grasp
 from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Box, Pose
 from robot.rig import Rig, check_seed
-from robot.sight.cylinder import CylinderFit, fit_cylinder
+from robot.sight.cylinder import fit_cylinder
 from robot.storage import file_content
 
 _OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
@@ -104,9 +104,10 @@ class Attempter:
         rig.arm.move_to(rig.home, self.settings.travel_mm_s)
         rig.prepare(object_id, number)
         start = rig.clock()
-        image = rig.camera.read(depth=self._needs_depth)
+        records_depth = rig.camera.has_depth and "depth" in self.settings.outputs
+        image = rig.camera.read(depth=rig.given is None or records_depth)
         try:
-            fit = self._fit(image)
+            fit = rig.given or fit_cylinder(image, rig.camera.extrinsics, self._sight)
             plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
         except PlanError as error:
             lasted = round(rig.clock() - start, 3)
@@ -115,7 +116,7 @@ class Attempter:
         touches, fields, at = self._grasp(plan)
         outcome = self._outcome()
         if "after" in self.settings.outputs:
-            touches |= self._feel("_after", self.settings.hold_s)
+            touches |= self._feel("_after", self.settings.hold_s)[0]
         self._put_down(plan, outcome == "held", rng)
         return GraspAttempt(
             object_id,
@@ -137,26 +138,17 @@ class Attempter:
         if here.z_mm < top and arm.workspace.contains(here):
             arm.move_to(replace(here, z_mm=top), self.settings.approach_mm_s)
 
-    @property
-    def _needs_depth(self) -> bool:
-        """Whether a grasp is planned from depth, or depth is to be recorded and there is any."""
-        return self.rig.given is None or (self.rig.camera.has_depth and "depth" in self.settings.outputs)
-
-    def _fit(self, image: RGBD) -> CylinderFit:
-        """The object as it was given, or as the camera sees it."""
-        return self.rig.given or fit_cylinder(image, self.rig.camera.extrinsics, self._sight)
-
     def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
         """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
         rig, settings = self.rig, self.settings
         rig.arm.move_to(plan.above, settings.travel_mm_s)
         rig.gripper.open(plan.opening_mm)
         reached = rig.arm.move_to(plan.pose, settings.approach_mm_s)
-        touches = self._feel("_before", MAX_AGE_S) if "before" in settings.outputs else {}
+        touches = self._feel("_before", MAX_AGE_S)[0] if "before" in settings.outputs else {}
         closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
         rig.sleep(settings.settle_s)
         at = rig.clock()
-        during, skew_s = self._feel_at_once("", settings.settle_s)
+        during, skew_s = self._feel("", settings.settle_s)
         rig.arm.move_to(plan.above, settings.approach_mm_s)
         rig.sleep(settings.hold_s)
         fields = {
@@ -167,12 +159,9 @@ class Attempter:
         }
         return touches | during, fields, at
 
-    def _feel(self, moment: str, since_s: float) -> dict[str, bytes]:
-        """Gel images by column; none older than what has just been waited for, which may have been before it."""
-        return self._feel_at_once(moment, since_s)[0]
-
-    def _feel_at_once(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
-        """Gel images by column, and how far apart in time they were taken (s)."""
+    def _feel(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
+        """Gel images by column, and how far apart in time they were taken (s); none older than what has just been
+        waited for, which may have been before it."""
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from robot.devices import Arm, Gripper
+from robot.devices import Arm, Gripper, VirtualDevice
 from robot.readings import GripperState, Pose
 from robot.rig import Rig
 
@@ -19,7 +19,7 @@ def without_motion(rig: Rig, say: Say) -> Rig:
     return rig
 
 
-class DryArm(Arm):
+class DryArm(VirtualDevice, Arm):
     """Says where it would go, and is there."""
 
     def __init__(self, arm: Arm, say: Say) -> None:
@@ -27,12 +27,6 @@ class DryArm(Arm):
         self._say = say
         lower, upper = arm.workspace.lower, arm.workspace.upper
         self._at = Pose((lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, upper[2], 0.0)
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
-
-    def _stop(self) -> None: ...
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         self._say(
@@ -46,7 +40,7 @@ class DryArm(Arm):
         return self._at
 
 
-class DryGripper(Gripper):
+class DryGripper(VirtualDevice, Gripper):
     """Says how it would move its jaws; whatever it closes on, it holds."""
 
     def __init__(self, gripper: Gripper, say: Say) -> None:
@@ -60,12 +54,6 @@ class DryGripper(Gripper):
         )
         self._say = say
         self._now = GripperState(gripper.stroke_mm, 0.0, "idle")
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
-
-    def _stop(self) -> None: ...
 
     def _state(self) -> GripperState:
         return self._now

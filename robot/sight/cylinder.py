@@ -44,6 +44,9 @@ _ARC_WHEN_CUT_OFF_DEG = 90.0
 _MANY_OFF = 0.3
 _LEAST_TOP = 0.05
 _POOR, _OUTLIER_MM = 0.35, 2.0
+_OUTLINE_SHARE = 0.15
+"""Standard error of an outline's fit as a share of the radius: measured on cylinders whose base nothing hides."""
+
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
 """Standard error of the centre from methods that guess the hidden side: of a simple solid, of any, of one unseen."""
 
@@ -124,16 +127,9 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = No
 def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None) -> CylinderFit:
     """See robot.sight.silhouette."""
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
-    return CylinderFit(
-        found.x_mm,
-        found.y_mm,
-        found.height_mm,
-        found.radius_mm,
-        found.error_mm,
-        "silhouette",
-        (found.radius_mm, found.radius_mm),
-        notes=(*table.notes, "depth shows nothing here: fitted to the outline in the colour picture"),
-    )
+    notes = (*table.notes, "depth shows nothing here: fitted to the outline in the colour picture")
+    error_mm = max(3.0, _OUTLINE_SHARE * found.radius)
+    return CylinderFit(found.x, found.y, found.height, found.radius, error_mm, "silhouette", found.half, notes=notes)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ alpha). The highest pixel looks at the far rim of the top, at distance D + r, wh
 """
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,27 +15,15 @@ import numpy.typing as npt
 from robot.errors import PlanError
 from robot.readings import Box
 from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, TablePlane, height_above, largest_patch
+from robot.sight.solids import Upright
 
 _COLOUR_LEVELS = 12.0
 _LEAST_PX = 60
-_ERROR_SHARE = 0.15
-"""Standard error as a share of the radius: measured on cylinders, where the base is hidden by nothing."""
-
-
-@dataclass(frozen=True)
-class Outline:
-    """An upright cylinder (mm, rig frame) that has this outline."""
-
-    x_mm: float
-    y_mm: float
-    radius_mm: float
-    height_mm: float
-    error_mm: float
 
 
 def fit_silhouette(
     colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None = None
-) -> Outline:
+) -> Upright:
     """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
     patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
     rows, columns = (at + part.start for at, part in zip(patch.mask.nonzero(), patch.window, strict=True))
@@ -68,7 +55,7 @@ def _patch(candidates: Mask) -> Patch:
     return patch
 
 
-def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Box | None) -> Outline:
+def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Box | None) -> Upright:
     """Closed form, see the top of the file. directions: (N, 3) of sight; eye: (3,) above the table's plane."""
     turn = np.arctan2(directions[:, 1], directions[:, 0])
     middle = math.atan2(float(np.sin(turn).mean()), float(np.cos(turn).mean()))
@@ -89,4 +76,4 @@ def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region:
     )
     if outside or height <= 0:
         raise PlanError("the outline in the colour picture is of nothing that stands on the table")
-    return Outline(x, y, radius, height, max(3.0, _ERROR_SHARE * radius))
+    return Upright(x, y, radius, height)

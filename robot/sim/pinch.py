@@ -60,9 +60,18 @@ class Hand:
     tolerance: float = 1e-2
 
 
+@dataclass(frozen=True)
+class Grip:
+    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger."""
+
+    pose: Pose
+    force_n: float
+    opening_mm: float = STROKE_MM
+
+
 @dataclass(frozen=True, eq=False)
 class Pinch:
-    """The jaws closed at `pose` from `opening_mm` with `force_n` on each finger; `sensors` are the fingers that feel.
+    """What comes of a grip at an object; `sensors` are the fingers that feel.
 
     A finger without a sensor is a bare rigid one. `seed` draws how far from square the object ends; `passes` counts
     the work done, by name.
@@ -70,9 +79,7 @@ class Pinch:
 
     obj: SimObject
     placement: Placement
-    pose: Pose
-    force_n: float
-    opening_mm: float
+    grip: Grip
     sensors: Mapping[str, GelSensor]
     hand: Hand
     seed: int
@@ -81,10 +88,11 @@ class Pinch:
 
     def __post_init__(self) -> None:
         """Raises SceneError for a force that no gripper has."""
-        if not (math.isfinite(self.force_n) and self.force_n > 0):
-            raise SceneError(f"a grip's force_n must be positive and finite, got {self.force_n}")
-        if not 0 < self.opening_mm <= self.hand.stroke_mm:
-            raise SceneError(f"opening_mm must be above 0, at most {self.hand.stroke_mm:g}; got {self.opening_mm}")
+        force_n, opening_mm = self.grip.force_n, self.grip.opening_mm
+        if not (math.isfinite(force_n) and force_n > 0):
+            raise SceneError(f"a grip's force_n must be positive and finite, got {force_n}")
+        if not 0 < opening_mm <= self.hand.stroke_mm:
+            raise SceneError(f"opening_mm must be above 0, at most {self.hand.stroke_mm:g}; got {opening_mm}")
 
     # Where the object ends ----------------------------------------------------------------------------------
 
@@ -121,9 +129,10 @@ class Pinch:
         y = -side * width * ((np.arange(grid[1]) + 0.5) / grid[1] - 0.5)
         yy, zz = np.meshgrid(y, z)
         local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
-        grip = Placement(yaw_rad=self.pose.yaw_rad).rotation()
-        starts = placement.to_object(local @ grip.T + [self.pose.x_mm, self.pose.y_mm, self.pose.z_mm])
-        return starts, np.broadcast_to((side * grip[:, 0]) @ placement.rotation(), starts.shape)
+        pose = self.grip.pose
+        closing = Placement(yaw_rad=pose.yaw_rad).rotation()
+        starts = placement.to_object(local @ closing.T + [pose.x_mm, pose.y_mm, pose.z_mm])
+        return starts, np.broadcast_to((side * closing[:, 0]) @ placement.rotation(), starts.shape)
 
     @cached_property
     def _field_mm(self) -> tuple[float, float]:
@@ -133,7 +142,7 @@ class Pinch:
     def missed(self) -> str | None:
         """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between."""
         reach = self._reaches[len(_COARSE_RAD) // 2]
-        if (reach < _START_MM - self.opening_mm / 2).any():
+        if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"
         if not np.isfinite(self._walls["a"]).any() or not np.isfinite(self._walls["b"]).any():
             return "the object is not between the fingers"
@@ -142,13 +151,13 @@ class Pinch:
     @cached_property
     def _walls(self) -> dict[str, Array]:
         """Distance along each finger's rays to the turned object; a bare finger feels its way on the coarse grid."""
-        return {finger: self._wall(finger) for finger in SIDES}
-
-    def _wall(self, finger: str) -> Array:
-        grid = self.hand.grid if finger in self.sensors else _FEELERS
-        self.passes["wall" if finger in self.sensors else "feel"] += 1
-        rays = self._rays(SIDES[finger], grid, self.turned)
-        return self.obj.body.cast(*rays, beyond_mm=_DEEPEST_MM).reshape(grid)
+        walls = {}
+        for finger, side in SIDES.items():
+            grid = self.hand.grid if finger in self.sensors else _FEELERS
+            self.passes["wall" if finger in self.sensors else "feel"] += 1
+            rays = self._rays(side, grid, self.turned)
+            walls[finger] = self.obj.body.cast(*rays, beyond_mm=_DEEPEST_MM).reshape(grid)
+        return walls
 
     # What the fingers feel ----------------------------------------------------------------------------------
 
@@ -164,7 +173,7 @@ class Pinch:
                 self.gap(finger),
                 self._pixel_mm,
                 self.sensors[finger].layer,
-                force_n=self.force_n,
+                force_n=self.grip.force_n,
                 object_modulus_mpa=self.obj.material.modulus_mpa,
                 object_poisson=self.obj.material.poisson,
                 tolerance=self.hand.tolerance,
@@ -202,7 +211,7 @@ class Pinch:
         if self.missed:
             return self.missed
         friction, weight = self.obj.material.friction, self.obj.mass_kg * GRAVITY_M_S2
-        if 2 * friction * self.force_n < self.hand.safety * weight:
+        if 2 * friction * self.grip.force_n < self.hand.safety * weight:
             return "the object is too heavy for the friction"
         a, b = self._centres["a"], self._centres["b"]
         if math.hypot(*(a - b)[1:]) > friction * abs(a[0] - b[0]):

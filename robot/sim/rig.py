@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Arm, Camera, Gripper, TactileSensor
+from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
 from robot.grasping.settings import attempt_of
@@ -25,8 +25,8 @@ from robot.sim.gel.marks import Markers
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
 from robot.sim.objects.shapes import SHAPES
-from robot.sim.pinch import PAD_MM, SIDES, Hand
-from robot.sim.scene import Grip, Scene
+from robot.sim.pinch import PAD_MM, SIDES, Grip, Hand
+from robot.sim.scene import Scene
 
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
@@ -270,18 +270,12 @@ def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
 # Devices ----------------------------------------------------------------------------------------------------
 
 
-class SimArm(Arm):
+class SimArm(VirtualDevice, Arm):
     """Goes where it is told, at once but for the clock."""
 
     def __init__(self, world: World) -> None:
         super().__init__("simulated arm", _WORKSPACE, clock=world.clock)
         self._world = world
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
-
-    def _stop(self) -> None: ...
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         before = self._world.pose.as_tuple()[:3]
@@ -293,7 +287,7 @@ class SimArm(Arm):
         return self._world.pose
 
 
-class SimGripper(Gripper):
+class SimGripper(VirtualDevice, Gripper):
     """Closes on what stands between its fingers; what it reports comes from the mechanics of the pinch."""
 
     def __init__(self, world: World) -> None:
@@ -301,12 +295,6 @@ class SimGripper(Gripper):
             "simulated gripper", stroke_mm=STROKE_MM, min_force_n=FORCE_N[0], max_force_n=FORCE_N[1], clock=world.clock
         )
         self._world = world
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
-
-    def _stop(self) -> None: ...
 
     def _settings(self) -> dict[str, Any]:
         return {"stroke_mm": STROKE_MM, "force_n": list(FORCE_N)}
@@ -337,16 +325,12 @@ class SimGripper(Gripper):
         return GripperState(pinch.closed_mm, scene.grip.force_n, "holding")
 
 
-class SimTactileSensor(TactileSensor):
+class SimTactileSensor(VirtualDevice, TactileSensor):
     """The gel of one finger: untouched, pressed, or after the lift."""
 
     def __init__(self, world: World, finger: str) -> None:
         super().__init__(f"simulated gel {finger}", finger, clock=world.clock)
         self._world = world
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
 
     def _read(self) -> Frame:
         scene = self._world.now()
@@ -354,7 +338,7 @@ class SimTactileSensor(TactileSensor):
         return Frame(scene.image(f"touch_{self.finger}{moment}"), self.clock())
 
 
-class SimCamera(Camera):
+class SimCamera(VirtualDevice, Camera):
     """Looks at the table; it knows where it stands only as well as it was calibrated."""
 
     def __init__(self, world: World, camera: PinholeCamera, error_mm: Array) -> None:
@@ -362,10 +346,6 @@ class SimCamera(Camera):
         believed[:3, 3] += error_mm
         super().__init__("simulated camera", believed, clock=world.clock)
         self._world, self._camera = world, camera
-
-    def _connect(self) -> None: ...
-
-    def _close(self) -> None: ...
 
     def _settings(self) -> dict[str, Any]:
         return {"px": self._camera.px, "focal_px": self._camera.focal_px}

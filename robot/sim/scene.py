@@ -18,24 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import SceneError
-from robot.readings import Pose
 from robot.sim import camera as cameras
 from robot.sim.camera import Lighting, PinholeCamera, Placement
 from robot.sim.gel.sensor import GelSensor
-from robot.sim.objects.draw import STROKE_MM, SimObject
-from robot.sim.pinch import SIDES, Hand, Pinch
+from robot.sim.objects.draw import SimObject
+from robot.sim.pinch import SIDES, Grip, Hand, Pinch
 
 _TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
 _MOMENTS = {"_before": 1, None: 2, "_after": 3}
-
-
-@dataclass(frozen=True)
-class Grip:
-    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger."""
-
-    pose: Pose
-    force_n: float
-    opening_mm: float = STROKE_MM
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +94,10 @@ class Scene:
         """The mechanics of the grip, each part worked out when asked for."""
         if self.grip is None:
             raise SceneError("no grip in this scene; give Scene(grip=Grip(pose, force_n))")
-        grip = self.grip
         return Pinch(
             obj=self.obj,
             placement=self.placement,
-            pose=grip.pose,
-            force_n=grip.force_n,
-            opening_mm=grip.opening_mm,
+            grip=self.grip,
             sensors=self.sensors,
             hand=self.hand,
             seed=self.seed,

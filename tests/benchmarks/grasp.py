@@ -14,8 +14,9 @@ import numpy as np
 from robot.collect import CollectSettings, collect
 from robot.readings import Pose
 from robot.rig import load_rig
+from robot.sim.pinch import Grip
 from robot.sim.rig import SimRig
-from robot.sim.scene import Grip, Scene
+from robot.sim.scene import Scene
 from tests.benchmarks.common import Line, duration
 
 FRAMES = ("", "_before", "_after")

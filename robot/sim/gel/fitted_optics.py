@@ -12,41 +12,43 @@ runs away; there every quantity is held at the limits that the fit noted.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import BadRobotInput, UnknownName
+from robot.settings import TypedSettings, build
 from robot.sim.gel.optics import Optics
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
 FORMAT = 1
 CHANNELS = 3
-PLACES = 6
 _COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach is many pixels
 
 Matrix = NDArray[np.float64]
 
 
-class FittedLimits(NamedTuple):
-    """What the fitted presses showed; everything is held inside."""
+@dataclass(frozen=True)
+class FittedLimits(TypedSettings):
+    """What the fitted presses showed; everything is held inside. steepest: of |n|, the sine of the tilt. lowest,
+    highest: of each smoothed map."""
 
-    steepest: float  # of |n|, the sine of the tilt
+    steepest: float
     left: float
     right: float
     top: float
     bottom: float
-    lowest: tuple[float, ...]  # of each smoothed map
+    lowest: tuple[float, ...]
     highest: tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class FittedOptics(Optics):
+class FittedOptics(TypedSettings, Optics):
     """A fitted sensor. `weights`: (features x places, 3) row by row; `flat`: (terms, 3) of the backdrop.
 
     Raises BadRobotInput where the sizes do not belong together, or a number is not finite.
@@ -61,6 +63,7 @@ class FittedOptics(Optics):
     limits: FittedLimits
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         wanted = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
         flat = (len(place_powers(self.flat_degree)), CHANNELS)
         if np.shape(self.weights) != wanted or np.shape(self.flat) != flat:
@@ -68,10 +71,6 @@ class FittedOptics(Optics):
                 f"weights and flat must be {wanted} and {flat} numbers for this degree, "
                 f"got {np.shape(self.weights)} and {np.shape(self.flat)}; fit again"
             )
-        limits = np.hstack(self.limits)
-        for name, numbers in (("weights", self.weights), ("flat", self.flat), ("limits", limits)):
-            if not np.isfinite(numbers).all():
-                raise BadRobotInput(f"{name} of fitted optics must be finite, got a NaN or infinite one; fit again")
 
     def backdrop(self, field: Field) -> Array:
         return _maps(self, field)[0].copy()
@@ -185,45 +184,22 @@ def optics_from_json(content: dict[str, Any]) -> FittedOptics:
     """The optics that a fitted file describes. Raises BadRobotInput for another format or missing keys."""
     if content.get("format") != FORMAT:
         raise BadRobotInput(f"a fitted sensor must have format {FORMAT}, got {content.get('format')!r}; fit again")
-    try:
-        model, limits = content["model"], content["model"]["limits"]
-        return FittedOptics(
-            degree=int(model["degree"]),
-            places=int(model["places"]),
-            reaches_mm=tuple(map(float, model["reaches_mm"])),
-            weights=_rows(model["weights"]),
-            flat_degree=int(model["flat_degree"]),
-            flat=_rows(model["flat"]),
-            limits=FittedLimits(
-                steepest=float(limits["steepest"]),
-                left=float(limits["left"]),
-                right=float(limits["right"]),
-                top=float(limits["top"]),
-                bottom=float(limits["bottom"]),
-                lowest=tuple(map(float, limits["lowest"])),
-                highest=tuple(map(float, limits["highest"])),
-            ),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadRobotInput(f"a fitted sensor lacks or garbles {error}; fit again") from error
+    model = content.get("model")
+    if not isinstance(model, dict) or not isinstance(model.get("limits"), dict):
+        raise BadRobotInput("a fitted sensor must have a model with its limits; fit again")
+    limits = build(FittedLimits, model["limits"], where="limits")
+    return build(FittedOptics, {name: value for name, value in model.items() if name != "limits"}, limits=limits)
 
 
 def optics_to_json(optics: FittedOptics) -> dict[str, Any]:
     """What optics_from_json() reads back, with six digits of each number."""
-    return {
-        "degree": optics.degree,
-        "places": optics.places,
-        "reaches_mm": list(optics.reaches_mm),
-        "weights": [[float(f"{value:.6g}") for value in row] for row in optics.weights],
-        "flat_degree": optics.flat_degree,
-        "flat": [[float(f"{value:.6g}") for value in row] for row in optics.flat],
-        "limits": {key: _short(value) for key, value in optics.limits._asdict().items()},
-    }
+    found: dict[str, Any] = _short(asdict(optics))
+    return found
 
 
 def _short(value: Any) -> Any:
-    return [float(f"{one:.6g}") for one in value] if isinstance(value, tuple) else float(f"{value:.6g}")
-
-
-def _rows(values: Any) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(map(float, row)) for row in values)
+    if isinstance(value, dict):
+        return {name: _short(each) for name, each in value.items()}
+    if isinstance(value, tuple):
+        return [_short(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

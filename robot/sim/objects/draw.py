@@ -1,7 +1,7 @@
 """Objects of the simulated rig: `draw_object(seed, index)` gives the same one wherever it is called.
 
 Four separate streams of numbers draw the shape, the relief, the material and the looks, so that neither colour nor
-paint says anything about what touch can feel. Families and reliefs are dealt like cards: within one deck (as many
+paint says anything about what touch can feel. Families and reliefs come like cards: within one deck (as many
 objects as there are families) each comes once, in an order of its own.
 """
 
@@ -55,8 +55,8 @@ def draw_object(seed: int, index: int, *, family: str | None = None, relief: str
     for name, value in (("seed", seed), ("index", index)):
         if not isinstance(value, int | np.integer) or value < 0:
             raise RobotConfigError(f"{name} must be a whole number from 0, got {value!r}")
-    chosen = _dealt(SHAPES, family, "family", seed, index, _FAMILY_DECK)
-    worn = _dealt(RELIEFS, relief, "relief", seed, index, _RELIEF_DECK)
+    chosen = _named_or_next(SHAPES, family, "family", seed, index, _FAMILY_DECK)
+    worn = _named_or_next(RELIEFS, relief, "relief", seed, index, _RELIEF_DECK)
     shape = SHAPES[chosen](np.random.default_rng([seed, index, _SHAPE]))
     pattern = draw_relief(worn, np.random.default_rng([seed, index, _RELIEF]), shape.relief_limit_mm)
     return SimObject(
@@ -69,7 +69,7 @@ def draw_object(seed: int, index: int, *, family: str | None = None, relief: str
     )
 
 
-def _dealt(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
+def _named_or_next(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
     """The name asked for, or the next card of the deck."""
     if name is None:
         deck, place = divmod(index, len(table))
