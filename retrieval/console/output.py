@@ -57,13 +57,12 @@ def say(text: str) -> None:
 
 def printable(text: str) -> str:
     """`text` on one line, with escapes for everything that would not be seen as it is."""
-    return text if text.isprintable() else "".join(map(_seen, text))
-
-
-def _seen(character: str) -> str:
-    if character.isprintable() or unicodedata.category(character) == "Zs":  # spaces of any width
-        return character
-    return character.encode("unicode_escape").decode()
+    return "".join(
+        character
+        if character.isprintable() or unicodedata.category(character) == "Zs"  # spaces of any width
+        else character.encode("unicode_escape").decode()
+        for character in text
+    )
 
 
 class PrintableFormatter(logging.Formatter):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from indexes.store.files import write_atomically
@@ -95,15 +94,10 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
         agg: Any = FigureCanvasAgg(make(*arguments))
         agg.draw()
-    _write(path, np.asarray(agg.buffer_rgba()))
-    return path
-
-
-def _write(path: Path, samples: NDArray[np.uint8]) -> None:
-    """A plot has few colours: 256 of its own make the file three times smaller."""
-    image, data = Image.fromarray(np.ascontiguousarray(samples[..., :3])), io.BytesIO()
+    image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
     if path.suffix == ".jpg":
         image.save(data, "JPEG", quality=86)
-    else:
+    else:  # a plot has few colours: 256 of its own make the file three times smaller
         image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     write_atomically(path, data.getvalue())
+    return path

@@ -13,8 +13,7 @@ from typing import Any, ClassVar
 from PIL import Image
 
 from retrieval.report.canvas import FIGURE_DPI
-from retrieval.report.pictures import data_uri
-from retrieval.report.templates import render
+from retrieval.report.pages import data_uri, render
 
 _PAGE_DPI = 96
 
@@ -107,11 +106,10 @@ def to_html(document: Document, folder: Path) -> str:
         with Image.open(folder / file) as image:
             return round(image.width * _PAGE_DPI / FIGURE_DPI)
 
-    return render("evaluation.html", document=document, uri=uri, width=width, anchor=_anchor)
+    def anchor(title: str) -> str:
+        return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
-
-def _anchor(title: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+    return render("evaluation.html", document=document, uri=uri, width=width, anchor=anchor)
 
 
 # Markdown --------------------------------------------------------------------------------------------
@@ -130,37 +128,21 @@ def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
         if isinstance(block, Details):
             yield f"{'#' * level} {_plain(block.title)}"
             yield from _blocks(block.blocks, level + 1)
+        elif isinstance(block, Text):
+            yield f"> {_plain(block.text)}" if block.warn else _plain(block.text)
+        elif isinstance(block, Listing):
+            yield "\n".join(f"    {line}" for line in block.text.splitlines())
+        elif isinstance(block, Picture):
+            yield f"![{_plain(block.alt)}]({block.file})"
+            yield _plain(block.caption)
         else:
-            yield from _block(block)
-
-
-def _block(block: Text | Listing | Table | Picture) -> Iterator[str]:
-    if isinstance(block, Text):
-        yield f"> {_plain(block.text)}" if block.warn else _plain(block.text)
-    elif isinstance(block, Listing):
-        yield "\n".join(f"    {line}" for line in block.text.splitlines())
-    elif isinstance(block, Picture):
-        yield f"![{_plain(block.alt)}]({block.file})"
-        yield _plain(block.caption)
-    else:
-        yield _table(block)
-        yield from (_plain(note) for note in block.notes)
-
-
-def _table(table: Table) -> str:
-    lines = [_row(table.header), _row(tuple(_line(column in table.words | {0}) for column in range(len(table.header))))]
-    for number, row in enumerate(table.rows):
-        marked = [(_plain(cell), (number, column) in table.bold) for column, cell in enumerate(row)]
-        lines.append(_row(tuple(f"**{text}**" if bold else text for text, bold in marked)))
-    return "\n".join(lines)
-
-
-def _line(words: bool) -> str:
-    return "---" if words else "---:"
-
-
-def _row(cells: tuple[str, ...]) -> str:
-    return f"| {' | '.join(cells)} |"
+            ruler = ["---" if column in block.words | {0} else "---:" for column in range(len(block.header))]
+            lines = [block.header, ruler]
+            for number, row in enumerate(block.rows):
+                marked = [(_plain(cell), (number, column) in block.bold) for column, cell in enumerate(row)]
+                lines.append([f"**{text}**" if bold else text for text, bold in marked])
+            yield "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+            yield from map(_plain, block.notes)
 
 
 def _plain(text: str) -> str:

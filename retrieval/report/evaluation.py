@@ -45,18 +45,16 @@ def write_report(out: Path, recording: Path | None) -> list[Path]:
     results = read_results(out)
     grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}
     builder = Builder(results, grasps, out)
-    document = _document(builder)
+    sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
+    document = Document(
+        f"Which object was touched? Evaluation on {results.data['recording']['path_name']}",
+        tuple(_lead(builder)),
+        tuple(section for section in sections if section.blocks),
+    )
     text, page = out / "report.md", out / "report.html"
     write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
     write_output(page, text_bytes(to_html(document, out)), PAGE)
     return [text, page, *builder.figures]
-
-
-def _document(builder: Builder) -> Document:
-    """The whole report; a section without anything to show is left out."""
-    sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
-    title = f"Which object was touched? Evaluation on {builder.results.data['recording']['path_name']}"
-    return Document(title, tuple(_lead(builder)), tuple(section for section in sections if section.blocks))
 
 
 def _lead(builder: Builder) -> Iterator[Block]:
@@ -67,15 +65,6 @@ def _lead(builder: Builder) -> Iterator[Block]:
         f"Fitted on {len(parts['train'])} objects, chosen and calibrated on {len(parts['validation'])}, judged on "
         f"{len(parts['test'])} that nothing has seen. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
     )
-    yield Text(_headline(builder))
-    if audit := data.get("audit"):
-        yield Text(f"Leakage audit: {audit['verdict']}", warn=not audit["clean"])
-    if builder.results.simulated:
-        yield Text(SIMULATION)
-    yield Text(PAPER)
-
-
-def _headline(builder: Builder) -> str:
     keys = ("pair_accuracy", "guesses_k5", "guesses_k5_g5_p3")
     found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]
     told = [
@@ -83,7 +72,12 @@ def _headline(builder: Builder) -> str:
         for key, summary in found
     ]
     text = f"{at_start(method_label(builder.main))} on unseen objects, in percent. {at_start('; '.join(told))}."
-    return f"{text} {FEW_MEANS}" if FEW in text else text
+    yield Text(f"{text} {FEW_MEANS}" if FEW in text else text)
+    if audit := data.get("audit"):
+        yield Text(f"Leakage audit: {audit['verdict']}", warn=not audit["clean"])
+    if builder.results.simulated:
+        yield Text(SIMULATION)
+    yield Text(PAPER)
 
 
 def _setting(builder: Builder) -> Iterator[Block | None]:

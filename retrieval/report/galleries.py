@@ -10,7 +10,7 @@ from typing import Any
 
 from retrieval.data.dataset import Grasp
 from retrieval.report.canvas import Axes, Figure, canvas
-from retrieval.report.pictures import thumbnail
+from retrieval.report.pages import thumbnail
 from retrieval.report.results import number, percent, short
 
 _TILE_PX = 150
@@ -32,20 +32,16 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
         panel.text(column + 0.46, -0.12, f"finger {ascii_lowercase[column]}", ha="center", fontsize=8)
     panel.text(fingers + 0.35, -0.12, "photos, most likely first", fontsize=8)
     for row, query in enumerate(queries):
-        _example(panel, 1.4 * row, query, grasps, fingers)
+        top, own = 1.4 * row, grasps.get(query["grasp_id"])
+        for column in range(fingers):
+            _tile(panel, column, top, own.touches[column] if own else None)
+        _label(panel, 0, top, f"{short(query['object_id'], 2 * _LETTERS + 4)}\nrank {number(query['true_rank'])}")
+        for place, name in enumerate(query["ranked"]):
+            shown, left = grasps.get(name), fingers + 0.35 + place
+            right = shown is not None and shown.object_id == query["object_id"]
+            _tile(panel, left, top, shown.photo if shown else None, _RIGHT if right else _LINE, 3 if right else 0.8)
+            _label(panel, left, top, f"{place + 1}. {_two_lines(shown.object_id if shown else name)}")
     return figure
-
-
-def _example(panel: Axes, top: float, query: Any, grasps: Grasps, fingers: int) -> None:
-    own = grasps.get(query["grasp_id"])
-    for column in range(fingers):
-        _tile(panel, column, top, own.touches[column] if own else None)
-    _label(panel, 0, top, f"{short(query['object_id'], 2 * _LETTERS + 4)}\nrank {number(query['true_rank'])}")
-    for place, name in enumerate(query["ranked"]):
-        shown, left = grasps.get(name), fingers + 0.35 + place
-        right = shown is not None and shown.object_id == query["object_id"]
-        _tile(panel, left, top, shown.photo if shown else None, _RIGHT if right else _LINE, 3 if right else 0.8)
-        _label(panel, left, top, f"{place + 1}. {_two_lines(shown.object_id if shown else name)}")
 
 
 def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
@@ -79,14 +75,12 @@ def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
             left, top = 2.35 * column, 1.5 * row
             panel.text(left, top - 0.05, f"{kind}: distance {pair['distance']:.2f}", fontsize=8)
             for side, part in enumerate(("test", "seen")):
-                grasp = grasps.get(pair[part])
-                _tile(panel, left + side, top, _frame(grasp, kind) if grasp else None)
+                grasp, path = grasps.get(pair[part]), None
+                if grasp is not None:
+                    path = grasp.photo if kind == "photo" else grasp.touches[ascii_lowercase.index(kind[-1])]
+                _tile(panel, left + side, top, path)
                 _label(panel, left + side, top, f"{part}: {_two_lines(grasp.object_id if grasp else pair[part], 6)}")
     return figure
-
-
-def _frame(grasp: Grasp, kind: str) -> Path:
-    return grasp.photo if kind == "photo" else grasp.touches[ascii_lowercase.index(kind[-1])]
 
 
 # Tiles -----------------------------------------------------------------------------------------------

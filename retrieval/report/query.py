@@ -2,10 +2,8 @@
 
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any
 
-from retrieval.report.pictures import data_uri, jpeg, thumbnail
-from retrieval.report.templates import render
+from retrieval.report.pages import data_uri, jpeg, render, thumbnail
 from retrieval.search.answer import QueryResult
 
 _THUMBNAIL_PX = 320
@@ -23,9 +21,7 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
         ]
         for paths in result.touches
     ]
-    matches: list[dict[str, Any]] = [
-        {**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results
-    ]
+    matches = [{**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results]
     return render("query.html", result=result, touches=touches, matches=matches)
 
 

@@ -1,7 +1,7 @@
 """Results for people, as tables on stdout: drawn on a terminal, plain lines that nothing cuts where they are piped."""
 
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from retrieval.console.output import printable, printing, show
@@ -48,25 +48,13 @@ def print_measures(results: "Results") -> None:
 def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
     """Print a table of text. words: columns of names, set to the left; numbers are set to the right."""
     seen = [[printable(cell) for cell in row] for row in rows]
-    if sys.stdout.isatty():
-        with printing():
-            _draw(title, header, seen, words)
+    if not sys.stdout.isatty():
+        widths = [max(map(len, column)) for column in zip(header, *seen, strict=True)]
+        for row in (header, *seen):
+            cells = enumerate(zip(row, widths, strict=True))
+            aligned = [cell.ljust(width) if at in words else cell.rjust(width) for at, (cell, width) in cells]
+            show("  ".join(aligned).rstrip())
         return
-    for line in aligned([header, *seen], words):
-        show(line)
-
-
-def aligned(rows: Sequence[Sequence[str]], words: Collection[int]) -> Iterator[str]:
-    """Lines of cells in columns two spaces apart, as wide as they are."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = zip(row, widths, strict=True)
-        yield "  ".join(
-            cell.ljust(width) if column in words else cell.rjust(width) for column, (cell, width) in enumerate(cells)
-        ).rstrip()
-
-
-def _draw(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -75,6 +63,7 @@ def _draw(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], word
     for column, name in enumerate(header):
         # Names are the answer: folded where they are long, never cut.
         table.add_column(name, justify="left" if column in words else "right", overflow="fold")
-    for row in rows:
+    for row in seen:
         table.add_row(*map(Text, row))  # as Text: a name may hold what rich takes for markup, such as "[bold]"
-    Console().print(table)
+    with printing():
+        Console().print(table)

@@ -1,9 +1,12 @@
-"""Thumbnails of image files, and images inside a page."""
+"""What pages are made of: the package's templates, thumbnails of image files, and images inside a page."""
 
 import base64
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,13 @@ from retrieval.errors import ImageError
 
 Thumbnail = NDArray[np.uint8]
 """(H, W, 3) red first."""
+
+
+def render(name: str, **values: Any) -> str:
+    """The template `name` with these values, whose text is escaped."""
+    source = (resources.files("retrieval") / "templates" / name).read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(source).render(**values)
 
 
 def thumbnail(path: Path, px: int) -> Thumbnail | None:
