@@ -430,7 +430,7 @@ def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch)
     monkeypatch.setattr("os.fsync", lambda fd: (events.append("fsync"), fsync(fd))[1])
     monkeypatch.setattr(Path, "replace", lambda one, two: (events.append(f"to {two.name}"), replace(one, two))[1])
     save(tmp_path / "m.safetensors")
-    assert events == ["fsync", "to m.safetensors", "fsync", "to m.md"]
+    assert events == ["fsync", "to m.safetensors", "fsync", "fsync", "to m.md", "fsync"]  # each file, then its folder
 
 
 # No pickle -------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from indexes import KINDS
 from retrieval.commands.options import Json, Model
 from retrieval.console.output import print_json, say
 from retrieval.errors import RetrievalError
@@ -26,7 +27,7 @@ def build_index(
     out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
     kind: Annotated[
         str | None,
-        typer.Option(help="candidate index (default: exact, unless a bound asks for more); see docs/catalogue.md"),
+        typer.Option(help=f"candidate index: {', '.join(KINDS)} (default: exact, unless a bound asks for more)"),
     ] = None,
     min_recall: Annotated[
         float | None,
