@@ -127,7 +127,7 @@ def collect(
 
 def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
     """recording.json: the rig's own, and all that a collection depends on."""
-    said = {
+    info = {
         **rig.info,
         "seed": seed,
         "background": "before each grasp" if settings.attempt and "before" in settings.attempt.outputs else "none",
@@ -135,7 +135,7 @@ def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dic
         "collection": {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit},
     }
     try:
-        return dict(json.loads(json.dumps(said, allow_nan=False)))
+        return dict(json.loads(json.dumps(info, allow_nan=False)))
     except (TypeError, ValueError) as error:
         raise RobotConfigError(f"what the rig says of itself must be plain JSON: {error}") from error
 
@@ -240,15 +240,14 @@ class _Collection:
         self.tallies[attempt.object_id].add(logged)
 
     def _judged(self, attempt: GraspAttempt) -> LoggedAttempt:
-        said = functools.partial(
+        logged = functools.partial(
             LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
         )
         if attempt.outcome == "no_plan":
-            return said(accepted=False, reason=attempt.reason)
+            return logged(accepted=False, reason=attempt.reason)
         accepted, score = judge(self.gate, frames_of(attempt.images))
-        return said(
-            accepted=accepted, grasp_id=name_of(attempt.object_id, attempt.number), score=score, fit=attempt.fit
-        )
+        grasp_id = name_of(attempt.object_id, attempt.number)
+        return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
     def _settled(self) -> int:
         wanted = self.settings.grasps
@@ -299,13 +298,9 @@ def frames_of(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
     moments: dict[str, dict[str, npt.NDArray[np.uint8]]] = defaultdict(dict)
     for column, data in images.items():
         if match := _TOUCH.fullmatch(column):
-            moments[match[1]][(match[2] or "_during")[1:]] = _decoded(data)
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            assert pixels is not None, "it was encoded by robot.grasping.attempt"
+            moments[match[1]][(match[2] or "_during")[1:]] = np.ascontiguousarray(pixels[..., ::-1])
     return {
         finger: GraspFrames(each.get("before"), each["during"], each.get("after")) for finger, each in moments.items()
     }
-
-
-def _decoded(data: bytes) -> npt.NDArray[np.uint8]:
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert pixels is not None, "it was encoded by robot.grasping.attempt"
-    return np.ascontiguousarray(pixels[..., ::-1])

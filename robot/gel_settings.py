@@ -27,7 +27,7 @@ class GelSettings(TypedSettings):
         """What was said, by name."""
         return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
-    def said(self) -> dict[str, float | str]:
+    def as_recorded(self) -> dict[str, float | str]:
         """As in recording.json, where what is not known is "unknown"."""
         return {**dict.fromkeys(asdict(self), UNKNOWN), **self.known()}
 

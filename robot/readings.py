@@ -11,6 +11,7 @@ import numpy.typing as npt
 from robot.errors import DeviceError, RobotConfigError
 
 Status = Literal["idle", "moving", "holding", "no_part", "part_lost"]
+_MOST_PX = 1e6
 STATUSES: tuple[Status, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
 
 
@@ -76,9 +77,12 @@ class Intrinsics:
     cy: float
 
     def __post_init__(self) -> None:
-        """Raises DeviceError for focal lengths that are not above 0, or numbers that are not finite."""
-        if not (0 < self.fx < math.inf and 0 < self.fy < math.inf and math.isfinite(self.cx + self.cy)):
-            raise DeviceError(f"intrinsics must be finite, with focal lengths above 0 pixels, got {self}")
+        """Raises DeviceError for focal lengths that are not above 0, or numbers that no camera has."""
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MOST_PX for each in numbers)):  # also refuses NaN
+            raise DeviceError(
+                f"intrinsics must be finite, up to a million pixels, with focal lengths above 0, got {self}"
+            )
 
 
 @dataclass(frozen=True, eq=False)

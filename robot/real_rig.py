@@ -157,7 +157,11 @@ class RealRig(Rig):
             load_driver("gripper", gripper, "[gripper]", **closing, **state_age),
             _sensors(sensors),
             _camera(camera),
-            info={"source": source, "sensor": sensor, "gels": [{finger: gels[finger].said() for finger in gels}]},
+            info={
+                "source": source,
+                "sensor": sensor,
+                "gels": [{finger: gels[finger].as_recorded() for finger in gels}],
+            },
             attempt=_attempt(attempt, grasp, ceilings),
             given=build(GivenObject, object, where="[object]").fit() if object else None,
         )

@@ -4,7 +4,8 @@ A device that fails does not keep the others from being checked. Nothing is gras
 rises by `ARM_MM`, and both come back.
 """
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
@@ -39,9 +40,9 @@ class Checked:
 
     def line(self) -> str:
         """The row of the table."""
-        said = self.failure or ", ".join(f"{name} {value}" for name, value in self.measured.items())
+        result = self.failure or ", ".join(f"{name} {value}" for name, value in self.measured.items())
         refused = "".join(f"; refused {name}: {value}" for name, value in self.refused.items())
-        return f"{'ok  ' if self.failure is None else 'FAIL'}  {self.role:9} {self.device}: {said}{refused}"
+        return f"{'ok  ' if self.failure is None else 'FAIL'}  {self.role:9} {self.device}: {result}{refused}"
 
 
 def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
@@ -52,20 +53,23 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
     rig.arm.may_move = rig.gripper.may_move = motion
     if rig.can_run_jobs:  # simulated: an object can be had for nothing, and without one its gels see nothing
         rig.prepare(rig.object_ids(1)[0], 0)
-    yield _checked(rig.arm, "arm", lambda: _check_arm(rig, motion))
-    yield _checked(rig.gripper, "gripper", lambda: _check_gripper(rig, motion))
+    yield _checked([rig.arm], "arm", lambda: _check_arm(rig, motion))
+    yield _checked([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
     for sensor in rig.sensors.values():
-        yield _checked(sensor, "gel", partial(_check_sensor, rig, sensor))
-    yield _checked(rig.camera, "camera", lambda: _check_camera(rig))
+        yield _checked([sensor], "gel", partial(_check_sensor, rig, sensor))
+    yield _checked([rig.camera], "camera", lambda: _check_camera(rig))
     if len(rig.sensors) > 1:
-        yield _check_skew(rig)
+        yield _checked(list(rig.sensors.values()), "skew", lambda: _check_skew(rig))
 
 
-def _checked(device: Device, role: str, check: Callable[[], dict[str, str]]) -> Checked:
-    row = Checked(device.name, role)
+def _checked(devices: Sequence[Device], role: str, check: Callable[[], dict[str, str]]) -> Checked:
+    row = Checked(" and ".join(device.name for device in devices), role)
     try:
-        with device:
-            row = replace(row, measured=check(), refused=dict(device.refused))
+        with contextlib.ExitStack() as connected:
+            for device in devices:
+                connected.enter_context(device)
+            refused = dict(devices[0].refused) if len(devices) == 1 else {}
+            row = replace(row, measured=check(), refused=refused)
     except RobotError as error:  # also what wants a person where there is no terminal
         return replace(row, failure=str(error))
     return row
@@ -92,16 +96,16 @@ def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
 def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
     gripper = rig.gripper
     state = gripper.state()
-    said = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"} | _round_trip(rig, gripper.state)
-    said["force"] = f"{gripper.min_force_n:g} to {gripper.max_force_n:g} N on each finger"
+    measured = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"} | _round_trip(rig, gripper.state)
+    measured["force"] = f"{gripper.min_force_n:g} to {gripper.max_force_n:g} N on each finger"
     if motion and state.status == "idle":
         there = state.opening_mm - JAW_MM if state.opening_mm >= JAW_MM else state.opening_mm + JAW_MM
         reached = gripper.open(there)
         gripper.open(min(state.opening_mm, gripper.stroke_mm))
-        said["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - there):.2f} mm"
+        measured["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - there):.2f} mm"
     elif motion:
-        said["moved"] = f"not: it is {state.status}"
-    return said
+        measured["moved"] = f"not: it is {state.status}"
+    return measured
 
 
 def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
@@ -114,19 +118,19 @@ def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
 
 
 def _check_sensor(rig: Rig, sensor: TactileSensor) -> dict[str, str]:
-    frame, said = _watched(rig, sensor.read)
-    return said | _size(frame.pixels)
+    frame, measured = _watched(rig, sensor.read)
+    return measured | _size(frame.pixels)
 
 
 def _check_camera(rig: Rig) -> dict[str, str]:
     camera = rig.camera
-    image, said = _watched(rig, lambda: camera.read(depth=camera.has_depth))
-    said |= _size(image.colour)
+    image, measured = _watched(rig, lambda: camera.read(depth=camera.has_depth))
+    measured |= _size(image.colour)
     if image.depth_m is not None:
         known = np.isfinite(image.depth_m)
         middle = f", median {np.nanmedian(image.depth_m):.3f} m" if known.any() else ""
-        said["depth known"] = f"{known.mean():.0%} of the pixels{middle}"
-    return said
+        measured["depth known"] = f"{known.mean():.0%} of the pixels{middle}"
+    return measured
 
 
 def _size(pixels: npt.NDArray[np.uint8]) -> dict[str, str]:
@@ -144,31 +148,18 @@ def _watched(rig: Rig, read: Callable[[], _Seen]) -> tuple[_Seen, dict[str, str]
         times.add(frame.time_s)
         ages.append(rig.clock() - frame.time_s)
         if rig.clock() - began >= WATCHED_S:
-            return frame, {"rate": _rate(sorted(times)), "age": f"{1000 * median(ages):.0f} ms"}
+            break
         rig.sleep(_POLL_S)
+    rate = f"{len(times)} frame(s) in {WATCHED_S:g} s"
+    if len(times) > 1:  # from the first to the last, so that where the watch began and ended does not count
+        rate = f"{(len(times) - 1) / (max(times) - min(times)):.1f} frames/s"
+    return frame, {"rate": rate, "age": f"{1000 * median(ages):.0f} ms"}
 
 
-def _rate(times: list[float]) -> str:
-    """From the first frame to the last, so that where the watch began and ended does not count."""
-    if len(times) < 2:
-        return f"{len(times)} frame(s) in {WATCHED_S:g} s"
-    return f"{(len(times) - 1) / (times[-1] - times[0]):.1f} frames/s"
-
-
-def _check_skew(rig: Rig) -> Checked:
-    """Both gels at once, as the collector reads them."""
-    row, connected = Checked(" and ".join(sensor.name for sensor in rig.sensors.values()), "skew"), []
-    try:
-        for sensor in rig.sensors.values():
-            sensor.connect()
-            connected.append(sensor)
-        skews = []
-        for _ in range(_ASKED):
-            skews.append(read_together(rig.sensors)[1])
-            rig.sleep(0.05)
-    except RobotError as error:
-        return replace(row, failure=str(error))
-    finally:
-        for sensor in connected:
-            sensor.close()
-    return replace(row, measured={"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"})
+def _check_skew(rig: Rig) -> dict[str, str]:
+    """All gels at once, as the collector reads them."""
+    skews = []
+    for _ in range(_ASKED):
+        skews.append(read_together(rig.sensors)[1])
+        rig.sleep(0.05)
+    return {"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"}

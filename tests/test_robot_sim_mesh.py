@@ -62,7 +62,7 @@ def ply(path, vertices, faces):
 @pytest.fixture
 def ball(tmp_path):
     vertices, faces = sphere()
-    return load_mesh_object(stl(tmp_path / "ball.stl", 30 * vertices, faces), 0, relief="smooth", scale_to_mm=1)
+    return load_mesh_object(stl(tmp_path / "ball.stl", 30 * vertices, faces), 0, relief="smooth")
 
 
 # Reading ---------------------------------------------------------------------------------------------------
@@ -77,18 +77,9 @@ def test_a_cube_stands_on_the_table_in_every_format(tmp_path, write, name):
     assert len(item.body.mesh.vertices) == 8
 
 
-def test_small_numbers_are_metres_and_a_scale_overrules_that(tmp_path):
+def test_small_numbers_are_metres(tmp_path):
     path = obj(tmp_path / "cube.obj", 0.02 * CORNERS, CUBE)
     assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
-    inches = obj(tmp_path / "inches.obj", CORNERS, CUBE)
-    assert load_mesh_object(inches, 0, scale_to_mm=25.4).body.mesh.vertices[:, 2].max() == pytest.approx(50.8)
-
-
-def test_the_upward_axis_can_be_y(tmp_path):
-    path = obj(tmp_path / "bar.obj", CORNERS * [10, 40, 20], CUBE)
-    item = load_mesh_object(path, 0, relief="smooth", up="y")
-    np.testing.assert_allclose(item.body.upper - item.body.lower, [20, 40, 80])
-    assert item.body.mesh.volume_mm3 > 0
 
 
 def test_faces_that_look_inwards_are_turned(tmp_path):
@@ -180,11 +171,6 @@ def test_other_kinds_missing_files_and_wrong_settings_are_refused(tmp_path):
         load_mesh_object(tmp_path / "cube.glb", 0)
     with pytest.raises(SceneError, match="No such file"):
         load_mesh_object(tmp_path / "none.stl", 0)
-    for scale in (0, -1, np.nan, np.inf):
-        with pytest.raises(SceneError, match="scale_to_mm must be"):
-            load_mesh_object(path, 0, scale_to_mm=scale)
-    with pytest.raises(SceneError, match='"z" or "y"'):
-        load_mesh_object(path, 0, up="x")
     with pytest.raises(UnknownName, match="knurl"):
         load_mesh_object(path, 0, relief="fur")
 
@@ -238,8 +224,8 @@ def test_a_cube_keeps_its_edges_and_faces(tmp_path):
 def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
     vertices, faces = sphere()
     path = stl(tmp_path / "ball.stl", 30 * vertices, faces)
-    worn = load_mesh_object(path, 1, relief="ribs", scale_to_mm=1).body
-    bare = load_mesh_object(path, 1, relief="smooth", scale_to_mm=1).body
+    worn = load_mesh_object(path, 1, relief="ribs").body
+    bare = load_mesh_object(path, 1, relief="smooth").body
     z = np.linspace(24, 36, 300)
     x = np.linspace(-6, 6, 300)
     origins = np.concatenate([np.stack([0 * z, 0 * z - 60, z], 1), np.stack([x, 0 * x - 60, 0 * x + 30], 1)])

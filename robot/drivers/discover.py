@@ -145,8 +145,8 @@ def find_kinects() -> list[Found]:
 
 def _not_loaded(camera: str, package: str, error: ImportError) -> list[Found]:
     """Nothing; said aloud where the package is installed and the system lacks what it needs."""
-    if said := missing_library(package, error):
-        log.warning("%s cameras could not be listed: that needs %s", camera, said)
+    if need := missing_library(package, error):
+        log.warning("%s cameras could not be listed: that needs %s", camera, need)
     return []
 
 

@@ -25,6 +25,7 @@ from robot.drivers.video.rectify import CutSettings, in_rgb, make_rectifier
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording.folder import INFO_FILE, read_recording
+from robot.settings import build
 from robot.storage import object_of
 
 _KEPT = 8
@@ -33,7 +34,6 @@ LEAST_HZ = 10.0
 """So often a sensor shows a picture at least: 0.1 s is well below the age at which one is refused."""
 
 _FPS = (0.01, 1000.0)
-_MOST_PX = 1e6
 INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
 
 
@@ -213,13 +213,12 @@ class ReplayCamera(Camera):
         """Raises RobotConfigError for fx, fy, cx and cy that are not all given, or out of range; opens nothing."""
         super().__init__("replay camera", extrinsics, clock=clock)
         self.path = Path(path)
-        lens = [each for each in (fx, fy, cx, cy) if each is not None]
-        if lens and (len(lens) != 4 or not _is_lens(*lens)):
-            raise RobotConfigError(
-                "fx, fy, cx and cy must be given together, in pixels up to a million, fx and fy above 0, "
-                f"got {fx}, {fy}, {cx}, {cy}"
-            )
-        self._given = Intrinsics(*lens) if lens else None
+        lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        given = {name: value for name, value in lens.items() if value is not None}
+        try:
+            self._given = build(Intrinsics, given) if given else None
+        except (RobotConfigError, DeviceError) as error:
+            raise RobotConfigError(f"fx, fy, cx and cy must be given together, in pixels: {error}") from error
         self._intrinsics: Intrinsics | None = None
         self._pairs: list[_Pair] = []
         self._next = 0
@@ -253,10 +252,6 @@ class ReplayCamera(Camera):
         return RGBD(colour, depth_m, self._intrinsics, self.clock())
 
 
-def _is_lens(fx: float, fy: float, cx: float, cy: float) -> bool:
-    return min(fx, fy) > 0 and all(abs(each) <= _MOST_PX for each in (fx, fy, cx, cy))  # the latter refuses NaN
-
-
 def _recorded_pairs(folder: Path) -> list[_Pair]:
     try:
         grasps = read_recording(folder).grasps
@@ -276,17 +271,9 @@ def _intrinsics(path: Path) -> Intrinsics | None:
     if not path.is_file():
         return None
     try:
-        found = object_of(path.read_bytes(), RecordingError)
-    except RecordingError as error:
-        raise DeviceError(f"{path}: {error}") from error
-    names = ("fx", "fy", "cx", "cy")
-    lens: list[Any] = [value for name in names if type(value := found.get(name)) in (int, float)]
-    if len(found) != 4 or len(lens) != 4 or not _is_lens(*lens):
-        raise DeviceError(
-            f"{path} must hold fx, fy, cx and cy in pixels up to a million, fx and fy above 0, and nothing else, "
-            f"got {found}"
-        )
-    return Intrinsics(*map(float, lens))
+        return build(Intrinsics, object_of(path.read_bytes(), RobotConfigError))
+    except (RobotConfigError, DeviceError) as error:
+        raise DeviceError(f"{path} must hold fx, fy, cx and cy in pixels, and nothing else: {error}") from error
 
 
 def _depth_m(path: Path) -> npt.NDArray[np.float32]:

@@ -27,8 +27,8 @@ def load(package: str, device: str, install: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        said = missing_library(package, error) or f"{package}, which is missing; {install}"
-        raise DeviceError(f"{device} needs {said}") from error
+        need = missing_library(package, error) or f"{package}, which is missing; {install}"
+        raise DeviceError(f"{device} needs {need}") from error
 
 
 def missing_library(package: str, error: ImportError) -> str | None:

@@ -117,10 +117,10 @@ class SimRig(Rig):
         self._hand = Hand(grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
         dots = Markers() if markers else None
-        said = gels_of(gel, fingers)
+        known = gels_of(gel, fingers)
         self._gels = [
             {
-                finger: replace(draw_sensor(int(pair), finger, optics=optics, gel=said[finger]), markers=dots)
+                finger: replace(draw_sensor(int(pair), finger, optics=optics, gel=known[finger]), markers=dots)
                 for finger in fingers
             }
             for pair in drawn
@@ -138,7 +138,7 @@ class SimRig(Rig):
                 "sensor": f"simulated GelSight ({optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
-                "gels": [{finger: pair[finger].gel.said() for finger in sorted(pair)} for pair in self._gels],
+                "gels": [{finger: pair[finger].gel.as_recorded() for finger in sorted(pair)} for pair in self._gels],
                 **({"meshes_sha256": _mesh_digest(meshes)} if meshes else {}),
             },
             clock=clock,

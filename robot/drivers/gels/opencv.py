@@ -37,17 +37,17 @@ class OpencvTactile(TactileSensor):
     def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range or a calibration file that is none; touches no device."""
         super().__init__(f"gel {finger}", finger, clock=clock)
-        said, preset = GelCameraSettings(**settings), self.PRESET
-        size = said if said.width or said.height else preset
+        asked, preset = GelCameraSettings(**settings), self.PRESET
+        size = asked if asked.width or asked.height else preset
         self._asked = replace(
-            said,
+            asked,
             width=size.width,
             height=size.height,
-            fps=said.fps or preset.fps,
-            fourcc=said.fourcc or preset.fourcc,
-            led=said.led or preset.led,
+            fps=asked.fps or preset.fps,
+            fourcc=asked.fourcc or preset.fourcc,
+            led=asked.led or preset.led,
         )
-        self._rectifier = make_rectifier(said, self.CROP)
+        self._rectifier = make_rectifier(asked, self.CROP)
         self._reader = CaptureReader(self, self._asked)
         self._picture_px: list[int] = []
 

@@ -337,24 +337,21 @@ class EmulatedWSG50:
 
     def _set_acceleration(self, payload: bytes) -> Answer:
         (value,) = struct.unpack("<f", payload)
-        if refused := self._unsettable(ACCELERATIONS[0] <= value <= ACCELERATIONS[1]):
-            return refused
-        self._jaws.acceleration_mm_s2 = value
-        return OK
+        if not (refused := self._unsettable(ACCELERATIONS[0] <= value <= ACCELERATIONS[1])):
+            self._jaws.acceleration_mm_s2 = value
+        return refused
 
     def _set_force(self, payload: bytes) -> Answer:
         (value,) = struct.unpack("<f", payload)
-        if refused := self._unsettable(FORCES[0] <= value <= FORCES[1]):
-            return refused
-        self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
-        return OK
+        if not (refused := self._unsettable(FORCES[0] <= value <= FORCES[1])):
+            self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
+        return refused
 
     def _set_soft_limits(self, payload: bytes) -> Answer:
         low, high = struct.unpack("<ff", payload)
-        if refused := self._unsettable(0 <= low < high <= STROKE_MM):
-            return refused
-        self.soft_limits = low, high
-        return OK
+        if not (refused := self._unsettable(0 <= low < high <= STROKE_MM)):
+            self.soft_limits = low, high
+        return refused
 
     def _unsettable(self, in_range: bool) -> int:
         """Changing parameters while it moves raises a FAST STOP."""

@@ -32,7 +32,6 @@ THINNEST_MM = 2.0
 _METRES_BELOW = 2.0
 _CREASE_COSINE = 0.77
 _BACK_MM = 1.0
-_UP = {"z": (0, 1, 2), "y": (0, 2, 1)}
 Faces = NDArray[np.int64]
 
 
@@ -230,17 +229,15 @@ def load_mesh_object(
     *,
     relief: str | None = None,
     material: str | None = None,
-    scale_to_mm: float | None = None,
-    up: str = "z",
 ) -> SimObject:
     """Read a mesh, stand it on the table and give it relief, material and looks drawn from `seed` and its name.
 
-    `scale_to_mm`: mm per unit of the file. None: 1000 (metres) if its largest extent is below 2 units, else 1 (mm).
-    `up`: the file's upward axis, "z" or "y". Raises SceneError for a file that is no closed solid of a size that
-    the gripper (110 mm) can close on, UnknownName, and SceneError naming the extra where its packages are missing.
+    The file's z axis points up, and its unit is the metre if its largest extent is below 2, else the mm. Raises
+    SceneError for a file that is no closed solid of a size that the gripper (110 mm) can close on, UnknownName, and
+    SceneError naming the extra where its packages are missing.
     """
     file = Path(path)
-    mesh = _stand(_read(file), file, scale_to_mm, up)
+    mesh = _stand(_read(file), file)
     stream = [seed, zlib.crc32(file.stem.encode())]
     worn = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
     limit = relief_limit(min(_narrowest(mesh.vertices), 94.0), 3.0)
@@ -311,16 +308,11 @@ def _merged(vertices: Vectors, faces: Faces) -> Mesh:
     return Mesh(vertices[first], faces[whole])
 
 
-def _stand(mesh: Mesh, file: Path, scale_to_mm: float | None, up: str) -> Mesh:
+def _stand(mesh: Mesh, file: Path) -> Mesh:
     """The mesh in mm, foot on z = 0, centred, faces outwards, after all checks. Raises SceneError."""
-    if up not in _UP:
-        raise SceneError(f'the upward axis must be "z" or "y", got {up!r}')
-    if scale_to_mm is not None and not (np.isfinite(scale_to_mm) and scale_to_mm > 0):
-        raise SceneError(f"scale_to_mm must be a positive number of mm per unit, got {scale_to_mm!r}")
     _check_closed(mesh, file)
-    extents = np.ptp(mesh.vertices, axis=0)
-    scale = (1000.0 if extents.max() < _METRES_BELOW else 1.0) if scale_to_mm is None else scale_to_mm
-    vertices = mesh.vertices[:, _UP[up]] * scale * ([1, -1, 1] if up == "y" else [1, 1, 1])
+    scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _METRES_BELOW else 1.0
+    vertices = mesh.vertices * scale
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = vertices - [*(low + high)[:2] / 2, low[2]]
     _check_size(vertices, file, scale)
@@ -349,7 +341,7 @@ def _check_closed(mesh: Mesh, file: Path) -> None:
 
 
 def _check_size(vertices: Vectors, file: Path, scale: float) -> None:
-    hint = f"at {scale:g} mm a unit; give scale_to_mm if the file is in other units"
+    hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
     extents = np.ptp(vertices, axis=0)
     if extents.min() < THINNEST_MM:
         raise SceneError(f"{file} must be at least {THINNEST_MM:g} mm thick, got {extents.min():.3g} mm {hint}")
