@@ -234,9 +234,9 @@ def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monke
     assert main(["query", *words]) == 0
     assert main(["query", "--gelsight=a.png", "--none-prior", "-1"]) == 0
     assert main(["frontier", "--out", "o", "--only", "closing", "contact", "--quick"]) == 0
-    assert given[0]["gelsight"] == [("a.png", "b.png"), ("a2.png", "b2.png")]
+    assert tuple(given[0]["gelsight"]) == (("a.png", "b.png"), ("a2.png", "b2.png"))
     assert (given[0]["background"], given[0]["top"]) == (("n.png",), 3)
-    assert (given[1]["gelsight"], given[1]["none_prior"]) == ([("a.png",)], -1.0)
+    assert (tuple(given[1]["gelsight"]), given[1]["none_prior"]) == ((("a.png",),), -1.0)
     assert (given[2]["only"], given[2]["quick"]) == (("closing", "contact"), True)
 
 
@@ -245,7 +245,7 @@ def test_the_package_is_the_command_line_too_and_help_lists_choices():
     done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Usage: retrieve train ")
-    assert "--task <match|grasp-success>" in done.stdout
+    assert "match|grasp-success" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -322,10 +322,10 @@ def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(o
     assert done.stderr.splitlines()[-1] in ("[]", "['faiss-cpu']"), done.stderr  # an exact search does without faiss
 
 
-def test_querys_help_and_a_wrong_index_import_no_encoder(tmp_path):
+def test_a_querys_words_and_a_wrong_index_import_no_encoder_and_no_pydantic(tmp_path):
     arguments = ["query", "--gelsight", "a.png", "--index", str(tmp_path)]
     code = f"from retrieval.commands.main import main\nmain({arguments!r})"
-    done = run_blocked(code, ("torch", "onnxruntime", "onnx"))
+    done = run_blocked(code, ("torch", "onnxruntime", "onnx", "pydantic"))
     assert "run `retrieve build-index` first" in done.stderr, done.stderr
 
 
