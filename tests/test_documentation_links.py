@@ -1,5 +1,6 @@
 """What README, docs/, CONTRIBUTING and the notebooks name and link to is there."""
 
+import pkgutil
 import re
 import tomllib
 
@@ -63,6 +64,12 @@ def test_every_file_of_ours_that_a_page_names_is_there():
     for page in (*PAGES, CONTRIBUTING):
         for name in re.findall(rf"(?<![\w/]){OURS}/[\w./*-]*(?:\.\w+|/)", text_of(page)):
             assert list(ROOT.glob(name.rstrip("/"))), (page.name, name)
+
+
+def test_every_module_and_name_of_ours_that_a_page_names_is_there():
+    for page in (*PAGES, CONTRIBUTING):
+        for name in re.findall(r"`((?:retrieval|robot|indexes)(?:\.[A-Za-z_]\w*)+)`", text_of(page)):
+            assert pkgutil.resolve_name(name), (page.name, name)
 
 
 def test_every_extra_that_a_page_names_can_be_installed():
