@@ -14,6 +14,7 @@ import numpy as np
 
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
+from retrieval.data.views import VIEWS, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -60,13 +61,18 @@ def _missing_reference(policy: str) -> ConfigError:
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How files become what the towers see: sides of the squares in pixels, and one of BACKGROUNDS."""
+    """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, and which views of a
+    photo stand side by side (`retrieval.data.views.VIEWS`)."""
 
     touch_px: int = 128
     photo_px: int = 256
     background: str = "none"
+    views: tuple[str, ...] = ("whole",)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "views", tuple(self.views))
+        if not self.views or not set(self.views) <= set(VIEWS) or len(set(self.views)) < len(self.views):
+            raise ConfigError(f"views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}")
         for key in ("touch_px", "photo_px"):
             side = getattr(self, key)
             if type(side) is not int or not 1 <= side <= 4096:
@@ -88,11 +94,14 @@ class Preprocessing:
     def digest(self) -> str:
         """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
+        if self.views == ("whole",):  # what there was before views
+            del content["views"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def photo(self, image: RgbImage) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, photo_px, 3). Raises BadInput, NumericalError."""
-        return _finite(resize(image, (self.photo_px, self.photo_px)), "photo")
+        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
+        check_rgb(image, "photo")
+        return strip(_finite(image, "photo"), self.views, self.photo_px)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
@@ -107,7 +116,7 @@ class Preprocessing:
         return _finite(touch, "touch")
 
     def load_photo(self, path: str | Path) -> RgbImage:
-        """Read a photo as (photo_px, photo_px, 3) float32. Raises ImageError."""
+        """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
         return self.photo(read_rgb(path))
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:

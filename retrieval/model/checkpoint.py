@@ -179,7 +179,7 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
 
 def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
     """A matcher as it is configured; its gel head is there where the file has one."""
-    matcher = Matcher(config.matcher)
+    matcher = Matcher(config.matcher, len(config.preprocessing.views))
     if any(name.startswith(_GEL_HEAD) for name in state):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
     return matcher

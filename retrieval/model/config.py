@@ -50,19 +50,22 @@ class MatcherConfig:
 class TrainingConfig:
     """How a matcher is trained.
 
-    init: "random", "imagenet" or the path of a state dict. iterations: optimiser steps. touches_per_batch times
-    (positives_per_touch + negatives_per_touch) pairs make a batch. weights: of the losses that are added to the match
-    loss (`retrieval.model.losses.LOSSES`), in files `contrastive_weight` and so on; 0 for each is exactly the paper's
-    loss, and without "contrastive" the embeddings stay untrained. shuffle_fingers: feed the fingers of a touch in a
-    random order, as gripping the other way round would; not in the paper. negatives: "dataset" draws a touch's from
-    all photos of other objects, as in the paper; "batch" from the photos that stand in the batch anyway, half as many
-    to encode (`PairSampler`); "auto" is "batch" where towers are trained. freeze_batch_norm: keep the batch statistics
-    of the initial weights. freeze_towers: train only what comes after the towers; every image is then encoded once for
-    the whole training. distil_steps: steps of teaching the pruner after training, where the matcher has one
-    (`retrieval.training.distil`). validation_fraction, test_fraction: shares of the objects.
+    init: "random", "imagenet" or the path of a state dict. init_touch, init_photo: the same for one tower alone, where
+    they are not empty (`retrieval.training.relief` makes such weights). iterations: optimiser steps. touches_per_batch
+    times (positives_per_touch + negatives_per_touch) pairs make a batch. weights: of the losses that are added to the
+    match loss (`retrieval.model.losses.LOSSES`), in files `contrastive_weight` and so on; 0 for each is exactly the
+    paper's loss, and without "contrastive" the embeddings stay untrained. shuffle_fingers: feed the fingers of a touch
+    in a random order, as gripping the other way round would; not in the paper. negatives: "dataset" draws a touch's
+    from all photos of other objects, as in the paper; "batch" from the photos that stand in the batch anyway, half as
+    many to encode (`PairSampler`); "auto" is "batch" where towers are trained. freeze_batch_norm: keep the batch
+    statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
+    encoded once for the whole training. distil_steps: steps of teaching the pruner after training, where the matcher
+    has one (`retrieval.training.distil`). validation_fraction, test_fraction: shares of the objects.
     """
 
     init: str = "imagenet"
+    init_touch: str = ""
+    init_photo: str = ""
     iterations: int = 26_000
     touches_per_batch: int = 6
     positives_per_touch: int = 4
@@ -210,6 +213,8 @@ def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) ->
 def _typed(name: str, wanted: type[Any], value: Any) -> Any:
     if wanted is float and type(value) is int and abs(value) < 2**63:
         return float(value)
+    if wanted is tuple and isinstance(value, list) and all(isinstance(each, str) for each in value):
+        return tuple(value)
     if type(value) is not wanted:
         raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")
     return value

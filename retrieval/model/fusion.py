@@ -60,14 +60,16 @@ class FusionHead(nn.Module):
 class Matcher(nn.Module):
     """Touch and photo in, halves and embeddings out; halves in, match logit out."""
 
-    def __init__(self, config: MatcherConfig) -> None:
+    def __init__(self, config: MatcherConfig, views: int = 1) -> None:
+        """views: pictures of a photo that stand side by side (`retrieval.data.views`)."""
         super().__init__()
+        self.views = views
         self.config = config
         # One set of weights for all fingers.
         self.touch_tower = build_tower(config.tower, config.tower_output)
         self.photo_tower = build_tower(config.tower, config.tower_output)
         touch_features = config.fingers * self.touch_tower.feature_count
-        photo_features = self.photo_tower.feature_count
+        photo_features = views * self.photo_tower.feature_count
         self.head = FusionHead(touch_features, photo_features, config.hidden, config.dropout)
         # After the head, so that their initial weights do not change the paper's.
         self.touch_projection = nn.Linear(touch_features, config.embedding_dim)
@@ -92,9 +94,11 @@ class Matcher(nn.Module):
         return features.float().view(len(touches), -1)
 
     def photo_features(self, photos: Tensor) -> Tensor:
-        """Features (B, features) of photos (B, 3, H, W) in 0..1."""
+        """Features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
+        if self.views > 1:
+            photos = photos.unflatten(3, (self.views, -1)).permute(0, 3, 1, 2, 4).flatten(0, 1)
         features: Tensor = self.photo_tower(photos)
-        return features.float()
+        return features.float().view(len(photos) // self.views, -1)
 
     def touch_code(self, features: Tensor) -> Code:
         """Half of touch features, and their embedding by the contrastive projection."""

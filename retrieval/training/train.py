@@ -330,10 +330,10 @@ FROZEN = ("touch_tower.", "photo_tower.")
 
 def build_matcher(config: Config) -> Matcher:
     """A matcher with the configured first weights in both towers."""
-    matcher = Matcher(config.matcher)
-    for tower in (matcher.touch_tower, matcher.photo_tower):
-        initialise_tower(tower, config.matcher.tower, config.training.init)
-        tower.requires_grad_(not config.training.freeze_towers)
+    settings, matcher = config.training, Matcher(config.matcher, len(config.preprocessing.views))
+    for tower, init in ((matcher.touch_tower, settings.init_touch), (matcher.photo_tower, settings.init_photo)):
+        initialise_tower(tower, config.matcher.tower, init or settings.init)
+        tower.requires_grad_(not settings.freeze_towers)
         distributed.share_batch_statistics(tower)
     return matcher
 

@@ -1,0 +1,135 @@
+"""Where the object of a photo lies, and what is cut out of the photo around it."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.views import VIEWS, Box, find_object, square, strip
+from retrieval.errors import ConfigError
+from retrieval.model.config import Config, MatcherConfig
+from retrieval.model.fusion import Matcher
+
+GROUND = (0.55, 0.5, 0.45)
+
+
+def photo(*, size=(256, 256), colour=(0.2, 0.4, 0.8), box=(100, 60, 150, 200), shadow=(), noise=0.01, slope=0.0):
+    """A box of one colour on a ground with a little noise; a shadow keeps a third of the light and is bluer."""
+    rng = np.random.default_rng(0)
+    image = np.ones((*size, 3)) * GROUND
+    image *= 1 + slope * np.linspace(-1, 1, size[1])[None, :, None]
+    for left, top, right, bottom in shadow:
+        image[top:bottom, left:right] *= np.array([0.57, 0.6, 0.63])
+    left, top, right, bottom = box
+    image[top:bottom, left:right] = colour
+    return np.clip(image + rng.normal(0, noise, image.shape), 0, 1).astype(np.float32)
+
+
+def near(found, box, px=6):
+    return np.abs(np.subtract(found, box)).max() <= px
+
+
+@pytest.mark.parametrize("colour", [(0.2, 0.4, 0.8), (0.95, 0.95, 0.9), (0.05, 0.05, 0.06), (0.7, 0.3, 0.3)])
+def test_the_object_is_what_differs_from_the_ground(colour):
+    assert near(find_object(photo(colour=colour)), (100, 60, 150, 200))
+
+
+def test_a_shadow_is_not_the_object():
+    assert near(find_object(photo(shadow=[(150, 150, 240, 200)])), (100, 60, 150, 200))
+
+
+def test_light_that_falls_off_is_not_an_object():
+    assert near(find_object(photo(slope=0.3)), (100, 60, 150, 200))
+
+
+def test_the_box_is_in_the_photos_own_pixels():
+    found = find_object(photo(size=(600, 900), box=(400, 100, 550, 500)))
+    assert near(found, (400, 100, 550, 500), px=16)
+
+
+def test_white_paper_with_a_thing_on_it_needs_no_noise():
+    image = np.ones((200, 200, 3), np.float32)
+    image[50:150, 80:120] = 0.4
+    assert near(find_object(image), (80, 50, 120, 150))
+
+
+def test_a_photo_without_an_object_is_looked_at_whole():
+    assert find_object(photo(box=(0, 0, 0, 0))) == (0, 0, 256, 256)
+    assert find_object(np.zeros((40, 30, 3), np.float32)) == (0, 0, 30, 40)
+
+
+@given(
+    arrays(
+        np.float32, st.tuples(st.integers(1, 40), st.integers(1, 40), st.just(3)), elements=st.floats(0, 1, width=32)
+    )
+)
+def test_any_photo_has_a_box_inside_it(image):
+    box = find_object(image)
+    assert 0 <= box.left < box.right <= image.shape[1]
+    assert 0 <= box.top < box.bottom <= image.shape[0]
+    assert np.isfinite(strip(image, list(VIEWS), 8)).all()
+
+
+def test_a_square_goes_on_with_the_edges_pixels():
+    image = np.arange(12, dtype=np.float32).reshape(3, 4, 1).repeat(3, 2)
+    found = square(image, Box(0, 0, 1, 1), 3)[..., 0]
+    np.testing.assert_array_equal(found, [[0, 0, 1], [0, 0, 1], [4, 4, 5]])
+
+
+def test_views_stand_side_by_side():
+    image = photo()
+    views = strip(image, ("whole", "crop", "zoom", "grey"), 64)
+    assert views.shape == (64, 256, 3)
+    np.testing.assert_array_equal(views[:, :64], Preprocessing(photo_px=64).photo(image))
+    crop, zoom, grey = views[:, 64:128], views[:, 128:192], views[:, 192:]
+    blue = [float((view[..., 2] > 0.65).mean()) for view in (views[:, :64], crop, zoom)]
+    assert blue[2] > blue[1] > blue[0]  # windows of 112, 157 and 256 pixels
+    np.testing.assert_allclose(grey, zoom.mean(axis=2, keepdims=True).repeat(3, 2), atol=1e-6)
+
+
+def test_the_zoom_has_one_scale_whatever_the_objects_size():
+    def stripes(box):
+        image = photo(box=box)
+        left, top, right, bottom = box
+        image[top:bottom, left:right:8] = 1
+        return strip(image, ("zoom",), 112)
+
+    small, large = stripes((110, 90, 150, 170)), stripes((70, 20, 190, 230))
+    middle = slice(40, 72)
+    for found in (small, large):
+        row = found[56, middle, 0]
+        assert (np.diff(np.flatnonzero(row > 0.9)) == 8).all()
+
+
+@pytest.mark.parametrize("views", [(), ("whole", "whole"), ("macro",)])
+def test_views_are_known_and_differ(views):
+    with pytest.raises(ConfigError, match="views must be some of whole, crop, zoom, grey"):
+        Preprocessing(views=views)
+
+
+def test_what_was_made_before_views_still_matches():
+    assert Preprocessing().digest() == Preprocessing(views=("whole",)).digest()
+    assert Preprocessing().digest() != Preprocessing(views=("zoom",)).digest()
+    assert Preprocessing(views=("crop", "zoom")).digest() != Preprocessing(views=("zoom", "crop")).digest()
+
+
+def test_views_come_back_from_a_file():
+    made = Config(preprocessing=Preprocessing(views=("zoom", "grey")))
+    table = made.to_dict()
+    table["preprocessing"]["views"] = list(table["preprocessing"]["views"])
+    assert Config.from_dict(table) == made
+
+
+def test_a_photos_features_are_those_of_its_views_side_by_side():
+    torch.manual_seed(0)
+    config = MatcherConfig(tower="small", tower_output="pooled", hidden=8)
+    matcher = Matcher(config, views=2).eval()
+    photos = torch.rand(3, 3, 32, 64)
+    with torch.inference_mode():
+        found = matcher.photo_features(photos)
+        expected = torch.cat([matcher.photo_tower(photos[..., :32]), matcher.photo_tower(photos[..., 32:])], dim=1)
+    torch.testing.assert_close(found, expected)
+    assert matcher.head.photo_half.in_features == found.shape[1]
