@@ -9,6 +9,7 @@ A recording is written by one writer in one order, so that it is the same whatev
 collection that was stopped or killed goes on where it was when it is started again.
 """
 
+import atexit
 import functools
 import json
 import re
@@ -31,7 +32,10 @@ from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.rig import Rig
-from robot.workers import Jobs, RigMaker
+from robot.workers import Jobs, Work
+
+RigMaker = Callable[[], Rig]
+"""Builds a rig, unconnected; for several jobs picklable, as functools.partial(load_rig, "sim", seed=0) is."""
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]")
@@ -117,9 +121,16 @@ def collect(
         attempter = Attempter(rig, seed, attempt)
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
             collection = _Collection(writer, log, names, settings, gate, progress)
-            with Jobs(jobs, attempter, make_rig) as workers:
+            with Jobs(jobs, attempter.run, functools.partial(_in_a_worker, make_rig, seed, attempt)) as workers:
                 collection.run(workers)
     return [collection.tallies[name] for name in names]
+
+
+def _in_a_worker(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work[GraspAttempt]:
+    rig = make_rig()
+    rig.connect()
+    atexit.register(rig.close)
+    return Attempter(rig, seed, settings).run
 
 
 # What the recording says of its collection ------------------------------------------------------------------
@@ -197,7 +208,7 @@ class _Collection:
         self._progress = progress
         self._start, self._settled_before = time.monotonic(), self._settled()
 
-    def run(self, workers: Jobs) -> None:
+    def run(self, workers: Jobs[GraspAttempt]) -> None:
         """Attempts are recorded object by object; workers may be ahead, but never make one that is not wanted."""
         self._report()
         for name in self.names:
@@ -206,7 +217,7 @@ class _Collection:
                 self._record(self._pending[name].popleft()())
                 self._report()
 
-    def _submit_ahead(self, workers: Jobs, name: str) -> None:
+    def _submit_ahead(self, workers: Jobs[GraspAttempt], name: str) -> None:
         """Give out the attempts that are wanted next, this object's first."""
         later = self.names[self.names.index(name) :]
         for each in later:

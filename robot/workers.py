@@ -1,6 +1,5 @@
-"""Attempts made by this process, or by several at once, each with a rig of its own."""
+"""Work on objects, by this process or by several at once, each with a rig of its own."""
 
-import atexit
 import functools
 import multiprocessing
 import os
@@ -11,31 +10,30 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import Self
+from typing import Any, Generic, Self, TypeVar
 
 import cv2
 
 from robot.errors import RobotError
-from robot.grasping.attempt import Attempter, GraspAttempt
-from robot.grasping.settings import AttemptSettings
-from robot.rig import Rig
 
-RigMaker = Callable[[], Rig]
-"""Builds a rig, unconnected; for several jobs picklable, as functools.partial(load_rig, "sim", seed=0) is."""
+T = TypeVar("T")
+Work = Callable[[str, int], T]
+"""What is done with an object, by its id, for the time of this number."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Jobs:
-    """Makes attempts: here and now with one job, else in processes that are started afresh ("spawn").
+class Jobs(Generic[T]):
+    """Does work: here and now with one job, by `here`; else in processes that are started afresh ("spawn"), by what
+    the picklable `make` gives each of them.
 
-    A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` attempts
+    A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` pieces of work
     should be under way at a time. With one job, too, OpenCV works in one thread while this is open: some of its
     filters give other last digits in several, and a recording must be the same whatever the jobs.
     """
 
-    def __init__(self, jobs: int, attempter: Attempter, make_rig: RigMaker) -> None:
-        self._attempter, self._pool = attempter, None
+    def __init__(self, jobs: int, here: Work[T], make: Callable[[], Work[T]]) -> None:
+        self._here, self._pool = here, None
         self.window = 1 if jobs == 1 else 2 * jobs
         self._environment: dict[str, str | None] = {}
         self._threads = cv2.getNumThreads()
@@ -46,14 +44,14 @@ class Jobs:
                 jobs,
                 mp_context=multiprocessing.get_context("spawn"),
                 initializer=_begin,
-                initargs=(make_rig, attempter.seed, attempter.settings),
+                initargs=(make,),
             )
 
-    def submit(self, object_id: str, number: int) -> Callable[[], GraspAttempt]:
-        """Begin an attempt; the callable waits for it. It raises the attempt's own RobotError, and a RobotError for
+    def submit(self, object_id: str, number: int) -> Callable[[], T]:
+        """Begin a piece of work; the callable waits for it. It raises the work's own RobotError, and a RobotError for
         any other failure in another process."""
         if self._pool is None:
-            return functools.partial(self._attempter.run, object_id, number)
+            return functools.partial(self._here, object_id, number)
         os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the processes that a submission may start
         try:
             future = self._pool.submit(_run, object_id, number)
@@ -68,7 +66,7 @@ class Jobs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Waits for the attempts that have begun; the others are not made."""
+        """Waits for the work that has begun; the other is not done."""
         cv2.setNumThreads(self._threads)
         if self._pool is not None:
             _end(self._pool, set(multiprocessing.active_children()) - self._before)
@@ -101,7 +99,7 @@ def _restore(environment: dict[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def _result(future: Future[GraspAttempt], object_id: str, number: int) -> GraspAttempt:
+def _result(future: Future[T], object_id: str, number: int) -> T:
     try:
         return future.result()
     except RobotError:
@@ -122,16 +120,16 @@ def _died() -> RobotError:
 
 # In the worker ----------------------------------------------------------------------------------------------
 
-_made: list[Attempter] = []
-_make: list[Callable[[], Attempter]] = []
+_made: list[Work[Any]] = []
+_make: list[Callable[[], Work[Any]]] = []
 
 
-def _begin(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> None:
+def _begin(make: Callable[[], Work[Any]]) -> None:
     """Runs first. Nothing here may fail: a pool does not say why. Ctrl-C is the parent's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
-    _make.append(functools.partial(_connected, make_rig, seed, settings))
+    _make.append(make)
 
 
 def _leave_with_parent() -> None:
@@ -142,14 +140,7 @@ def _leave_with_parent() -> None:
     os._exit(1)
 
 
-def _connected(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Attempter:
-    rig = make_rig()
-    rig.connect()
-    atexit.register(rig.close)
-    return Attempter(rig, seed, settings)
-
-
-def _run(object_id: str, number: int) -> GraspAttempt:
+def _run(object_id: str, number: int) -> Any:
     if not _made:
         _made.append(_make[0]())
-    return _made[0].run(object_id, number)
+    return _made[0](object_id, number)

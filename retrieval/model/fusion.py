@@ -96,7 +96,7 @@ class Matcher(nn.Module):
     def photo_features(self, photos: Tensor) -> Tensor:
         """Features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
         if self.views > 1:
-            photos = photos.unflatten(3, (self.views, -1)).permute(0, 3, 1, 2, 4).flatten(0, 1)
+            photos = photos.reshape(*photos.shape[:3], self.views, -1).permute(0, 3, 1, 2, 4).flatten(0, 1)
         features: Tensor = self.photo_tower(photos)
         return features.float().view(len(photos) // self.views, -1)
 

@@ -171,6 +171,27 @@ class SimRig(Rig):
         )
         self.world.clock.now_s = number * _ATTEMPT_S
 
+    def labels(self, object_id: str) -> dict[str, float | bool | str]:
+        """`SimObject.labels` of an object of this rig. Raises RobotConfigError where it has none of this name."""
+        return self._find(object_id).labels()
+
+    def press(self, object_id: str, number: int) -> dict[str, npt.NDArray[np.uint8]]:
+        """Gel images of each finger, pressed and before (touch_a, touch_a_before, ...), as the jaws close on the object at
+        a random height, turn and force, without arm or camera; nothing where they close on air."""
+        self.prepare(object_id, number)
+        scene = self.world.now()
+        rng = np.random.default_rng([104, self._seed, zlib.crc32(object_id.encode()), number])
+        place, settings, height = scene.placement, self.attempt.grasp, float(scene.obj.body.upper[2])
+        x, y = rng.normal([place.x_mm, place.y_mm], settings.jitter_mm)
+        lowest = max(settings.floor_mm, height - settings.reach_mm)
+        z = rng.uniform(lowest, max(lowest, height - settings.top_margin_mm))
+        pose = Pose(float(x), float(y), float(z), float(rng.uniform(0.0, math.pi)))
+        scene = replace(scene, grip=Grip(pose, float(rng.uniform(*settings.force_n))))
+        if scene.pinch.missed:
+            return {}
+        names = [f"touch_{finger}{moment}" for finger in sorted(self.sensors) for moment in ("", "_before")]
+        return {name: scene.image(name) for name in names}
+
     def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
         """Distance (mm) of the object from each gel at first touch, simulated again from what was recorded.
 

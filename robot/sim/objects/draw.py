@@ -43,6 +43,20 @@ class SimObject:
         solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
         return solid if solid <= HEAVY_KG else min(solid, shell)
 
+    def labels(self) -> dict[str, float | bool | str]:
+        """What is known of shape and relief, in plain values: what touch can feel and a photo can show."""
+        relief = self.relief
+        return {
+            "shape": self.family,
+            "relief": relief.name,
+            "pitch_mm": relief.pitch_mm,
+            "amplitude_mm": relief.amplitude_mm,
+            "angle_rad": relief.angle_rad,
+            "aspect": relief.aspect,
+            "sharpness": relief.sharpness,
+            "engraved": relief.engraved,
+        }
+
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "mass_kg"}
 

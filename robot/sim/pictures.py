@@ -1,0 +1,154 @@
+"""Pictures of simulated objects with what is known of each, to learn relief from: no touch needs its photo.
+
+    pictures.json     schema_version, kind ("photo" or "touch"), source, sensor, seed, objects, software_version
+    metadata.jsonl    a line for each picture: file_name, object_id, and the object's labels
+                      (`robot.sim.objects.draw.SimObject.labels`); touches also finger and before_file_name, the
+                      untouched gel
+    images/           PNG files; the folder opens as it is with Hugging Face datasets ("imagefolder")
+
+A photographed object costs a tenth of a felt one, and a press of its own a third. An object's lines are written when
+its pictures are on the disk; what was stopped goes on where it was.
+"""
+
+import functools
+import json
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from robot.errors import RecordingError, RobotConfigError
+from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
+from robot.rig import load_rig
+from robot.sim.rig import SimRig
+from robot.storage import append_line, file_content, read_regular, storage_errors, sync_folder, write_file
+from robot.workers import Jobs, Work
+
+INFO_FILE = "pictures.json"
+SCHEMA_VERSION = 1
+KINDS = ("photo", "touch")
+_PRESSES = 3
+"""At most so many tries at an object on which the jaws close without meeting it."""
+Pictures = dict[str, npt.NDArray[np.uint8]]
+
+
+def collect_pictures(
+    kind: str,
+    out: str | Path,
+    *,
+    objects: int,
+    seed: int,
+    rig: str = "sim",
+    jobs: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Photograph, or press, the first `objects` objects of a simulated rig into `out`, or go on with what is there.
+
+    Returns the number of pictures. kind: "photo" (one an object) or "touch" (one a finger); rig: "sim" or the TOML file
+    of a simulated one; progress: told how many objects are done, of how many. Raises RobotConfigError, RecordingError
+    for a folder with something else, StorageError.
+    """
+    if kind not in KINDS:
+        raise RobotConfigError(f"pictures must be of kind {' or '.join(KINDS)}, got {kind!r}")
+    make = functools.partial(_work, kind, rig, seed)
+    names = _simulated(rig, seed).object_ids(objects)
+    folder = Path(out)
+    info = {**_simulated(rig, seed).info, "schema_version": SCHEMA_VERSION, "kind": kind, "seed": seed}
+    done = _begin(folder, info | {"software_version": software_version()})
+    count = sum(done.values())
+    left = [name for name in names if name not in done]
+    with storage_errors(folder), Jobs(jobs, make(), make) as workers:
+        for made, (name, (pictures, labels)) in enumerate(_in_order(workers, left), start=1):
+            count += _write(folder, kind, name, pictures, labels)
+            if progress is not None:
+                progress(len(names) - len(left) + made, len(names))
+    return count
+
+
+def _simulated(rig: str, seed: int) -> SimRig:
+    made = load_rig(rig, seed=seed)
+    if not isinstance(made, SimRig):
+        raise RobotConfigError(f"pictures with labels come from a simulated rig, for it knows its objects; got {rig}")
+    return made
+
+
+def _work(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str, Any]]]:
+    made = _simulated(rig, seed)
+
+    def photograph(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
+        made.prepare(object_id, number)
+        return {"photo": made.world.now().image("photo")}, made.labels(object_id)
+
+    def press(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
+        tries = (made.press(object_id, number + each) for each in range(_PRESSES))
+        return next((pictures for pictures in tries if pictures), {}), made.labels(object_id)
+
+    return photograph if kind == "photo" else press
+
+
+def _in_order(workers: Jobs[Any], names: list[str]) -> Iterator[tuple[str, Any]]:
+    """What is made of each object, in their order; a few are under way ahead."""
+    pending: deque[tuple[str, Callable[[], Any]]] = deque()
+    for name in names:
+        pending.append((name, workers.submit(name, 0)))
+        if len(pending) >= workers.window:
+            first, result = pending.popleft()
+            yield first, result()
+    for first, result in pending:
+        yield first, result()
+
+
+def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
+    """Make the folder, or check that it holds pictures made likewise; object -> how many pictures it has."""
+    plain = json.loads(json.dumps(info))
+    with storage_errors(folder):
+        if (folder / INFO_FILE).exists():
+            held = json.loads(read_regular(folder / INFO_FILE))
+            if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
+                raise RecordingError(
+                    f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
+                )
+            return _done(folder / METADATA_FILE)
+        if folder.exists() and any(folder.iterdir()):
+            raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
+        (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
+        write_file(folder / METADATA_FILE, b"")
+        write_file(folder / INFO_FILE, (json.dumps(plain, indent=1) + "\n").encode())
+        sync_folder(folder)
+    return {}
+
+
+def _done(path: Path) -> dict[str, int]:
+    """Objects whose lines are whole. Half a last line is cut off, and with it the last object, whose it may be."""
+    content = read_regular(path)
+    lines = content.splitlines(keepends=True)
+    names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
+    if len(names) < len(lines):
+        kept = [name for name in names if name != names[-1]]
+        with open(path, "r+b") as file:
+            file.truncate(sum(map(len, lines[: len(kept)])))
+        names = kept
+    return dict(Counter(names))
+
+
+def _write(folder: Path, kind: str, object_id: str, pictures: Pictures, labels: Mapping[str, Any]) -> int:
+    """Write an object's pictures, then its lines at once; returns how many pictures it has."""
+    files = {}
+    for name, pixels in pictures.items():
+        data, suffix = file_content(name, pixels)
+        files[name] = f"{IMAGES_FOLDER}/{object_id}-{name}{suffix}"
+        write_file(folder / files[name], data)
+    rows = []
+    for name in files:
+        if name.endswith("_before"):
+            continue
+        row = {"file_name": files[name], "object_id": object_id, **labels}
+        if kind == "touch":
+            row |= {"finger": name.removeprefix("touch_"), "before_file_name": files[f"{name}_before"]}
+        rows.append(json.dumps(row) + "\n")
+    with open(folder / METADATA_FILE, "r+b", buffering=0) as file:
+        append_line(file, file.seek(0, 2), "".join(rows).encode())
+    return len(rows)
