@@ -176,8 +176,8 @@ class SimRig(Rig):
         return self._find(object_id).labels()
 
     def press(self, object_id: str, number: int) -> dict[str, npt.NDArray[np.uint8]]:
-        """Gel images of each finger, pressed and before (touch_a, touch_a_before, ...), as the jaws close on the object at
-        a random height, turn and force, without arm or camera; nothing where they close on air."""
+        """Gel images of each finger, pressed and before (touch_a, touch_a_before, ...), as jaws close on the object
+        at a random height, turn and force, without arm or camera; nothing where they close on air."""
         self.prepare(object_id, number)
         scene = self.world.now()
         rng = np.random.default_rng([104, self._seed, zlib.crc32(object_id.encode()), number])

@@ -1,0 +1,59 @@
+"""Pictures with what is known of the objects they show, as `retrieve collect --photos-only` and `--touches-only` make
+them; the format stands in robot.sim.pictures."""
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from indexes.store.regular import read_json, read_regular
+from retrieval.errors import DatasetError
+
+KINDS = ("photo", "touch")
+
+
+@dataclass(frozen=True)
+class LabelledPicture:
+    """A photo, or one finger's gel image with the untouched gel, and the relief of what it shows or feels.
+
+    pitch_mm, amplitude_mm: of the pattern; the amplitude of a smooth object is 0.
+    """
+
+    file: Path
+    before: Path | None
+    object_id: str
+    relief: str
+    pitch_mm: float
+    amplitude_mm: float
+
+
+def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
+    """The kind of the pictures in `folder`, and the pictures. Raises DatasetError."""
+    try:
+        info = read_json(folder / "pictures.json")
+        lines = read_regular(folder / "metadata.jsonl").decode().splitlines()
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{folder} must be a folder that `retrieve collect --photos-only` wrote: {error}") from error
+    kind = info.get("kind") if isinstance(info, dict) else None
+    if kind not in KINDS:
+        raise DatasetError(f"{folder}/pictures.json must say kind photo or touch; got {kind!r}")
+    pictures = [_picture(folder, number, line) for number, line in enumerate(lines, start=1)]
+    if not pictures:
+        raise DatasetError(f"{folder} holds no picture yet; run the same `retrieve collect` again")
+    return kind, pictures
+
+
+def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
+    try:
+        row: dict[str, Any] = json.loads(line)
+        pitch, amplitude = float(row["pitch_mm"]), float(row["amplitude_mm"])
+        before = folder / row["before_file_name"] if "before_file_name" in row else None
+        found = LabelledPicture(
+            folder / row["file_name"], before, str(row["object_id"]), str(row["relief"]), pitch, amplitude
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{folder}/metadata.jsonl, line {number}, is no labelled picture: {error!r}") from error
+    if not (0 < pitch < math.inf and 0 <= amplitude < math.inf):
+        raise DatasetError(f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm")
+    return found

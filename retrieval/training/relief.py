@@ -1,0 +1,324 @@
+"""Teaching one tower what relief looks like, from labelled pictures alone: no touch needs its photo.
+
+A photographed object costs a tenth of a felt one, and what a matcher lacks on the photo's side is objects. The tower
+learns which family of relief an object wears, its pitch and its amplitude; its weights then begin a matcher's
+(`init_photo`, `init_touch`), whose head is trained on felt objects as before.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from retrieval.console.interruption import interruption
+from retrieval.console.progress import Bar
+from retrieval.data.images import to_float
+from retrieval.data.labelled import LabelledPicture, load_labelled
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.errors import CheckpointError, DatasetError, Interrupted
+from retrieval.model.checkpoint import beside, read_tensors, require_writable, write_tensors
+from retrieval.model.config import Config
+from retrieval.model.encode import autocast, default_device, to_batch
+from retrieval.model.towers import build_tower
+from retrieval.model.towers.weights import initialise_tower
+from retrieval.training.fit import Plan, fit
+
+BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
+WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
+HEAD_FASTER = 5.0
+"""The head, which begins at zero, learns so many times faster than the tower."""
+VALIDATION, MOST_VALIDATED = 0.05, 400
+SAVE_EVERY = 200
+VISIBLE = 0.8
+"""Share of a photo's side that a step sees; a gel is seen whole."""
+LEAST_MM = 0.05
+
+
+@dataclass(frozen=True)
+class ReliefReport:
+    """How well the relief of objects that were held out is told: the share of families, chance beside it, and the
+    correlation of the logarithms of pitch and amplitude."""
+
+    kind: str
+    pictures: int
+    objects: int
+    steps: int
+    families: float
+    chance: float
+    pitch: float
+    amplitude: float
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return [
+            f"{self.kind}: {self.steps} steps on {self.pictures} pictures of {self.objects} objects",
+            f"objects held out: family of relief {self.families:.3f} (chance {self.chance:.3f}), pitch r = "
+            f"{self.pitch:.2f}, amplitude r = {self.amplitude:.2f}",
+        ]
+
+
+def train_relief(
+    folder: Path, out: Path, config: Config, *, iterations: int = ITERATIONS, resume: bool = False, quiet: bool = False
+) -> ReliefReport:
+    """Train a tower of `config` on the pictures in `folder` and write its weights to `out` (.safetensors).
+
+    Photos are seen as the view "grey" or "zoom" shows them, touches as the matcher sees them (`config.preprocessing`);
+    the first weights are `config.training.init`. resume: go on from the state beside `out`. Ctrl-C keeps a state and
+    raises Interrupted. Raises DatasetError, ConfigError, CheckpointError.
+    """
+    kind, pictures = load_labelled(folder)
+    require_writable(out)
+    training = ReliefTraining(kind, pictures, config, iterations)
+    state = beside(out, ".state.safetensors")
+    if resume:
+        training.resume(state)
+    elif state.exists():
+        raise CheckpointError(f"an unfinished training is at {state}; go on with --resume, or delete it to begin anew")
+    with interruption() as stop, Bar("train relief", iterations, "steps", done=training.step, quiet=quiet) as bar:
+        training.run(state, bar, stop.is_set)
+    if training.step < iterations:
+        raise Interrupted(f"stopped at step {training.step} of {iterations}; --resume goes on from here")
+    report = training.report()
+    about = {"tower": config.matcher.tower, "tower_output": config.matcher.tower_output}
+    write_tensors(out, _contiguous(training.tower.state_dict()), about | dataclasses.asdict(report))
+    state.unlink(missing_ok=True)
+    return report
+
+
+class ReliefTraining:
+    """A tower, the head that reads relief off its features, and the pictures they learn from."""
+
+    def __init__(self, kind: str, pictures: Sequence[LabelledPicture], config: Config, iterations: int) -> None:
+        self.kind, self.config, self.iterations, self.step = kind, config, iterations, 0
+        self.device, seed = default_device(), config.training.seed
+        objects = sorted({picture.object_id for picture in pictures})
+        held_out = max(1, min(round(VALIDATION * len(objects)), MOST_VALIDATED))
+        chosen = set(np.random.default_rng([seed, 1]).permutation(objects)[:held_out].tolist())
+        self.pictures = [picture for picture in pictures if picture.object_id not in chosen]
+        self.validation = [picture for picture in pictures if picture.object_id in chosen]
+        self.families = sorted({picture.relief for picture in self.pictures})
+        if len(self.families) < 2:
+            raise DatasetError(f"relief can be learned from two families and more; got {', '.join(self.families)}")
+        sizes = np.array([_sizes(picture) for picture in self.pictures if picture.amplitude_mm > 0])
+        self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
+        torch.manual_seed(seed)
+        self.tower = build_tower(config.matcher.tower, config.matcher.tower_output)
+        initialise_tower(self.tower, config.matcher.tower, config.training.init)
+        features = self.tower.feature_count
+        last = nn.Linear(features, len(self.families) + 2)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.head = nn.Sequential(nn.BatchNorm1d(features, affine=False), nn.Dropout(DROPOUT), last)
+        self.tower.to(self.device)
+        self.head.to(self.device)
+        self.optimizer = torch.optim.AdamW(
+            [{"params": self.tower.parameters()}, {"params": self.head.parameters()}], weight_decay=WEIGHT_DECAY
+        )
+        self._kept: dict[Path, NDArray[np.uint8]] = {}
+
+    def _load(self, picture: LabelledPicture) -> NDArray[np.float32]:
+        settings = self.config.preprocessing
+        if self.kind == "touch":
+            return settings.load_touch(picture.file, picture.before)
+        return Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(picture.file)
+
+    def _images(self, pictures: Sequence[LabelledPicture]) -> Tensor:
+        """(B, 3, H, W); a picture is read once, and kept in 8 bits."""
+        for picture in pictures:
+            if picture.file not in self._kept:
+                self._kept[picture.file] = np.rint(255 * self._load(picture)).astype(np.uint8)
+        return to_batch([to_float(self._kept[picture.file]) for picture in pictures])
+
+    def run(self, state: Path, bar: Bar, stopped: Callable[[], bool]) -> None:
+        """Train from the current step to the last, keeping the state now and then."""
+        plan = Plan(self.iterations, LEARNING_RATE, "cosine", SAVE_EVERY)
+        with ThreadPoolExecutor(1) as ahead:
+            fit(
+                self.optimizer,
+                plan,
+                self._batches(ahead),
+                self._loss,
+                bar=bar,
+                done=self.step,
+                before_step=self._head_faster,
+                after_step=self._stepped,
+                validate=lambda _: self._save(state),
+                stopped=stopped,
+            )
+
+    def _head_faster(self) -> None:
+        self.optimizer.param_groups[1]["lr"] *= HEAD_FASTER
+
+    def _stepped(self, done: int) -> None:
+        self.step = done
+
+    def _batches(self, ahead: ThreadPoolExecutor) -> Iterator[tuple[list[LabelledPicture], Tensor]]:
+        def prepare(step: int) -> Future[tuple[list[LabelledPicture], Tensor]]:
+            return ahead.submit(self._batch, step)
+
+        upcoming = prepare(self.step)
+        for step in range(self.step + 1, self.iterations):
+            batch, upcoming = upcoming.result(), prepare(step)
+            yield batch
+        yield upcoming.result()
+
+    def _batch(self, step: int) -> tuple[list[LabelledPicture], Tensor]:
+        rng = np.random.default_rng([self.config.training.seed, 2, step])
+        chosen = [self.pictures[row] for row in rng.integers(len(self.pictures), size=BATCH)]
+        return chosen, augmented(self._images(chosen), self.kind, rng)
+
+    def _loss(self, batch: tuple[list[LabelledPicture], Tensor]) -> Tensor:
+        pictures, images = batch
+        self.tower.train()
+        for module in self.tower.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()  # the published statistics hold; a batch of 32 is too few for new ones
+        self.head.train()
+        torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
+        said = self._said(images)
+        family = torch.tensor([self.families.index(each.relief) for each in pictures], device=self.device)
+        worn = torch.tensor([each.amplitude_mm > 0 for each in pictures], device=self.device)
+        error = (said[:, -2:] - self._wanted(pictures)).square().mean(1)
+        loss = functional.cross_entropy(said[:, :-2], family, label_smoothing=SMOOTHING)
+        return loss + (error * worn).mean()
+
+    def _said(self, images: Tensor) -> Tensor:
+        """(B, families + 2): logits of the families, then the standardised logarithms of pitch and amplitude."""
+        with autocast(self.device, self.config.training.precision):
+            features = self.tower(images.to(self.device, memory_format=torch.channels_last))
+        said: Tensor = self.head(features.float())
+        return said
+
+    def _wanted(self, pictures: Sequence[LabelledPicture]) -> Tensor:
+        sizes = (np.array([_sizes(each) for each in pictures]) - self.mean) / self.deviation
+        return torch.from_numpy(sizes.astype(np.float32)).to(self.device)
+
+    @torch.inference_mode()
+    def report(self) -> ReliefReport:
+        """Judge the objects that were held out; a touch by each of its fingers."""
+        self.tower.eval()
+        self.head.eval()
+        parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
+        said = torch.cat([self._said(centred(self._images(part), self.kind)) for part in parts]).cpu().numpy()
+        named = np.array(self.families)[said[:, :-2].argmax(1)]
+        families = np.array([each.relief for each in self.validation])
+        worn = np.array([each.amplitude_mm > 0 for each in self.validation])
+        wanted = self._wanted(self.validation).cpu().numpy()
+        pitch, amplitude = (_correlation(said[worn, -2 + place], wanted[worn, place]) for place in (0, 1))
+        everything = [*self.pictures, *self.validation]
+        return ReliefReport(
+            kind=self.kind,
+            pictures=len(everything),
+            objects=len({each.object_id for each in everything}),
+            steps=self.step,
+            families=float((named == families).mean()),
+            chance=1 / len(self.families),
+            pitch=pitch,
+            amplitude=amplitude,
+        )
+
+    def _identity(self) -> dict[str, Any]:
+        return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": len(self.pictures)}
+
+    def _modules(self) -> nn.ModuleDict:
+        return nn.ModuleDict({"tower": self.tower, "head": self.head})
+
+    def _save(self, path: Path) -> None:
+        both = self._modules()
+        tensors = {f"model.{name}": tensor for name, tensor in both.state_dict().items()}
+        for name, parameter in both.named_parameters():
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                tensors[f"optimizer.{name}.{key}"] = value
+        write_tensors(path, _contiguous(tensors), {"step": self.step, **self._identity()})
+
+    def resume(self, path: Path) -> None:
+        """Take over a state. Raises CheckpointError where there is none, or one of another training."""
+        tensors, header = read_tensors(path)
+        if any(header.get(name) != value for name, value in _plain(self._identity()).items()):
+            raise CheckpointError(f"{path} is of another training; resume with the same pictures and settings")
+        both = self._modules()
+        both.load_state_dict({name: tensors[f"model.{name}"] for name in both.state_dict()})
+        for name, parameter in both.named_parameters():
+            prefix = f"optimizer.{name}."
+            kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+            if kept:
+                self.optimizer.state[parameter] = {
+                    key: value if key == "step" else value.to(self.device) for key, value in kept.items()
+                }
+        self.step = header["step"]
+
+
+def augmented(images: Tensor, kind: str, rng: np.random.Generator) -> Tensor:
+    """Other pictures of the same relief, from images (B, 3, H, W): turned by up to .1 rad, 8 % nearer or further,
+    shifted, flipped, in other light, with noise; photos also drawn towards grey, for colour says nothing of relief.
+
+    A gel's colours come from its lamps: they keep their places, so a gel is flipped only top to bottom, where it is
+    the same press with the finger turned, and its channels are scaled alike.
+    """
+    count = len(images)
+
+    def draw(low: float, high: float, *shape: int) -> Tensor:
+        return torch.from_numpy(rng.uniform(low, high, (count, *shape)).astype(np.float32))
+
+    turn, size = draw(-0.1, 0.1), draw(0.92, 1.08)
+    flip = torch.from_numpy(np.where(rng.random(count) < 0.5, -1.0, 1.0).astype(np.float32))
+    shown = VISIBLE if kind == "photo" else 1.0
+    across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
+    cosine, sine = torch.cos(turn) * size * shown, torch.sin(turn) * size * shown
+    shift = draw(-0.1, 0.1, 2) if kind == "photo" else draw(-0.05, 0.05, 2)
+    maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
+    seen = _sampled(images, maps.view(count, 2, 3), shown)
+    if kind == "photo":
+        grey, towards = seen.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
+        seen = torch.lerp(seen, grey.expand_as(seen), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
+        middle = seen.mean((1, 2, 3), keepdim=True)
+        seen = (seen - middle) * draw(0.7, 1.3, 1, 1, 1) + middle + draw(-0.15, 0.15, 1, 1, 1)
+    else:
+        seen = (seen - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
+    noise = torch.from_numpy(rng.standard_normal(seen.shape, dtype=np.float32))
+    return (seen + 0.01 * noise).clamp(0.0, 1.0)
+
+
+def centred(images: Tensor, kind: str) -> Tensor:
+    """What of images is seen where nothing is drawn: the middle of a photo, in grey; a whole gel."""
+    if kind == "touch":
+        return images
+    same = torch.tensor([[VISIBLE, 0.0, 0.0], [0.0, VISIBLE, 0.0]]).expand(len(images), 2, 3)
+    seen = _sampled(images, same, VISIBLE)
+    return seen.mean(1, keepdim=True).expand_as(seen)
+
+
+def _sampled(images: Tensor, maps: Tensor, shown: float) -> Tensor:
+    side = [max(round(shown * length), 1) for length in images.shape[2:]]
+    grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
+    return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
+
+
+def _sizes(picture: LabelledPicture) -> tuple[float, float]:
+    return float(np.log(picture.pitch_mm)), float(np.log(max(picture.amplitude_mm, LEAST_MM)))
+
+
+def _correlation(said: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
+    """Of Pearson; 0 where one of them does not vary."""
+    if len(said) < 2 or said.std() == 0 or wanted.std() == 0:
+        return 0.0
+    return float(np.corrcoef(said, wanted)[0, 1])
+
+
+def _contiguous(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
+
+
+def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+    """As JSON gives it back: lists for tuples."""
+    plain: dict[str, Any] = json.loads(json.dumps(settings))
+    return plain

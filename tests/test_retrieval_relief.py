@@ -1,0 +1,145 @@
+"""A tower learns relief from labelled pictures; its weights begin a matcher's."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from retrieval.data.labelled import load_labelled
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.errors import CheckpointError, DatasetError
+from retrieval.model.checkpoint import read_tensors
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig
+from retrieval.training import relief
+from retrieval.training.relief import augmented, centred, train_relief
+from retrieval.training.train import build_matcher
+
+CONFIG = Config(
+    MatcherConfig(tower="small", tower_output="pooled", hidden=8),
+    TrainingConfig(init="random", precision="float32"),
+    Preprocessing(touch_px=32, photo_px=40, background="difference+0.5"),
+)
+
+
+def write_pictures(folder, kind="photo", objects=24):
+    """Stripes or squares, of pitches 8 to 16 pixels, on every object's picture."""
+    (folder / "images").mkdir(parents=True)
+    (folder / "pictures.json").write_text(json.dumps({"schema_version": 1, "kind": kind, "seed": 0}))
+    rng, lines = np.random.default_rng(0), []
+    for number in range(objects):
+        pitch, squares = 8 + number % 9, number % 2 == 0
+        y, x = np.mgrid[:96, :96]
+        waves = np.sign(np.sin(2 * np.pi * (x + rng.integers(20)) / pitch))
+        if squares:
+            waves = waves * np.sign(np.sin(2 * np.pi * (y + rng.integers(20)) / pitch))
+        picture = np.clip(128 + 60 * waves + rng.normal(0, 5, waves.shape), 0, 255).astype(np.uint8)
+        row = {"object_id": f"thing-{number}", "relief": "squares" if squares else "stripes"}
+        row |= {"file_name": f"images/{number}.png", "pitch_mm": float(pitch), "amplitude_mm": 1.0}
+        cv2.imwrite(str(folder / row["file_name"]), np.repeat(picture[..., None], 3, axis=2))
+        if kind == "touch":
+            row |= {"finger": "a", "before_file_name": f"images/{number}-before.png"}
+            cv2.imwrite(str(folder / row["before_file_name"]), np.full((96, 96, 3), 128, np.uint8))
+        lines.append(json.dumps(row) + "\n")
+    (folder / "metadata.jsonl").write_text("".join(lines))
+    return folder
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(relief, "BATCH", 8)
+    monkeypatch.setattr(relief, "VALIDATION", 0.25)
+
+
+@pytest.mark.parametrize("kind", ["photo", "touch"])
+def test_families_are_told_apart_on_objects_that_were_held_out(quick, tmp_path, kind):
+    folder = write_pictures(tmp_path / "pictures", kind, objects=40)
+    report = train_relief(folder, tmp_path / "tower.safetensors", CONFIG, iterations=60, quiet=True)
+    assert (report.kind, report.objects, report.steps, report.chance) == (kind, 40, 60, 0.5)
+    assert report.families >= 0.9
+
+
+@pytest.mark.parametrize("side", ["photo", "touch"])
+def test_the_weights_begin_the_tower_of_their_side_alone(quick, tmp_path, side):
+    folder, out = write_pictures(tmp_path / "pictures", side), tmp_path / "tower.safetensors"
+    train_relief(folder, out, CONFIG, iterations=3, quiet=True)
+    training = dataclasses.replace(CONFIG.training, **{f"init_{side}": str(out)})
+    made = build_matcher(dataclasses.replace(CONFIG, training=training))
+    taught = read_tensors(out)[0]
+    towers = {"photo": made.photo_tower.state_dict(), "touch": made.touch_tower.state_dict()}
+    other = towers.pop("touch" if side == "photo" else "photo")
+    for name, tensor in towers[side].items():
+        torch.testing.assert_close(tensor, taught[name], rtol=0, atol=0)
+    assert any(not torch.equal(other[name], taught[name]) for name in taught)
+
+
+def test_a_training_that_was_stopped_ends_as_one_that_was_not(quick, tmp_path, monkeypatch):
+    folder = write_pictures(tmp_path / "pictures")
+    train_relief(folder, tmp_path / "whole.safetensors", CONFIG, iterations=8, quiet=True)
+    monkeypatch.setattr(relief, "SAVE_EVERY", 3)
+    steps, loss = [], relief.ReliefTraining._loss
+
+    def breaks_off(self, batch):
+        steps.append(self.step)
+        if len(steps) == 6:
+            raise RuntimeError("the power failed")
+        return loss(self, batch)
+
+    out = tmp_path / "parts.safetensors"
+    with monkeypatch.context() as failing:
+        failing.setattr(relief.ReliefTraining, "_loss", breaks_off)
+        with pytest.raises(RuntimeError, match="the power failed"):
+            train_relief(folder, out, CONFIG, iterations=8, quiet=True)
+    with pytest.raises(CheckpointError, match="--resume"):
+        train_relief(folder, out, CONFIG, iterations=8, quiet=True)
+    with pytest.raises(CheckpointError, match="another training"):
+        train_relief(folder, out, CONFIG, iterations=9, resume=True, quiet=True)
+    train_relief(folder, out, CONFIG, iterations=8, resume=True, quiet=True)
+    whole, parts = (read_tensors(tmp_path / f"{name}.safetensors")[0] for name in ("whole", "parts"))
+    for name, tensor in whole.items():
+        torch.testing.assert_close(parts[name], tensor, rtol=0, atol=0)
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == ["parts.safetensors", "whole.safetensors"]
+
+
+def test_a_gel_keeps_its_left_and_right_and_its_lamps():
+    gel = torch.zeros(64, 3, 20, 20)
+    gel[:, 0, :, :10] = 0.8
+    gel[:, 2, :, 10:] = 0.8
+    seen = augmented(gel, "touch", np.random.default_rng(0))
+    assert (seen[:, 0, :, :5].mean((1, 2)) > seen[:, 0, :, 15:].mean((1, 2))).all()
+    assert (seen[:, 2, :, 15:].mean((1, 2)) > seen[:, 2, :, :5].mean((1, 2))).all()
+
+
+def test_a_photo_that_is_judged_is_its_grey_middle():
+    photo = torch.rand(2, 3, 20, 20)
+    seen = centred(photo, "photo")
+    assert seen.shape == (2, 3, 16, 16)
+    torch.testing.assert_close(seen[:, 1], photo[:, :, 2:18, 2:18].mean(1), atol=1e-5, rtol=0)
+    assert centred(photo, "touch") is photo
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("pictures.json", "{", "retrieve collect --photos-only"),
+        ("pictures.json", '{"kind": "film"}', "kind photo or touch"),
+        ("metadata.jsonl", "", "no picture yet"),
+        ("metadata.jsonl", '{"object_id": "a"}\n', "line 1, is no labelled picture"),
+        ("metadata.jsonl", "[]\n", "line 1, is no labelled picture"),
+    ],
+)
+def test_what_is_no_folder_of_pictures_is_said(tmp_path, file, content, said):
+    folder = write_pictures(tmp_path / "pictures", objects=2)
+    (folder / file).write_text(content)
+    with pytest.raises(DatasetError, match=said):
+        load_labelled(folder)
+
+
+def test_one_family_alone_teaches_nothing(quick, tmp_path):
+    folder = write_pictures(tmp_path / "pictures", objects=4)
+    lines = (folder / "metadata.jsonl").read_text().replace("squares", "stripes")
+    (folder / "metadata.jsonl").write_text(lines)
+    with pytest.raises(DatasetError, match="two families"):
+        train_relief(folder, tmp_path / "tower.safetensors", CONFIG, iterations=2, quiet=True)
