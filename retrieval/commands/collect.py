@@ -1,4 +1,4 @@
-"""`retrieve collect`: a recording, by a rig on its own."""
+"""`retrieve collect`: a recording, by a rig on its own; or labelled pictures of simulated objects."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,8 +7,8 @@ import typer
 
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
-from retrieval.console.progress import CollectBar
-from retrieval.errors import RetrievalError
+from retrieval.console.progress import Bar, CollectBar
+from retrieval.errors import BadInput, RetrievalError
 
 
 def collect(
@@ -26,10 +26,25 @@ def collect(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the motions of one attempt at each object; nothing moves")
     ] = False,
+    photos_only: Annotated[
+        bool,
+        typer.Option(
+            "--photos-only", help="a labelled photo of each simulated object instead: for train --task relief"
+        ),
+    ] = False,
+    touches_only: Annotated[
+        bool,
+        typer.Option("--touches-only", help="a labelled press of each simulated object instead: for the same"),
+    ] = False,
 ) -> None:
     """Collect a recording with a rig on its own; goes on where it was stopped."""
     if dry_run:
         _rehearse(rig, objects, seed)
+        return
+    if photos_only or touches_only:
+        if (photos_only and touches_only) or gate or preview:
+            raise BadInput("--photos-only and --touches-only go alone, without --gate and --preview")
+        _collect_pictures("photo" if photos_only else "touch", rig, objects, out, seed, jobs)
         return
     from functools import partial
 
@@ -85,6 +100,27 @@ def _rehearse(name: str, objects: int, seed: int) -> None:
         for object_id in rig.object_ids(objects):
             attempt = attempter.run(object_id, 0)
             say(f"{object_id}: {attempt.reason or 'nothing was moved, nothing was recorded'}")
+
+
+def _collect_pictures(kind: str, rig: str, objects: int, out: Path, seed: int, jobs: int) -> None:
+    """`--photos-only`, `--touches-only`."""
+    from robot.sim.pictures import collect_pictures
+
+    try:
+        with Bar("collect", objects, "objects") as bar:
+            count = collect_pictures(
+                kind,
+                out,
+                objects=objects,
+                seed=seed,
+                rig=rig,
+                jobs=jobs,
+                progress=lambda done, total: bar.advance(done - bar.done),
+            )
+    except KeyboardInterrupt:
+        say(f"what was made is whole in {out}; the same command goes on with it")
+        raise
+    say(f"{out}: {count} pictures of {objects} objects")
 
 
 def _load_gate(path: Path | None) -> tuple[Any, str | None]:

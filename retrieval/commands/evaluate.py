@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import DEFAULT_PRESET, INIT, SPLIT, Json, Recording, read_split, training_config
+from retrieval.commands.options import (
+    DEFAULT_PRESET,
+    INIT,
+    SPLIT,
+    InitPhoto,
+    InitTouch,
+    Json,
+    Recording,
+    read_split,
+    training_config,
+)
 from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
@@ -24,6 +34,8 @@ def evaluate(
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
+    init_photo: InitPhoto = None,
+    init_touch: InitTouch = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
     seeds: Annotated[int, typer.Option(help="trainings of each method")] = 1,
     seed: Annotated[
@@ -40,7 +52,7 @@ def evaluate(
     from retrieval.methods import METHODS
     from retrieval.report.evaluation import write_report
 
-    if model and (preset or init):
+    if model and (preset or init or init_photo or init_touch):
         raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
     for name, kind in WRITTEN.items():
         require_ours(out / name, kind)
@@ -48,7 +60,9 @@ def evaluate(
         results = run.evaluate(
             recording,
             out,
-            config=training_config(preset, init, iterations, seed),
+            config=training_config(
+                preset, iterations, init=init, init_photo=init_photo, init_touch=init_touch, seed=seed
+            ),
             preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
             methods=methods.split(",") if methods else tuple(METHODS),
             model=model,

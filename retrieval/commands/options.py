@@ -18,10 +18,13 @@ if TYPE_CHECKING:
 DEFAULT_PRESET = "small"
 DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
 INIT = "first weights of the towers: random, imagenet, or a state dict file"
+INIT_OF = "first weights of one tower alone: a file, as `train --task relief` writes it"
 SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
 Model = Annotated[str | None, typer.Option(help=f"checkpoint (default: {DEFAULT_MODEL})")]
+InitPhoto = Annotated[str | None, typer.Option(help=INIT_OF)]
+InitTouch = Annotated[str | None, typer.Option(help=INIT_OF)]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
 
 _BETWEEN = "\0"  # which no word of a command line holds
@@ -80,11 +83,11 @@ def read_split(path: Path | None) -> "Split | None":
         raise BadInput(f"{path} is not a JSON file: {error}") from error
 
 
-def training_config(preset: str | None, init: str | None, iterations: int | None, seed: int | None) -> "Config":
-    """A preset or TOML file, and what options say instead. Raises ConfigError."""
+def training_config(preset: str | None, iterations: int | None, **instead: str | int | None) -> "Config":
+    """A preset or TOML file, and what options say instead of it, each a setting of training. Raises ConfigError."""
     from retrieval.model.config import load_config
 
     config = load_config(preset or DEFAULT_PRESET)
-    changed: dict[str, Any] = {name: value for name, value in {"init": init, "seed": seed}.items() if value is not None}
+    changed: dict[str, Any] = {name: value for name, value in instead.items() if value is not None}
     steps = config.training.iterations if iterations is None else iterations
     return dataclasses.replace(config, training=dataclasses.replace(config.training.of_steps(steps), **changed))

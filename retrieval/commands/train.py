@@ -1,27 +1,34 @@
-"""`retrieve train`: a matcher, or a gate for `retrieve collect`."""
+"""`retrieve train`: a matcher, a tower that sees relief, or a gate for `retrieve collect`."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from retrieval.commands.options import INIT, SPLIT, Recording, read_split, training_config
+from retrieval.commands.options import INIT, SPLIT, InitPhoto, InitTouch, read_split, training_config
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 
 
 def train(
-    recording: Recording,
+    recording: Annotated[
+        Path, typer.Argument(help="recording folder; for relief the folder of labelled pictures", show_default=False)
+    ],
     *,
     task: Annotated[
-        Literal["match", "grasp-success"],
-        typer.Option(help="match: does this touch belong to this photo? grasp-success: did the grasp succeed?"),
+        Literal["match", "relief", "grasp-success"],
+        typer.Option(
+            help="match: does this touch belong to this photo? relief: which relief does one side's picture show, for "
+            "--init-photo or --init-touch; grasp-success: did the grasp succeed?"
+        ),
     ] = "match",
     out: Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")],
     config: Annotated[
         str | None, typer.Option(help="preset (small, mobilenet, paper) or TOML file (default: small)")
     ] = None,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
+    init_photo: InitPhoto = None,
+    init_touch: InitTouch = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the configuration's")] = None,
     seed: Annotated[
         int | None, typer.Option(help="seed of split, pairs and weights, instead of the configuration's")
@@ -29,19 +36,31 @@ def train(
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
 ) -> None:
-    """Train a matcher, or a gate for `collect`, on a recording."""
+    """Train a matcher, a tower that sees relief, or a gate for `collect`."""
+    inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if task == "grasp-success":
-        for option, value in {"--config": config, "--init": init, "--split": split, "--resume": resume}.items():
+        of_others = {"--config": config, "--split": split, "--resume": resume}
+        for option, value in {
+            **of_others,
+            **{f"--{name.replace('_', '-')}": each for name, each in inits.items()},
+        }.items():
             if value:
                 raise BadInput(f"{option} is of matchers; --task grasp-success takes --iterations and --seed")
         _train_gate(recording, out, iterations, seed)
+        return
+    if task == "relief":
+        if split or init_photo or init_touch:
+            raise BadInput(
+                "--task relief takes --config, --init, --iterations, --seed and --resume, and needs no split"
+            )
+        _train_relief(recording, out, config, init, iterations, seed, resume)
         return
     from retrieval.search import defaults
     from retrieval.training import distributed
     from retrieval.training.train import train as train_matcher
 
     try:
-        settings = training_config(config, init, iterations, seed)
+        settings = training_config(config, iterations, seed=seed, **inits)
         checkpoint = train_matcher(recording, out, settings, split=read_split(split), resume=resume)
         if distributed.rank():
             return
@@ -51,6 +70,26 @@ def train(
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
     say(f"{out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
+
+
+def _train_relief(
+    pictures: Path,
+    out: Path,
+    config: str | None,
+    init: str | None,
+    iterations: int | None,
+    seed: int | None,
+    resume: bool,
+) -> None:
+    from retrieval.training.relief import ITERATIONS, train_relief
+
+    settings = training_config(config, None, init=init, seed=seed)
+    report = train_relief(
+        pictures, out, settings, iterations=ITERATIONS if iterations is None else iterations, resume=resume
+    )
+    for line in report.lines():
+        say(line)
+    say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
 
 
 def _train_gate(recording: Path, out: Path, iterations: int | None, seed: int | None) -> None:

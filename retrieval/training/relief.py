@@ -24,7 +24,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.images import to_float
 from retrieval.data.labelled import LabelledPicture, load_labelled
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import CheckpointError, DatasetError, Interrupted
+from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.model.checkpoint import beside, read_tensors, require_writable, write_tensors
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
@@ -75,6 +75,8 @@ def train_relief(
     the first weights are `config.training.init`. resume: go on from the state beside `out`. Ctrl-C keeps a state and
     raises Interrupted. Raises DatasetError, ConfigError, CheckpointError.
     """
+    if iterations < 1:
+        raise ConfigError(f"iterations must be at least 1; got {iterations}")
     kind, pictures = load_labelled(folder)
     require_writable(out)
     training = ReliefTraining(kind, pictures, config, iterations)
