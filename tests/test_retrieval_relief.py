@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from retrieval.commands.main import main
 from retrieval.data.labelled import load_labelled
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import CheckpointError, DatasetError
@@ -143,3 +144,40 @@ def test_one_family_alone_teaches_nothing(quick, tmp_path):
     (folder / "metadata.jsonl").write_text(lines)
     with pytest.raises(DatasetError, match="two families"):
         train_relief(folder, tmp_path / "tower.safetensors", CONFIG, iterations=2, quiet=True)
+
+
+def test_the_command_line_collects_pictures_and_learns_from_them(quick, tmp_path, capsys):
+    small = tmp_path / "small.toml"
+    small.write_text(
+        '[matcher]\ntower = "small"\ntower_output = "pooled"\n[training]\ninit = "random"\n'
+        "[preprocessing]\ntouch_px = 32\nphoto_px = 32\n"
+    )
+    for kind in ("photo", "touch"):
+        pictures, out = tmp_path / kind, tmp_path / f"{kind}.safetensors"
+        words = ["--rig", "sim", "--objects", "6", "--seed", "3", "--out", str(pictures)]
+        assert main(["collect", f"--{'photos' if kind == 'photo' else 'touches'}-only", *words]) == 0
+        words = ["--out", str(out), "--config", str(small), "--iterations", "2"]
+        assert main(["train", str(pictures), "--task", "relief", *words]) == 0
+        assert f"as --init-{kind}" in capsys.readouterr().err
+        assert out.is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["collect", "--photos-only", "--touches-only", "--out", "x"], "go alone"),
+        (["collect", "--photos-only", "--preview", "--out", "x"], "go alone"),
+        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--init-photo", "z"], "needs no split"),
+        (
+            ["train", "x", "--task", "grasp-success", "--out", "y.safetensors", "--init-photo", "z"],
+            "--init-photo is of",
+        ),
+        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--iterations", "0"], "at least 1"),
+        (["train", "x", "--task", "relief", "--out", "y.safetensors"], "--photos-only"),
+    ],
+)
+def test_words_that_do_not_go_together_are_wrong_use(tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) in (1, 2)
+    assert said in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())

@@ -29,12 +29,12 @@ def collect(
     photos_only: Annotated[
         bool,
         typer.Option(
-            "--photos-only", help="a labelled photo of each simulated object instead: for train --task relief"
+            "--photos-only", help="instead: a labelled photo of each simulated object, for train --task relief"
         ),
     ] = False,
     touches_only: Annotated[
         bool,
-        typer.Option("--touches-only", help="a labelled press of each simulated object instead: for the same"),
+        typer.Option("--touches-only", help="instead: a labelled press of each simulated object, for the same"),
     ] = False,
 ) -> None:
     """Collect a recording with a rig on its own; goes on where it was stopped."""

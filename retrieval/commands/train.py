@@ -39,20 +39,15 @@ def train(
     """Train a matcher, a tower that sees relief, or a gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if task == "grasp-success":
-        of_others = {"--config": config, "--split": split, "--resume": resume}
-        for option, value in {
-            **of_others,
-            **{f"--{name.replace('_', '-')}": each for name, each in inits.items()},
-        }.items():
+        for name, value in {"config": config, "split": split, "resume": resume, **inits}.items():
             if value:
+                option = "--" + name.replace("_", "-")
                 raise BadInput(f"{option} is of matchers; --task grasp-success takes --iterations and --seed")
         _train_gate(recording, out, iterations, seed)
         return
     if task == "relief":
         if split or init_photo or init_touch:
-            raise BadInput(
-                "--task relief takes --config, --init, --iterations, --seed and --resume, and needs no split"
-            )
+            raise BadInput("--task relief needs no split, and makes what --init-photo and --init-touch take")
         _train_relief(recording, out, config, init, iterations, seed, resume)
         return
     from retrieval.search import defaults
@@ -84,9 +79,8 @@ def _train_relief(
     from retrieval.training.relief import ITERATIONS, train_relief
 
     settings = training_config(config, None, init=init, seed=seed)
-    report = train_relief(
-        pictures, out, settings, iterations=ITERATIONS if iterations is None else iterations, resume=resume
-    )
+    steps = ITERATIONS if iterations is None else iterations
+    report = train_relief(pictures, out, settings, iterations=steps, resume=resume)
     for line in report.lines():
         say(line)
     say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
