@@ -205,7 +205,7 @@ WRONG_WORDS = {
     "none at all": (["check"], "retrieve check: Missing argument 'recording'"),
     "no touch": (["query", "--top", "3"], "retrieve query: Missing option '--gelsight'"),
     "no number": (["query", "--gelsight", "a.png", "--top", "few"], "retrieve query: Invalid value for '--top'"),
-    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'grasp-success'"),
+    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'relief', 'grasp-success'"),
     "a forgotten folder": (["collect", "--out", "--preview"], "retrieve collect: --out needs a value"),
     "forgotten files": (["query", "--gelsight", "--json"], "retrieve query: --gelsight needs a value"),
     "a forgotten word": (["rig", "check", "--rig"], "retrieve rig: --rig needs a value"),
@@ -245,7 +245,11 @@ def test_the_package_is_the_command_line_too_and_help_lists_choices():
     done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Usage: retrieve train ")
+<<<<<<< HEAD
     assert "match|grasp-success" in done.stdout
+=======
+    assert "--task <match|relief|grasp-success>" in done.stdout
+>>>>>>> c95d1bb (Tests of the command line: the task relief)
 
 
 @pytest.mark.parametrize(
