@@ -245,11 +245,7 @@ def test_the_package_is_the_command_line_too_and_help_lists_choices():
     done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Usage: retrieve train ")
-<<<<<<< HEAD
-    assert "match|grasp-success" in done.stdout
-=======
-    assert "--task <match|relief|grasp-success>" in done.stdout
->>>>>>> c95d1bb (Tests of the command line: the task relief)
+    assert "match|relief|grasp-success" in done.stdout
 
 
 @pytest.mark.parametrize(
