@@ -50,8 +50,8 @@ def test_an_index_and_the_answer_to_a_query(tmp_path, catalogue, model, touch, c
     assert main(["build-index", str(catalogue), "--model", str(model), "--out", str(index)]) == 0
     generation = index / (index / "CURRENT").read_text().strip()
     check(2, json.loads((generation / "manifest.json").read_text()))
-    check(3, json.loads(next(generation.glob("rows-*.jsonl")).read_text().splitlines()[0]))
-    named = {re.sub(r"-\d+", "-000005", path.name) for path in generation.iterdir()}
+    check(3, json.loads((generation / "rows.jsonl").read_text().splitlines()[0]))
+    named = {path.name for path in generation.iterdir()}
     assert named <= set(re.findall(r"^ {0,2}(\S+\.\w+) ", text_of(PAGE), re.M))
     capsys.readouterr()
     main(["query", "--gelsight", *map(str, touch), "--index", str(index), "--json"])
