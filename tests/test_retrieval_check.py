@@ -13,7 +13,7 @@ from tests import synthetic
 
 def remarks(folder, split=None):
     """What is found, without the notes on what could not be checked."""
-    return [finding for finding in check_recording(folder, split, quiet=True) if finding.severity != "note"]
+    return [finding for finding in check_recording(folder, split) if finding.severity != "note"]
 
 
 class Broken:
@@ -86,16 +86,14 @@ def test_other_clean_recordings_give_no_remark(tmp_path, seed, fingers):
 
 def test_what_is_no_recording_is_an_error(tmp_path):
     with pytest.raises(DatasetError, match=r"recording\.json"):
-        check_recording(tmp_path, quiet=True)
+        check_recording(tmp_path)
 
 
-def test_progress_goes_to_stderr_unless_quiet(recording, capsys):
+def test_progress_goes_to_stderr(recording, capsys):
     check_recording(recording)
     out, err = capsys.readouterr()
     assert out == ""
     assert "check: 180/180 images" in err  # 12 objects, 3 grasps, a photo and two touches before and during each
-    check_recording(recording, quiet=True)
-    assert capsys.readouterr() == ("", "")
 
 
 # Files -----------------------------------------------------------------------------------------------------

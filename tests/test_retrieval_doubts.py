@@ -49,7 +49,7 @@ def edit(path, change):
 
 def test_a_clean_recording_has_no_remark_but_says_what_could_not_be_checked(felt):
     assert remarks(felt) == []
-    kinds = {finding.kind for finding in check_recording(felt, quiet=True)}
+    kinds = {finding.kind for finding in check_recording(felt)}
     assert kinds <= {"unchecked-photos", "unchecked-copies"}
 
 
@@ -234,5 +234,5 @@ def test_near_copies_of_another_object_are_named(broken, how):
     } >= found_in(how)
     for finding in found:
         assert set(finding.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
-    notes = [finding for finding in check_recording(broken.folder, quiet=True) if finding.kind == "unchecked-copies"]
+    notes = [finding for finding in check_recording(broken.folder) if finding.kind == "unchecked-copies"]
     assert any("(touch a)" in note.message for note in notes)

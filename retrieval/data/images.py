@@ -102,7 +102,9 @@ def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
                 check_pixels(image.size, name)
                 image.load()
                 orientation = _orientation(image)
-                rgb = _deep_rgb(image, data, name) if _is_deep(image, data) else _eight_bit_rgb(image, name)
+                # Byte 24 of a PNG file is its bit depth.
+                bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
+                rgb = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
         return np.ascontiguousarray(_upright(rgb, orientation))
     except ImageError:
         raise
@@ -199,13 +201,6 @@ def _webp_size(data: bytes) -> tuple[int, int]:
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     width, height = struct.unpack_from("<HH", data, 26)
     return max(width & 0x3FFF, 1), max(height & 0x3FFF, 1)
-
-
-def _is_deep(image: Image.Image, data: bytes) -> bool:
-    """Whether samples have more than 8 bits: byte 24 of a PNG file (IHDR), BitsPerSample of a TIFF file."""
-    if image.format == "PNG":
-        return data[24] > 8
-    return max(_tiff_tag(image, _BITS, (8,))) > 8
 
 
 def _tiff_tag(image: Image.Image, tag: int, default: tuple[int, ...]) -> tuple[int, ...]:

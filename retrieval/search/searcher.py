@@ -176,12 +176,6 @@ class Searcher:
         codes = held.reader.encode(grasps, references, Stopwatch())
         return Encoded(codes.embeddings, codes.halves)
 
-    @property
-    def default_candidates(self) -> int:
-        """Photos that the classifier judges where a query says no number: as measured on the index, else 1000."""
-        measured = self.generation.manifest.about.get("candidates")
-        return int(measured["k"]) if measured else DEFAULT_CANDIDATES
-
     def _held(self) -> "Searcher":
         """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
         held = copy.copy(self)
@@ -190,8 +184,9 @@ class Searcher:
         return held
 
     def _limit(self, top: int, candidates: int | None) -> int:
-        """Photos that are judged for each grasp."""
-        limit = self.default_candidates if candidates is None else candidates
+        """Photos that are judged for each grasp: as many as asked for, else as measured on the index, else 1000."""
+        measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
+        limit = int(measured["k"]) if candidates is None else candidates
         if top < 1 or limit < 1:
             raise BadInput(f"top and candidates must be 1 or more; got {top} and {limit}")
         return max(top, limit)

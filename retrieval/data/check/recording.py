@@ -24,7 +24,7 @@ _SMALL, _PHOTO = (6, 8), (64, 64)
 _Check = Callable[[Sequence[Grasp], Files], Iterable[Finding]]
 
 
-def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = False) -> list[Finding]:
+def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     """Check every photo and gel image of a recording, those of rejected grasps too, and the split where one is given.
 
     Depth pictures are not opened: nothing is trained on them. A grasp that one check names is left out of the later
@@ -32,7 +32,7 @@ def check_recording(folder: Path, split: Split | None = None, *, quiet: bool = F
     """
     attempts = load_all(folder)
     accepted = require_accepted(folder, attempts)
-    seen = _look_at_all(attempts, quiet)
+    seen = _look_at_all(attempts)
     grasps = [attempt.grasp for attempt in attempts]
     findings = [
         Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
@@ -104,7 +104,7 @@ def _pictures(attempt: Attempt) -> tuple[Path, ...]:
     return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
 
 
-def _look_at_all(attempts: Sequence[Attempt], quiet: bool) -> Files:
+def _look_at_all(attempts: Sequence[Attempt]) -> Files:
     files = sorted({path for attempt in attempts for path in _pictures(attempt)})
     photos = {attempt.grasp.photo for attempt in attempts}
     copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
@@ -123,7 +123,7 @@ def _look_at_all(attempts: Sequence[Attempt], quiet: bool) -> Files:
         )
 
     seen: Files = {}
-    with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images", quiet=quiet) as bar:
+    with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images") as bar:
         for path, found in zip(files, pool.map(look, files), strict=True):
             seen[path] = found
             bar.advance()
