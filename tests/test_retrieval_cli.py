@@ -10,8 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from indexes import KINDS
 from retrieval.commands.main import main
 from retrieval.commands.options import Command
+from retrieval.lab.frontier import APPROXIMATIONS
+from retrieval.methods import METHODS
 from retrieval.search import defaults
 
 
@@ -240,12 +243,26 @@ def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monke
     assert (given[2]["only"], given[2]["quick"]) == (("closing", "contact"), True)
 
 
-def test_the_package_is_the_command_line_too_and_help_lists_choices():
+def test_the_package_is_the_command_line_too():
     asked = [sys.executable, "-m", "retrieval", "train", "--help"]
     done = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("Usage: retrieve train ")
-    assert "match|relief|grasp-success" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "choices"),
+    [
+        ("train", ["match|relief|grasp-success"]),
+        ("build-index", KINDS),
+        ("evaluate", METHODS),
+        ("frontier", APPROXIMATIONS),
+    ],
+)
+def test_help_lists_what_there_is_to_choose_from(command, choices, capsys):
+    assert main([command, "--help"]) == 0
+    words = capsys.readouterr().out.replace(",", " ").split()
+    assert set(choices) <= {word.strip("<>") for word in words}
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from retrieval.commands.options import (
 from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
+from retrieval.methods import METHODS
 
 WRITTEN = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
 
@@ -27,7 +28,9 @@ def evaluate(
     recording: Recording,
     *,
     out: Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")],
-    methods: Annotated[str | None, typer.Option(help="methods to compare, with commas between (default: all)")] = None,
+    methods: Annotated[
+        str | None, typer.Option(help=f"methods to compare, with commas between: {', '.join(METHODS)} (default: all)")
+    ] = None,
     preset: Annotated[
         str | None,
         typer.Option(metavar="PRESET", help="preset (tiny, small, mobilenet, paper) or TOML file (default: small)"),
@@ -49,7 +52,6 @@ def evaluate(
 ) -> None:
     """Compare methods on objects they never saw; goes on where it was stopped. Writes a report."""
     from retrieval.evaluation import run
-    from retrieval.methods import METHODS
     from retrieval.report.evaluation import write_report
 
     if model and (preset or init or init_photo or init_touch):

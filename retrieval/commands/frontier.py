@@ -8,6 +8,7 @@ import typer
 from retrieval.commands.options import Json, Model, Values
 from retrieval.console.output import print_json
 from retrieval.errors import RetrievalError
+from retrieval.lab.frontier import APPROXIMATIONS
 
 
 def frontier(
@@ -18,7 +19,8 @@ def frontier(
     ] = None,
     model: Model = None,
     only: Annotated[
-        Values | None, typer.Option(parser=Values.read, metavar="NAME...", help="these approximations only")
+        Values | None,
+        typer.Option(parser=Values.read, metavar="NAME...", help=f"only some of {', '.join(APPROXIMATIONS)}"),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="smallest sizes, to see that it runs; concludes nothing")
