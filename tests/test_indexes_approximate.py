@@ -9,6 +9,7 @@ from indexes.errors import ParameterError
 from indexes.kinds.ivf import IVFFlatIndex, IVFParameters, IVFPQIndex, IVFPQParameters
 from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.store.folder import IndexStore
+from tests.test_indexes_store import APPROXIMATE
 
 
 def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:
@@ -48,7 +49,7 @@ def test_a_thousand_copies_of_twenty_vectors_lose_naive_hnsw_and_not_ours(tmp_pa
         assert len(set(scores.tolist())) == 1
 
 
-@pytest.mark.parametrize("kind", ["hnsw", "ivf_flat", "ivf_sq8", "ivf_pq"])
+@pytest.mark.parametrize("kind", APPROXIMATE)
 def test_approximate_kinds_find_most_of_the_best_in_clustered_data(kind):
     vectors = clustered(3000, 32, 60)
     index = load_kind(kind).build(vectors, threads=1)

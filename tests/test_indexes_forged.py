@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from indexes.errors import CorruptIndex, IndexesError, LockedIndex, NoIndex, RowError, WriteFailed
-from indexes.store.files import digest
+from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import _own_digest
 from indexes.store.regular import DEEPEST, read_regular
@@ -41,7 +41,7 @@ def forge(folder, change=lambda content: None):
     content = json.loads(path.read_text())
     content.pop("sha256", None)
     for name, must in content["files"].items():
-        must |= {"bytes": (folder / name).stat().st_size, "sha256": digest(folder / name)}
+        must |= {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)}
     change(content)
     path.write_text(json.dumps(content | {"sha256": _own_digest(content)}))
 

@@ -12,7 +12,7 @@ from indexes.store.equal import first_of_equals
 from indexes.store.folder import IndexStore
 from indexes.store.rows import key_of
 from indexes.store.tables import Block
-from tests.test_indexes_store import DIM, EVERY_KIND, FINGERPRINT, names, rows_of, unit
+from tests.test_indexes_store import APPROXIMATE, DIM, EVERY_KIND, FINGERPRINT, names, rows_of, unit
 
 
 def block(start: int, stop: int, **more) -> Block:
@@ -149,7 +149,7 @@ def test_blocks_that_do_not_fit_the_ones_before_are_refused(tmp_path, later, err
 # The structure ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["hnsw", "ivf_flat", "ivf_sq8", "ivf_pq"])
+@pytest.mark.parametrize("kind", APPROXIMATE)
 def test_new_vectors_are_put_into_a_copy_of_the_parents_structure_which_is_not_trained_again(tmp_path, kind):
     store = IndexStore(tmp_path)
     first = grown(store, [block(0, 900)], kind=kind)

@@ -7,7 +7,8 @@ from indexes import load_kind
 from indexes.errors import ParameterError
 from indexes.kinds.base import VectorIndex
 from indexes.kinds.exact import ExactIndex
-from indexes.kinds.measure import disagreements, query_ms, recall_against_exact, sample_queries
+from indexes.kinds.measure import query_ms, recall_against_exact, sample_queries
+from tests.oracle import disagreements
 
 AXES = np.eye(6, dtype=np.float32)
 

@@ -7,7 +7,7 @@ import indexes
 from indexes import load_kind
 from indexes.errors import CorruptIndex, EngineError, ParameterError, VectorError
 from indexes.kinds.exact import ExactIndex
-from indexes.kinds.measure import disagreements
+from tests.oracle import disagreements
 
 KINDS = list(indexes.KINDS)
 EXACT = [name for name in KINDS if load_kind(name).exact]

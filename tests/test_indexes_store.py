@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from indexes import KINDS
+from indexes import KINDS, load_kind
 from indexes.errors import MismatchedIndex, ParameterError, RowError, SelfRetrievalFailed, VectorError
 from indexes.kinds.hnsw import HNSWParameters
 from indexes.kinds.ivf import IVFPQParameters
@@ -19,6 +19,7 @@ from indexes.store.generation import Generation
 DIM = 8
 FINGERPRINT = {"checkpoint": "abc", "preprocessing": "def"}
 EVERY_KIND = list(KINDS)
+APPROXIMATE = [name for name in KINDS if not load_kind(name).exact]
 
 
 def unit(count: int, dim: int = DIM, seed: int = 0) -> np.ndarray:

@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 import indexes
 import retrieval
 import robot
+from indexes.store.files import file_digest
 from retrieval.data.dataset import Split
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (
@@ -28,7 +29,7 @@ from retrieval.model.checkpoint import (
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.judge import GelCheck
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored import file_digest, read_stored
+from retrieval.model.stored import read_stored
 from retrieval.version import __version__
 from tests.conftest import TINY
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.model.stored import file_digest
 from retrieval.search import defaults
 
 

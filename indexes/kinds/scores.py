@@ -75,11 +75,3 @@ def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> 
             row = table[query, slots - start]
             found[query] = best(np.concatenate([scores, row]), np.concatenate([before, slots]), k)
     return np.stack([scores for scores, _ in found]), np.stack([slots for _, slots in found])
-
-
-def score_table(queries: Floats, vectors: Floats) -> Floats:
-    """Every inner product (Q, M) of queries (Q, d) and vectors (M, d), the vectors read block by block."""
-    gridded = on_grid(queries)
-    step = max(1, BLOCK_NUMBERS // max(1, vectors.shape[1]))
-    blocks = [grid_scores(gridded, on_grid(vectors[start : start + step])) for start in range(0, len(vectors), step)]
-    return np.concatenate(blocks, axis=1)

@@ -120,8 +120,8 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(doomed)
 
 
-def digest(path: Path) -> str:
-    """SHA-256 of a regular file, in hexadecimal."""
+def file_digest(path: Path) -> str:
+    """SHA-256 of a regular file, in hexadecimal. Raises OSError."""
     with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 

@@ -21,8 +21,7 @@ the next writer sweeps up what the killed one left.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from os import getpid
 from pathlib import Path
 from typing import Any
@@ -166,9 +165,14 @@ class IndexStore:
         )
         check_about(fingerprint, about or {})
         self._require_ours()
-        with self._lock, self._writing():
-            self._sweep()
-            return self._publish(generation_name(self._next_number()), blocks, job, self_check, keep)
+        try:
+            with self._lock:
+                self._sweep()
+                name = generation_name(max(self._numbers(), default=0) + 1)
+                return self._publish(name, blocks, job, self_check, keep)
+        except OSError as error:
+            where = error.filename or self.path
+            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
 
     def _require_ours(self) -> None:
         """A file called CURRENT in a folder without a generation is not of an index, and would be replaced."""
@@ -195,16 +199,9 @@ class IndexStore:
         files.sync(self.path)
         files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
         generation.folder = self.path / name
-        self._forget(keep)
+        for number in self._numbers()[: -1 - keep]:
+            _discard(self.path / generation_name(number))
         return generation
-
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            where = error.filename or self.path
-            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
 
     def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
         folder = self.path / name
@@ -219,20 +216,11 @@ class IndexStore:
         found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
         return sorted(int(match[1]) for match in found if match)
 
-    def _next_number(self) -> int:
-        return max(self._numbers(), default=0) + 1
-
     def _sweep(self) -> None:
         """Delete what killed writers left, and nothing else."""
         for path in [path for path in self.path.iterdir() if LEFT.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
-
-    def _forget(self, keep: int) -> None:
-        """Delete all generations but the newest and `keep` before it."""
-        numbers = self._numbers()
-        for number in numbers[: max(0, len(numbers) - 1 - keep)]:
-            _discard(self.path / generation_name(number))
 
 
 def generation_name(number: int) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
-from indexes.store.files import digest, durable, encoded
+from indexes.store.files import durable, encoded, file_digest
 from indexes.store.regular import open_regular, read_json
 
 FORMAT, OLDER = 3, 2
@@ -89,7 +89,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 def sealed(folder: Path) -> dict[str, dict[str, Any]]:
     """Size and SHA-256 of every file in the folder."""
-    return {path.name: {"bytes": path.stat().st_size, "sha256": digest(path)} for path in sorted(folder.iterdir())}
+    return {path.name: {"bytes": path.stat().st_size, "sha256": file_digest(path)} for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -99,7 +99,7 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
         try:
             with open_regular(path) as file:
                 size = os.fstat(file.fileno()).st_size
-            fits = size == must["bytes"] and (not verify or digest(path) == must["sha256"])
+            fits = size == must["bytes"] and (not verify or file_digest(path) == must["sha256"])
         except OSError as error:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
         if size != must["bytes"]:

@@ -1,6 +1,5 @@
 """What a checkpoint's file says of itself, read without PyTorch: enough for a query whose towers run elsewhere."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from indexes.store.files import file_digest
 from indexes.store.regular import open_regular, parse_json
 from retrieval.console.files import HEADER
 from retrieval.errors import BadInput, CheckpointError
@@ -120,9 +120,3 @@ def unreadable(path: Path, error: Exception) -> CheckpointError:
 def unusable(path: Path, error: object) -> CheckpointError:
     """What to raise where a file holds what no matcher of this version is made of."""
     return CheckpointError(f"{path} is not a checkpoint that this version can use: {error}")
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a regular file, in hexadecimal. Raises OSError."""
-    with open_regular(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

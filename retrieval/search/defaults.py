@@ -12,7 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from indexes.store.files import write_atomically
+from indexes.store.files import file_digest, write_atomically
 from indexes.store.regular import read_json
 from retrieval.errors import BadInput, CheckpointError
 
@@ -66,8 +66,6 @@ def model_of(manifest: "Manifest") -> Path:
 
     Raises CheckpointError where none is.
     """
-    from retrieval.model.stored import file_digest
-
     path = Path(str(manifest.about.get("checkpoint")))
     if path.is_file():
         return path

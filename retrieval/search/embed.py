@@ -7,7 +7,7 @@ the towers, as PyTorch's default is, waits for those of its members whose core i
 from collections import Counter, deque
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, TypeVar
 
@@ -30,8 +30,6 @@ R = TypeVar("R")
 BATCH = 16
 READ = 32
 """Files that a thread reads at a time: what a task costs by itself is a tenth of reading and hashing a photo."""
-
-
 HELD = 256
 """Embeddings that were made before and stand in one part, at most: what waits between threads stays small."""
 
@@ -54,15 +52,6 @@ class _Found:
     row: dict[str, Any]
     file: PhotoBytes | None = None
     code: _Code | None = None
-
-
-@dataclass(frozen=True)
-class _Decoded:
-    """A photo's row, and its preprocessed image where it is to be encoded."""
-
-    row: dict[str, Any]
-    image: Image | None
-    code: _Code | None
 
 
 @dataclass(frozen=True)
@@ -118,9 +107,8 @@ class Embedder:
         if not self.photos:
             first = self.skipped[0]
             raise DatasetError(f"no photo in {catalogue.folder} can be read; the first: {first.path}: {first.reason}")
-        if (
-            self.parent is not None and self.embedded + self.resumed < self.photos
-        ):  # what was taken over was rounded when it was made
+        if self.parent is not None and self.embedded + self.resumed < self.photos:
+            # What was taken over was rounded when it was made.
             self.half_error = max(self.half_error, self.parent.manifest.about.get("half_error", 0.0))
 
     def _find(self, catalogue: Catalogue, photos: Sequence[CataloguePhoto]) -> list[_Found | SkippedPhoto]:
@@ -151,23 +139,32 @@ class Embedder:
 
     def _encode(self, found: Sequence[_Found | SkippedPhoto]) -> Part:
         """Decode and encode those that must be. Called on threads."""
-        done = [self._decoded(item) for item in found]
-        skipped = [item for item in done if isinstance(item, SkippedPhoto)]
-        usable = [item for item in done if isinstance(item, _Decoded)]
-        rows = [item.row for item in usable]
-        codes = {item.row["id"]: item.code for item in usable if item.code is not None}
-        new = [item for item in usable if item.image is not None]
+        part, new, images = Part([]), list[dict[str, Any]](), list[Image]()
+        codes = dict[str, _Code]()
+        for item in found:
+            if isinstance(item, SkippedPhoto):
+                part.skipped.append(item)
+                continue
+            image = None if item.file is None else decode_photo(item.file)
+            if isinstance(image, SkippedPhoto):
+                part.skipped.append(image)
+                continue
+            part.rows.append(item.row)
+            if image is not None:
+                new.append(item.row)
+                images.append(self.checkpoint.config.preprocessing.photo(image))
+            elif item.code is not None:
+                codes[item.row["id"]] = item.code
         resumed = sum(code.resumed for code in codes.values())
-        codes |= self._encoded([item.row for item in new], [item.image for item in new if item.image is not None])
+        codes |= self._encoded(new, images)
         if not codes:
-            return Part(rows, skipped)
-        ordered = [codes[row["id"]] for row in rows if row["id"] in codes]
-        return Part(
-            rows,
-            skipped,
-            np.stack([code.embedding for code in ordered]),
-            np.stack([code.half for code in ordered]),
-            max(code.half_error for code in ordered),
+            return part
+        ordered = [codes[row["id"]] for row in part.rows if row["id"] in codes]
+        return replace(
+            part,
+            embeddings=np.stack([code.embedding for code in ordered]),
+            halves=np.stack([code.half for code in ordered]),
+            half_error=max(code.half_error for code in ordered),
             embedded=len(new),
             resumed=resumed,
         )
@@ -186,14 +183,6 @@ class Embedder:
         )
         made = zip(embeddings, stored, errors.tolist(), strict=True)
         return {name: _Code(*of, resumed=False) for name, of in zip(names, made, strict=True)}
-
-    def _decoded(self, item: _Found | SkippedPhoto) -> "_Decoded | SkippedPhoto":
-        if isinstance(item, SkippedPhoto) or item.file is None:
-            return item if isinstance(item, SkippedPhoto) else _Decoded(item.row, None, item.code)
-        image = decode_photo(item.file)
-        if isinstance(image, SkippedPhoto):
-            return image
-        return _Decoded(item.row, self.checkpoint.config.preprocessing.photo(image), None)
 
     def _count(self, part: Part) -> None:
         self.skipped += part.skipped

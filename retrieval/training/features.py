@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from indexes.store.files import file_digest
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
@@ -27,7 +28,6 @@ from retrieval.model.checkpoint import read_tensors, tensors_digest, write_tenso
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, default_device, photo_features, touch_features
 from retrieval.model.fusion import Matcher
-from retrieval.model.stored import file_digest
 from retrieval.training.batches import BatchImages
 
 T = TypeVar("T")

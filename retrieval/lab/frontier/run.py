@@ -7,14 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from indexes.store.files import write_atomically
+from indexes.store.files import file_digest, write_atomically
 from indexes.store.regular import read_json
 from retrieval.console.output import say
 from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation
 from retrieval.lab.frontier.clock import machine
 from retrieval.lab.frontier.points import Row
 from retrieval.lab.frontier.sample import Sample
-from retrieval.model.stored import file_digest
 from retrieval.version import __version__
 
 FORMAT = 1

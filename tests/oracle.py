@@ -1,0 +1,29 @@
+"""Whether results are the best there are, by the scores of every pair."""
+
+import numpy as np
+
+from indexes.kinds.scores import grid_scores, on_grid
+
+
+def disagreements(vectors, queries, scores, slots, tolerance: float) -> list[str]:
+    """Where results (Q, k) claimed to be the best k differ from the exact search; empty when they hold.
+
+    Each score must be the exact score of its slot, the scores must be the best k exact scores (so that a tie
+    partner may stand for another), and no slot may come twice; scores are compared within `tolerance`.
+    """
+    table = grid_scores(on_grid(queries), on_grid(vectors))
+    best = -np.sort(-table, axis=1)[:, : slots.shape[1]]
+    if scores.shape != slots.shape or best.shape != slots.shape:
+        return [f"results must be of shape {best.shape}; got scores {scores.shape} and slots {slots.shape}"]
+    found = []
+    for query, (row, got) in enumerate(zip(slots, scores, strict=True)):
+        if row.min() < 0 or row.max() >= len(vectors):
+            found.append(f"query {query}: slots must be in 0..{len(vectors) - 1}; got {row.tolist()}")
+            continue
+        if len(np.unique(row)) != len(row):
+            found.append(f"query {query}: a slot comes twice in {row.tolist()}")
+        for rank in np.flatnonzero(~(np.abs(got - table[query, row]) <= tolerance)):
+            found.append(f"query {query}, rank {rank + 1}: slot {row[rank]} does not score {got[rank]:.6g}")
+        for rank in np.flatnonzero(~(np.abs(got - best[query]) <= tolerance)):
+            found.append(f"query {query}, rank {rank + 1}: {got[rank]:.6g} is not the best left")
+    return found
