@@ -6,7 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from PIL import Image
 
+from retrieval.commands.main import main
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.views import VIEWS, Box, find_object, square, strip
 from retrieval.errors import ConfigError
@@ -133,3 +135,16 @@ def test_a_photos_features_are_those_of_its_views_side_by_side():
         expected = torch.cat([matcher.photo_tower(photos[..., :32]), matcher.photo_tower(photos[..., 32:])], dim=1)
     torch.testing.assert_close(found, expected)
     assert matcher.head.photo_half.in_features == found.shape[1]
+
+
+def test_a_sheet_shows_what_the_model_sees_of_a_catalogue(tmp_path, model, catalogue, capsys):
+    words = ["build-index", str(catalogue), "--model", str(model), "--out", str(tmp_path / "index")]
+    assert main([*words, "--preview"]) == 0
+    sheet = tmp_path / "index-views.png"
+    assert f"in {sheet}" in capsys.readouterr().err
+    with Image.open(sheet) as picture:
+        assert picture.width == 2 * 48
+        assert picture.height >= 48
+    sheet.write_text("a letter")
+    assert main([*words, "--preview"]) == 2
+    assert sheet.read_text() == "a letter"

@@ -7,8 +7,12 @@ import typer
 
 from indexes import KINDS
 from retrieval.commands.options import Json, Model
+from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import RetrievalError
+
+PREVIEWED = 16
+"""Photos of the catalogue, evenly chosen, that a preview shows."""
 
 
 def build_index(
@@ -36,18 +40,25 @@ def build_index(
     max_ms: Annotated[
         float | None, typer.Option(help="longest search in milliseconds: candidates and judging them")
     ] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="write OUT-views.png: what the model sees of some of the photos")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.search import build, defaults
 
+    sheet = out.resolve().with_name(f"{out.resolve().name}-views.png")
+    if preview:
+        require_ours(sheet, PREVIEW)
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
+    checkpoint = load_checkpoint(path)
     try:
         report = build.build_index(
             catalogue,
-            load_checkpoint(path),
+            checkpoint,
             out,
             objects_from=objects_from,
             kind=kind,
@@ -60,6 +71,14 @@ def build_index(
     defaults.remember("index", out)
     for line in report.lines():
         say(line)
+    if preview:
+        from indexes.store.folder import IndexStore
+        from retrieval.report.views import write_views
+
+        rows = IndexStore(out).open(verify=False).rows
+        chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
+        write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
+        say(f"views: {len(chosen)} photos in {sheet}")
     if json:
         print_json(report.to_dict())
     if report.without_photo:
