@@ -48,10 +48,11 @@ class Box:
         if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not np.less(self.lower, self.upper).all():
             raise RobotConfigError(f"a box must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
 
-    def contains(self, pose: Pose) -> bool:
-        """Whether the point of the pose lies in the box."""
+    def contains(self, pose: Pose, margin_mm: float = 0.0) -> bool:
+        """Whether the point of the pose lies in the box, or at most so far beyond each face."""
         point = pose.as_tuple()[:3]
-        return all(low <= value <= high for low, value, high in zip(self.lower, point, self.upper, strict=True))
+        sides = zip(self.lower, point, self.upper, strict=True)
+        return all(low - margin_mm <= value <= high + margin_mm for low, value, high in sides)
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,14 +67,6 @@ class Rig:
         self.attempt, self.given = attempt or AttemptSettings(), given
         self._on_table: str | None = None
 
-    @classmethod
-    def from_settings(cls, seed: int, settings: Mapping[str, Any]) -> Self:
-        """Build from plain settings: the keywords of the class, `seed` among them or not, of the types it annotates.
-
-        Raises RobotConfigError.
-        """
-        return build(cls, settings, seed=seed)
-
     @property
     def devices(self) -> tuple[Device, ...]:
         """All devices in the order in which they are connected."""
@@ -174,7 +166,7 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
         raise UnknownName(f"no rig is called {name!r}; known: {', '.join(sorted(RIGS))}, or give a .toml file")
     module, class_name = RIGS[name].split(":")
     rig_class: type[Rig] = getattr(import_module(module), class_name)
-    rig = rig_class.from_settings(seed, settings)
+    rig = build(rig_class, settings, seed=seed)
     rig.info |= {"rig": name, "rig_settings": settings}
     return rig
 

@@ -12,21 +12,21 @@ from hypothesis import strategies as st
 
 from robot.drivers.wsg50 import codec, commands
 from robot.drivers.wsg50.codec import Packet, WireError, decode, encode
-from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState
+from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState
 from robot.errors import DeviceError
 from tests.wsg50_packets import COMMANDS, MANUAL_REPLIES, PACKETS, bytes_of
 
 BUILT = {
     "acknowledge": commands.acknowledge(),
-    "disconnect": commands.packet(Command.DISCONNECT),
-    "fast stop": commands.packet(Command.FAST_STOP),
-    "stop": commands.packet(Command.STOP),
-    "get force limit": commands.ask(Command.GET_FORCE_LIMIT),
-    "grasping state every 4E0Eh ms": commands.update(Command.GRASPING_STATE, 0x4E0E),
-    "opening every 1234h ms": commands.update(Command.OPENING, 0x1234),
-    "info": commands.ask(Command.INFO),
-    "grasp 12 mm 34 mm/s": commands.packet(Command.GRASP, 12.0, 34.0),
-    "loop abc": Packet(Command.LOOP, b"abc"),
+    "disconnect": commands.packet(CommandId.DISCONNECT),
+    "fast stop": commands.packet(CommandId.FAST_STOP),
+    "stop": commands.packet(CommandId.STOP),
+    "get force limit": commands.ask(CommandId.GET_FORCE_LIMIT),
+    "grasping state every 4E0Eh ms": commands.update(CommandId.GRASPING_STATE, 0x4E0E),
+    "opening every 1234h ms": commands.update(CommandId.OPENING, 0x1234),
+    "info": commands.ask(CommandId.INFO),
+    "grasp 12 mm 34 mm/s": commands.packet(CommandId.GRASP, 12.0, 34.0),
+    "loop abc": Packet(CommandId.LOOP, b"abc"),
     "move to 34 mm at 56 mm/s, stop on block": commands.move(34.0, 56.0),
 }
 
@@ -94,12 +94,12 @@ def test_the_check_sum_is_not_the_textbook_ccitt():
 
 def test_builders_without_a_printed_packet_pack_what_the_table_says():
     assert commands.home(2) == Packet(0x20, b"\x02")
-    assert commands.packet(Command.RELEASE, 1.0, 2.0) == Packet(0x26, struct.pack("<ff", 1, 2))
-    assert commands.packet(Command.SET_ACCELERATION, 150.0) == Packet(0x30, bytes.fromhex("00001643"))
-    assert commands.packet(Command.SET_FORCE_LIMIT, 40.0) == Packet(0x32, struct.pack("<f", 40))
-    assert commands.packet(Command.SET_SOFT_LIMITS, 5.0, 100.0) == Packet(0x34, struct.pack("<ff", 5, 100))
-    assert commands.ask(Command.OPENING) == Packet(0x43, b"\x00\x00\x00")
-    assert commands.update(Command.FORCE, 20) == Packet(0x45, b"\x01\x14\x00")
+    assert commands.packet(CommandId.RELEASE, 1.0, 2.0) == Packet(0x26, struct.pack("<ff", 1, 2))
+    assert commands.packet(CommandId.SET_ACCELERATION, 150.0) == Packet(0x30, bytes.fromhex("00001643"))
+    assert commands.packet(CommandId.SET_FORCE_LIMIT, 40.0) == Packet(0x32, struct.pack("<f", 40))
+    assert commands.packet(CommandId.SET_SOFT_LIMITS, 5.0, 100.0) == Packet(0x34, struct.pack("<ff", 5, 100))
+    assert commands.ask(CommandId.OPENING) == Packet(0x43, b"\x00\x00\x00")
+    assert commands.update(CommandId.FORCE, 20) == Packet(0x45, b"\x01\x14\x00")
 
 
 def test_replies_mean_what_the_manual_says():
@@ -145,11 +145,11 @@ def test_every_status_and_bit_has_the_number_of_the_manual():
         lambda: commands.grasping_state(b"\x08"),
         lambda: commands.soft_limits(bytes(4)),
         lambda: commands.home(3),
-        lambda: commands.packet(Command.GRASP, math.nan, 1.0),
-        lambda: commands.packet(Command.GRASP, 1e39, 1.0),
-        lambda: commands.update(Command.INFO, 10),
-        lambda: commands.update(Command.FORCE, 0),
-        lambda: commands.update(Command.FORCE, 65536),
+        lambda: commands.packet(CommandId.GRASP, math.nan, 1.0),
+        lambda: commands.packet(CommandId.GRASP, 1e39, 1.0),
+        lambda: commands.update(CommandId.INFO, 10),
+        lambda: commands.update(CommandId.FORCE, 0),
+        lambda: commands.update(CommandId.FORCE, 65536),
         lambda: Packet(0xAA),
         lambda: Packet(256),
         lambda: Packet(1, bytes(codec.MAX_PAYLOAD + 1)),
@@ -198,7 +198,7 @@ def test_three_aa_must_stand_in_a_row():
     "payload", [b"\xaa\xaa\xaa", b"\xaa" * 7, b"x\xaa\xaa\xaa\x22\x00\x00", b"\xaa\xaa\xaa\xaa\x06"]
 )
 def test_a_preamble_inside_a_payload_splits_no_packet(payload):
-    packet = Packet(Command.LOOP, payload)
+    packet = Packet(CommandId.LOOP, payload)
     stream = encode(packet) + encode(packet)
     assert len(stream.split(codec.PREAMBLE)) > 3  # a public driver cuts there: two packets make two cuts, not more
     assert all_packets(stream) == [packet, packet]
@@ -206,14 +206,14 @@ def test_a_preamble_inside_a_payload_splits_no_packet(payload):
 
 
 def test_a_whole_packet_inside_a_payload_stays_inside():
-    packet = Packet(Command.LOOP, bytes_of("fast stop"))
+    packet = Packet(CommandId.LOOP, bytes_of("fast stop"))
     assert all_packets(encode(packet)) == [packet]
 
 
 @pytest.mark.parametrize("name", PACKETS)
 def test_a_packet_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
     good = bytes_of(name)
-    after = Packet(Command.LOOP, bytes(range(16)))
+    after = Packet(CommandId.LOOP, bytes(range(16)))
     close = bytes(codec.MAX_PAYLOAD)  # a flipped length may claim so much more
     for bit in range(8 * len(good)):
         bad = bytearray(good)

@@ -19,7 +19,7 @@ from robot.drivers.wsg50 import codec as wsg50_codec
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50 import link as wsg50_link
 from robot.drivers.wsg50.codec import Packet, decode, encode
-from robot.drivers.wsg50.commands import Command, Status
+from robot.drivers.wsg50.commands import CommandId, Status
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoEcho, NoReply, Port
 from robot.errors import DeviceError
@@ -118,7 +118,7 @@ class Timed:
 
     def write(self, data):
         packet = decode(data)[1]
-        if self.echoes and packet and packet.id == Command.LOOP:
+        if self.echoes and packet and packet.id == CommandId.LOOP:
             self.told = reply(packet, packet.payload)
 
     def close(self): ...
@@ -126,7 +126,7 @@ class Timed:
 
 TABLE = wsg50_codec._TABLE
 HALF = b"\xaa\xaa\xaa\x06\xff\x00"
-UPDATE = encode(Packet(Command.SYSTEM_STATE, OK + bytes(4)))
+UPDATE = encode(Packet(CommandId.SYSTEM_STATE, OK + bytes(4)))
 FLOODS = pytest.mark.parametrize(
     "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
 )
@@ -155,7 +155,7 @@ def reply(packet, parameters=b"", status=0):
 
 def echoing(packet):
     """Answers LOOP, and nothing else."""
-    return reply(packet, packet.payload) if packet.id == Command.LOOP else b""
+    return reply(packet, packet.payload) if packet.id == CommandId.LOOP else b""
 
 
 def linked(peer, timeout_s=0.2):
@@ -185,14 +185,14 @@ def test_a_loopback_port_gives_back_what_it_is_given():
 
 def test_a_reply_is_found_among_updates_and_noise():
     def answer(packet):
-        if packet.id == Command.LOOP:
+        if packet.id == CommandId.LOOP:
             return echoing(packet)
-        update = encode(Packet(Command.OPENING, OK + b"\x00\x00\x16\x43"))
+        update = encode(Packet(CommandId.OPENING, OK + b"\x00\x00\x16\x43"))
         return update + b"\xaa\xaa noise" + update + reply(packet, b"\x00\x00\x20\x42")
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 40.0
-        assert commands.number(link.updates[Command.OPENING][0]) == 150.0
+        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 40.0
+        assert commands.number(link.updates[CommandId.OPENING][0]) == 150.0
 
 
 def test_pending_is_not_the_end_of_a_command():
@@ -200,27 +200,27 @@ def test_pending_is_not_the_end_of_a_command():
         return echoing(packet) or reply(packet, status=Status.CMD_PENDING) + reply(packet)
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.call(Packet(Command.TARE)) == b""
-        link.begin(Packet(Command.HOME, b"\0"))
-        assert [link.poll(Command.HOME, 1.0), link.poll(Command.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
-        assert link.poll(Command.HOME, 0.01) is None
+        assert link.call(Packet(CommandId.TARE)) == b""
+        link.begin(Packet(CommandId.HOME, b"\0"))
+        assert [link.poll(CommandId.HOME, 1.0), link.poll(CommandId.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
+        assert link.poll(CommandId.HOME, 0.01) is None
 
 
 def test_another_status_than_success_says_which_command_and_why():
     with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
         with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
-            link.tell(Packet(Command.STOP))
+            link.tell(Packet(CommandId.STOP))
         assert caught.value.status is Status.ACCESS_DENIED
-        assert peer.heard.count(Command.STOP) == 1  # an answer is an answer
+        assert peer.heard.count(CommandId.STOP) == 1  # an answer is an answer
 
 
 def test_silence_ends_with_the_deadline_and_is_asked_three_times():
     with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
         started = time.monotonic()
         with pytest.raises(NoReply, match=r"INFO \(50h\) within 0.05 s"):
-            link.ask(commands.ask(Command.INFO), commands.info)
+            link.ask(commands.ask(CommandId.INFO), commands.info)
         assert time.monotonic() - started < 5
-        assert peer.heard.count(Command.INFO) == 3
+        assert peer.heard.count(CommandId.INFO) == 3
         assert link.counts["asked again"] == 2
 
 
@@ -230,10 +230,10 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
     [
         (lambda link: link.pump(0.05), None),
         (lambda link: link.pump(0.0), None),
-        (lambda link: link.poll(Command.HOME, 0.05), None),
+        (lambda link: link.poll(CommandId.HOME, 0.05), None),
         (lambda link: link.sync(), NoEcho),
-        (lambda link: link.urgent(Packet(Command.STOP)), NoReply),
-        (lambda link: link.tell(Packet(Command.STOP)), NoEcho),
+        (lambda link: link.urgent(Packet(CommandId.STOP)), NoReply),
+        (lambda link: link.tell(Packet(CommandId.STOP)), NoEcho),
     ],
 )
 def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
@@ -250,11 +250,11 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
 @pytest.mark.parametrize(
     ("wait", "time_outs"),
     [
-        (lambda link: link.poll(Command.HOME, 0.1), 1),
-        (lambda link: link.urgent(Packet(Command.STOP)), 1),
+        (lambda link: link.poll(CommandId.HOME, 0.1), 1),
+        (lambda link: link.urgent(Packet(CommandId.STOP)), 1),
         (lambda link: link.sync(), 3),
-        (lambda link: link.call(Packet(Command.STOP)), 4),
-        (lambda link: link.tell(Packet(Command.STOP)), 7),
+        (lambda link: link.call(Packet(CommandId.STOP)), 4),
+        (lambda link: link.tell(Packet(CommandId.STOP)), 7),
         (lambda link: link.pump(0.0), 0),
     ],
     ids=["poll", "urgent", "sync", "call", "tell", "pump"],
@@ -295,16 +295,16 @@ def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end(
 
 
 def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
-    updates = b"".join(encode(Packet(Command.OPENING, OK + struct.pack("<f", each))) for each in range(800))
+    updates = b"".join(encode(Packet(CommandId.OPENING, OK + struct.pack("<f", each))) for each in range(800))
 
     def answer(packet):
         return echoing(packet) or reply(packet) + updates
 
     with Peer(answer) as peer, linked(peer) as link:
-        link.tell(Packet(Command.STOP))
+        link.tell(Packet(CommandId.STOP))
         time.sleep(0.2)
         link.pump(0.0)
-        assert commands.number(link.updates[Command.OPENING][0]) == 799.0
+        assert commands.number(link.updates[CommandId.OPENING][0]) == 799.0
 
 
 def test_a_command_that_was_heard_damaged_is_asked_again():
@@ -314,25 +314,25 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
         return echoing(packet) or reply(packet, status=statuses.pop(0))
 
     with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
-        link.tell(Packet(Command.STOP))
-        assert peer.heard.count(Command.STOP) == 2
+        link.tell(Packet(CommandId.STOP))
+        assert peer.heard.count(CommandId.STOP) == 2
         assert link.counts == {"asked again": 1}
 
 
 def test_where_nobody_echoes_nothing_is_asked_again():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoEcho):
-            link.tell(Packet(Command.STOP))
+            link.tell(Packet(CommandId.STOP))
         until(lambda: len(peer.heard) == 3)
         time.sleep(0.1)
-        assert peer.heard == [Command.LOOP] * 3
+        assert peer.heard == [CommandId.LOOP] * 3
 
 
 def test_a_gripper_that_echoes_nothing_is_not_there():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoReply, match="is it on, and connected"):
-            link.call(Packet(Command.STOP))
-        assert set(peer.heard) == {Command.LOOP}  # nothing was told to a line in doubt
+            link.call(Packet(CommandId.STOP))
+        assert set(peer.heard) == {CommandId.LOOP}  # nothing was told to a line in doubt
 
 
 def test_a_late_reply_is_never_taken_for_the_present_one():
@@ -340,7 +340,7 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
     late = []
 
     def answer(packet):
-        if packet.id == Command.LOOP:
+        if packet.id == CommandId.LOOP:
             return b"".join(late) + echoing(packet)
         if not late:
             late.append(reply(packet, b"\x00\x00\x80\x3f"))  # 1.0
@@ -349,8 +349,8 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
 
     with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
         with pytest.raises(NoReply):
-            link.call(commands.ask(Command.GET_FORCE_LIMIT))
-        assert commands.number(link.call(commands.ask(Command.GET_FORCE_LIMIT))) == 2.0
+            link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
+        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 2.0
         assert link.counts["unexpected"] == 1
 
 
@@ -359,11 +359,11 @@ def test_a_doubled_reply_raises_doubt_before_the_next_command():
         return echoing(packet) or 2 * reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
-        link.call(commands.ask(Command.GET_FORCE_LIMIT))
+        link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
         link.pump(0.05)
-        loops = peer.heard.count(Command.LOOP)
-        link.call(commands.ask(Command.GET_ACCELERATION))
-        assert peer.heard.count(Command.LOOP) == loops + 1
+        loops = peer.heard.count(CommandId.LOOP)
+        link.call(commands.ask(CommandId.GET_ACCELERATION))
+        assert peer.heard.count(CommandId.LOOP) == loops + 1
 
 
 def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
@@ -373,7 +373,7 @@ def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
         return echoing(packet) or half + reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert commands.number(link.call(commands.ask(Command.GET_FORCE_LIMIT))) == 1.0
+        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 1.0
         assert link.counts["given up"] >= 1
 
 
@@ -384,15 +384,15 @@ def test_replies_of_the_wrong_length_are_asked_again():
         return echoing(packet) or reply(packet, answers.pop(0))
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number) == 1.0
+        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 1.0
         assert answers == []
 
 
 def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
     with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
         link.doubt()
-        link.urgent(Packet(Command.STOP))
-        assert peer.heard == [Command.STOP]
+        link.urgent(Packet(CommandId.STOP))
+        assert peer.heard == [CommandId.STOP]
 
 
 def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
@@ -403,7 +403,7 @@ def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
             link.sync()
         assert not link.is_open
         with pytest.raises(LinkLost, match="must be open"):
-            link.tell(Packet(Command.STOP))
+            link.tell(Packet(CommandId.STOP))
         link.close()
     with Peer(echoing) as other:
         link.name = other.url

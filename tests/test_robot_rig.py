@@ -162,8 +162,8 @@ def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
         ("meshes = 3", "meshes must be a text in quotes, got 3"),
         ('fingers = "ab"', "fingers must be a list, each of them a text in quotes, got 'ab'"),
         ('families = ["ring", 3]', r"families must be a list, each of them a text in quotes, got \['ring', 3\]"),
-        ("localisation_mm = 3", "localisation_mm must be a list, each of them a number, got 3"),
-        ("contact_grid = [120.0, 160.0]", "contact_grid must be a list, each of them a whole number"),
+        ("localisation_mm = 3", "localisation_mm must be a list of 2, each of them a number, got 3"),
+        ("contact_grid = [120.0, 160.0]", "contact_grid must be a list of 2, each of them a whole number"),
     ],
 )
 def test_a_setting_of_another_type_says_which_is_wanted(tmp_path, setting, said):

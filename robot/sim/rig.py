@@ -4,7 +4,7 @@ import hashlib
 import math
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ from robot.grasping.settings import attempt_of
 from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
 from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
-from robot.settings import check_range
+from robot.settings import TypedSettings, limited
 from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.marks import Markers
 from robot.sim.gel.sensor import draw_sensor
@@ -75,52 +75,68 @@ class World:
         return grip is not None and self.pose.z_mm > grip.pose.z_mm + 1.0
 
 
-class SimRig(Rig):
-    """Arm, gripper with a gel on each of `fingers`, and an RGB-D camera over a table with procedural objects.
+@dataclass(frozen=True, kw_only=True)
+class SimSettings(TypedSettings):
+    """What the simulated rig is like.
 
-    `optics`: led, or a sensor fitted to real presses (gelsight, gelsight_mini). `gels`: gels wear out and are replaced;
-    so many pairs serve, each for its share of the objects. `markers`: black dots on the gels. `families`: only shapes
-    of these. `meshes`: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`).
-    `contact_grid` (rows, columns) and `contact_tolerance` of the contact solver. `shadow`: whether the lamp casts one.
-    `localisation_mm`: how far off the camera's calibration is, drawn from this range. `grasp`, `attempt` and `gel` are
-    the tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: force and place of a grasp
+    fingers: those with a gel. optics: led, or a sensor fitted to real presses (gelsight, gelsight_mini). gels: so many
+    pairs serve one after the other, each for its share of the objects. markers: black dots on the gels. families: only
+    shapes of these. meshes: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). contact_grid
+    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one.
+    localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
+    tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: force and place of a grasp
     (robot.grasping.plan.GraspSettings), how attempts are made (robot.grasping.settings.AttemptSettings), and what the
-    gels are made of (robot.gel_settings.GelSettings); what is not said of a gel is drawn for each.
-    Raises RobotConfigError, UnknownName, SceneError.
+    gels are made of (robot.gel_settings.GelSettings); what is not known of a gel is drawn for each.
     """
 
+    fingers: Sequence[str] = ("a", "b")
+    optics: str = "led"
+    gels: int = limited(1, 1000, 1, unit="pairs")
+    markers: bool = False
+    families: Sequence[str] = ()
+    meshes: str = ""
+    contact_grid: tuple[int, int] = (120, 160)
+    contact_tolerance: float = limited(1e-12, 0.999, 1e-2)
+    shadow: bool = True
+    localisation_mm: tuple[float, float] = (5.0, 10.0)
+    grasp: Mapping[str, Any] = field(default_factory=dict)
+    attempt: Mapping[str, Any] = field(default_factory=dict)
+    gel: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        super().__post_init__()
+        fingers, (rows, columns) = self.fingers, self.contact_grid
+        if not fingers or len(set(fingers)) != len(fingers) or set(fingers) - set(SIDES):
+            raise RobotConfigError(f'fingers must be ["a"], ["b"] or ["a", "b"], got {list(fingers)}')
+        if unknown := sorted(set(self.families) - set(SHAPES)):
+            raise RobotConfigError(f"families must be of {', '.join(sorted(SHAPES))}; got {unknown[0]!r}")
+        if not 3 <= rows <= columns <= 2000 or 4 * rows != 3 * columns:
+            raise RobotConfigError(f"contact_grid must be 3 to 2000, 3 rows to 4 columns, got {rows}, {columns}")
+        if not 0 <= self.localisation_mm[0] <= self.localisation_mm[1]:
+            raise RobotConfigError(f"localisation_mm must be a range of two lengths, got {self.localisation_mm}")
+
+
+class SimRig(Rig):
+    """Arm, gripper with a gel on each finger, and an RGB-D camera over a table with procedural objects; its keywords
+    are those of SimSettings."""
+
+    Settings = SimSettings
     can_run_jobs: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        seed: int = 0,
-        *,
-        fingers: Sequence[str] = ("a", "b"),
-        optics: str = "led",
-        gels: int = 1,
-        markers: bool = False,
-        families: Sequence[str] = (),
-        meshes: str = "",
-        contact_grid: Sequence[int] = (120, 160),
-        contact_tolerance: float = 1e-2,
-        shadow: bool = True,
-        localisation_mm: Sequence[float] = (5.0, 10.0),
-        grasp: Mapping[str, Any] = {},
-        attempt: Mapping[str, Any] = {},
-        gel: Mapping[str, Any] = {},
-    ) -> None:
+    def __init__(self, seed: int = 0, **settings: Any) -> None:
+        """Raises RobotConfigError, UnknownName, SceneError."""
         check_seed(seed)
-        _check_settings(fingers, families, contact_grid, contact_tolerance, localisation_mm)
-        check_range("gels", gels, 1, 1000, "pairs")
-        self._seed, self._families, self._meshes = seed, tuple(sorted(families)), meshes
-        self._shadow = shadow
-        self._hand = Hand(grid=(contact_grid[0], contact_grid[1]), tolerance=contact_tolerance)
-        drawn = np.random.default_rng([103, seed]).integers(2**31, size=gels)
-        dots = Markers() if markers else None
-        known = gels_of(gel, fingers)
+        asked = SimSettings(**settings)
+        self._seed, self._families, self._meshes = seed, tuple(sorted(asked.families)), asked.meshes
+        self._shadow = asked.shadow
+        self._hand = Hand(grid=asked.contact_grid, tolerance=asked.contact_tolerance)
+        drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
+        dots = Markers() if asked.markers else None
+        fingers, known = asked.fingers, gels_of(asked.gel, asked.fingers)
         self._gels = [
             {
-                finger: replace(draw_sensor(int(pair), finger, optics=optics, gel=known[finger]), markers=dots)
+                finger: replace(draw_sensor(int(pair), finger, optics=asked.optics, gel=known[finger]), markers=dots)
                 for finger in fingers
             }
             for pair in drawn
@@ -132,18 +148,18 @@ class SimRig(Rig):
             SimArm(self.world),
             SimGripper(self.world),
             {finger: SimTactileSensor(self.world, finger) for finger in fingers},
-            SimCamera(self.world, self._camera, _calibration_error(seed, localisation_mm)),
+            SimCamera(self.world, self._camera, _calibration_error(seed, asked.localisation_mm)),
             info={
                 "source": "simulated rig",
-                "sensor": f"simulated GelSight ({optics} optics)",
+                "sensor": f"simulated GelSight ({asked.optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
                 "gels": [{finger: pair[finger].gel.as_recorded() for finger in sorted(pair)} for pair in self._gels],
-                **({"meshes_sha256": _mesh_digest(meshes)} if meshes else {}),
+                **({"meshes_sha256": _mesh_digest(asked.meshes)} if asked.meshes else {}),
             },
             clock=clock,
             sleep=clock.sleep,
-            attempt=attempt_of(attempt, grasp),
+            attempt=attempt_of(asked.attempt, asked.grasp),
         )
         self.attempt.grasp.check(self.arm, self.gripper)
 
@@ -259,26 +275,6 @@ def _may_be(object_id: str, path: Path) -> bool:
     from robot.sim.objects.mesh import object_prefix
 
     return object_id.startswith(object_prefix(path))
-
-
-def _check_settings(
-    fingers: Sequence[str],
-    families: Sequence[str],
-    grid: Sequence[int],
-    tolerance: float,
-    localisation_mm: Sequence[float],
-) -> None:
-    if not fingers or len(set(fingers)) != len(fingers) or set(fingers) - set(SIDES):
-        raise RobotConfigError(f'fingers must be ["a"], ["b"] or ["a", "b"], got {list(fingers)}')
-    if unknown := sorted(set(families) - set(SHAPES)):
-        raise RobotConfigError(f"families must be of {', '.join(sorted(SHAPES))}; got {unknown[0]!r}")
-    whole = len(grid) == 2 and all(isinstance(count, int) and 3 <= count <= 2000 for count in grid)
-    if not whole or 4 * grid[0] != 3 * grid[1]:
-        raise RobotConfigError(f"contact_grid must be two whole numbers, 3 rows to 4 columns, got {list(grid)}")
-    if not 0 < tolerance < 1:
-        raise RobotConfigError(f"contact_tolerance must be between 0 and 1, got {tolerance}")
-    if len(localisation_mm) != 2 or not 0 <= localisation_mm[0] <= localisation_mm[1] < math.inf:
-        raise RobotConfigError(f"localisation_mm must be a range of two lengths, got {list(localisation_mm)}")
 
 
 def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
-from robot.drivers.wsg50.commands import Command
+from robot.drivers.wsg50.commands import CommandId
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import Link
 from robot.emulators.wsg50.gripper import EmulatedWSG50
@@ -29,10 +29,10 @@ def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterat
             link.open()
             try:
                 yield _times(
-                    port, "round trip of a command", trips, lambda link=link: link.call(Packet(Command.LOOP, b"abcd"))
+                    port, "round trip of a command", trips, lambda link=link: link.call(Packet(CommandId.LOOP, b"abcd"))
                 )
                 yield _updates(port, link, seconds)
-                link.tell(Packet(Command.DISCONNECT))
+                link.tell(Packet(CommandId.DISCONNECT))
             finally:
                 link.close()
             with WSG50(port=address) as gripper:
@@ -58,12 +58,12 @@ def _times(port: str, what: str, count: int, call: Callable[[], object]) -> Line
 
 def _updates(port: str, link: Link, seconds: float) -> Line:
     """Count state updates asked for every millisecond."""
-    link.tell(commands.update(Command.SYSTEM_STATE, 1))
+    link.tell(commands.update(CommandId.SYSTEM_STATE, 1))
     count, last, end = 0, None, time.monotonic() + seconds
     while time.monotonic() < end:
         link.pump(0.0005)
-        now = link.updates[Command.SYSTEM_STATE][1]
+        now = link.updates[CommandId.SYSTEM_STATE][1]
         count, last = count + (now != last), now
-    link.tell(commands.ask(Command.SYSTEM_STATE))
+    link.tell(commands.ask(CommandId.SYSTEM_STATE))
     text = f"automatic updates asked for every millisecond: {count / seconds:.0f} a second"
     return Line("gripper", port, text, {"updates_per_s": count / seconds})

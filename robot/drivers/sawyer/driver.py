@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from robot.devices import Arm, Clock
-from robot.drivers.sawyer import messages, straight_line
+from robot.drivers.sawyer import messages
 from robot.drivers.sawyer.messages import Joints, Mount, newest_joints, stands
 from robot.drivers.sawyer.rosbridge import Arrival, RosbridgeLink
 from robot.drivers.sawyer.straight_line import Schedule, way_points
@@ -234,7 +234,7 @@ class Sawyer(Arm):
 
     def _inside(self, pose: Pose) -> Pose:
         """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
-        if not straight_line.is_near(self.workspace, pose, _MARGIN_MM):
+        if not self.workspace.contains(pose, _MARGIN_MM):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(
                 f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; "

@@ -8,19 +8,13 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from robot.readings import Box, Pose
+from robot.readings import Pose
 
 Joints = npt.NDArray[np.float64]
 
 STEP_MM, STEP_RAD = 10.0, math.radians(5.0)
 """Way-points are at most so far apart. Between two, joints go linearly, so that the hand leaves the line by less than
 0.1 mm and is at most 1 % faster than asked (an arm of 0.8 m; a test measures both)."""
-
-
-def is_near(box: Box, pose: Pose, margin_mm: float) -> bool:
-    """Whether the point of a pose is in a box or at most so far beyond each face."""
-    point = pose.as_tuple()[:3]
-    return all(a - margin_mm <= p <= b + margin_mm for a, p, b in zip(box.lower, point, box.upper, strict=True))
 
 
 def way_points(start: Pose, goal: Pose) -> list[Pose]:

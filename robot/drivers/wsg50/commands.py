@@ -18,7 +18,7 @@ from typing import Any
 from robot.drivers.wsg50.codec import Packet, WireError
 
 
-class Command(enum.IntEnum):
+class CommandId(enum.IntEnum):
     """Commands by id."""
 
     LOOP = 0x06
@@ -45,7 +45,7 @@ class Command(enum.IntEnum):
     LIMITS = 0x53
 
 
-UPDATING = frozenset({Command.SYSTEM_STATE, Command.GRASPING_STATE, Command.OPENING, Command.FORCE})
+UPDATING = frozenset({CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE, CommandId.OPENING, CommandId.FORCE})
 """Commands whose reply the gripper can be told to send again and again."""
 
 
@@ -146,7 +146,7 @@ class GripperLimits:
     overdrive_force_n: float
 
 
-def packet(command: Command, *numbers: float) -> Packet:
+def packet(command: CommandId, *numbers: float) -> Packet:
     """A command, with the lengths, speeds, forces or accelerations that it takes."""
     try:
         packed = struct.pack(f"<{len(numbers)}f", *numbers)
@@ -161,25 +161,25 @@ def home(direction: int = 0) -> Packet:
     """Find the reference. direction: 0 as configured, 1 outward, 2 inward."""
     if direction not in (0, 1, 2):
         raise WireError(f"the direction of homing must be 0, 1 or 2, got {direction}")
-    return Packet(Command.HOME, bytes([direction]))
+    return Packet(CommandId.HOME, bytes([direction]))
 
 
 def move(width_mm: float, speed_mm_s: float) -> Packet:
     """Pre-position the fingers, and stop (rather than clamp) when blocked."""
-    return Packet(Command.MOVE, b"\x02" + packet(Command.MOVE, width_mm, speed_mm_s).payload)
+    return Packet(CommandId.MOVE, b"\x02" + packet(CommandId.MOVE, width_mm, speed_mm_s).payload)
 
 
 def acknowledge() -> Packet:
     """End a FAST STOP."""
-    return Packet(Command.ACKNOWLEDGE, b"ack")
+    return Packet(CommandId.ACKNOWLEDGE, b"ack")
 
 
-def ask(command: Command) -> Packet:
+def ask(command: CommandId) -> Packet:
     """Ask for a value; of an UPDATING one this also ends its automatic updates."""
     return Packet(command, bytes(3) if command in UPDATING else b"")
 
 
-def update(command: Command, period_ms: int) -> Packet:
+def update(command: CommandId, period_ms: int) -> Packet:
     """Ask for a value every `period_ms` (1 to 65535) from now on."""
     if command not in UPDATING:
         raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} update themselves, not {command!r}")
@@ -236,7 +236,7 @@ def grasping_state(parameters: bytes) -> GraspingState:
 
 def name_of(command_id: int) -> str:
     """Words for an id, as in "GRASP (25h)"."""
-    name = Command(command_id).name if command_id in list(Command) else "to an unknown command"
+    name = CommandId(command_id).name if command_id in list(CommandId) else "to an unknown command"
     return f"{name} ({command_id:02X}h)"
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from robot.devices import Clock, Gripper
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
-from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState
+from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState
 from robot.drivers.wsg50.link import LinkLost, NoReply
 from robot.drivers.wsg50.motion import Done, Reading, causes, check_ready, read
 from robot.drivers.wsg50.setup import TYPICAL, Setup, WSG50Settings
@@ -95,7 +95,7 @@ class WSG50(Gripper):
             try:
                 self._motions.quiet()
             finally:
-                self._link.tell(Packet(Command.DISCONNECT))
+                self._link.tell(Packet(CommandId.DISCONNECT))
         finally:
             self._link.close()
 
@@ -147,7 +147,7 @@ class WSG50(Gripper):
             self._release(self._further(reading))
         self._setup.set_force(force_n)
         width = max(self._wanted.grasp_width_mm, self._setup.openings[0])
-        packet = commands.packet(Command.GRASP, width, speed_mm_s)
+        packet = commands.packet(CommandId.GRASP, width, speed_mm_s)
         return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_ON))
 
     # More than the contract.
@@ -186,7 +186,7 @@ class WSG50(Gripper):
 
     def _release(self, width_mm: float) -> Reading:
         speed = self._speed_of_opening()
-        return self._run(commands.packet(Command.RELEASE, width_mm, speed), speed, _is_at(width_mm))
+        return self._run(commands.packet(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
 
     def _move(self, width_mm: float, *, closing: bool) -> Reading:
         """Pre-position; when that closes the jaws, with no more than the least force."""

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet, WireError, decode, encode
-from robot.drivers.wsg50.commands import Command, Status, name_of
+from robot.drivers.wsg50.commands import CommandId, Status, name_of
 from robot.errors import DeviceError
 
 _T = TypeVar("_T")
@@ -236,8 +236,8 @@ class Link:
             if number:
                 self.pad()
             token = next(self._tokens).to_bytes(8, "little")
-            self._write(Packet(Command.LOOP, token))
-            if self._echoed(Packet(Command.LOOP, bytes(2) + token)):
+            self._write(Packet(CommandId.LOOP, token))
+            if self._echoed(Packet(CommandId.LOOP, bytes(2) + token)):
                 self._in_doubt, self.has_echoed = False, True
                 return
             self.counts["no echo"] += 1

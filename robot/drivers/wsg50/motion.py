@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet, WireError
-from robot.drivers.wsg50.commands import Command, GraspingState, Status, SystemState, name_of
+from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState, name_of
 from robot.drivers.wsg50.link import CommandFailed, Link, NoReply
 from robot.errors import DeviceError
 
 _log = logging.getLogger(__name__)
-_STOP, _FAST_STOP = Packet(Command.STOP), Packet(Command.FAST_STOP)
-_WATCHED = (Command.SYSTEM_STATE, Command.GRASPING_STATE)
+_STOP, _FAST_STOP = Packet(CommandId.STOP), Packet(CommandId.FAST_STOP)
+_WATCHED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 UPDATE_BYTES = 25
 """Of an update of each: 10 around a payload, and status and value, 6 and 3."""
 
@@ -61,10 +61,10 @@ Done = Callable[[Reading, Status | None], bool]
 def read(link: Link) -> Reading:
     """Ask for all of a Reading. Raises DeviceError."""
     return Reading(
-        link.ask(commands.ask(Command.SYSTEM_STATE), commands.system_state),
-        link.ask(commands.ask(Command.GRASPING_STATE), commands.grasping_state),
-        link.ask(commands.ask(Command.OPENING), commands.number),
-        link.ask(commands.ask(Command.FORCE), commands.number),
+        link.ask(commands.ask(CommandId.SYSTEM_STATE), commands.system_state),
+        link.ask(commands.ask(CommandId.GRASPING_STATE), commands.grasping_state),
+        link.ask(commands.ask(CommandId.OPENING), commands.number),
+        link.ask(commands.ask(CommandId.FORCE), commands.number),
     )
 
 
@@ -138,7 +138,7 @@ class Motions:
     def _say(self, packets: Sequence[Packet]) -> None:
         """One after the other, until one is answered."""
         for number, packet in enumerate(packets, start=1):
-            if packet.id == Command.FAST_STOP:
+            if packet.id == CommandId.FAST_STOP:
                 _log.warning("the gripper does not stop when told to: telling it to FAST STOP")
             try:
                 self.link.urgent(packet)
@@ -176,10 +176,10 @@ class Motions:
 
     def _check_age(self, now: float) -> None:
         """The watchdog: FAST STOP and DeviceError where the gripper has gone silent."""
-        if now - self.link.updates[Command.SYSTEM_STATE][1] <= self.max_age_s:
+        if now - self.link.updates[CommandId.SYSTEM_STATE][1] <= self.max_age_s:
             return
         self.link.pump(0.0)  # it may be this program that was held up: what has come meanwhile counts
-        age = time.monotonic() - self.link.updates[Command.SYSTEM_STATE][1]
+        age = time.monotonic() - self.link.updates[CommandId.SYSTEM_STATE][1]
         if age <= self.max_age_s:
             return
         error = DeviceError(
@@ -195,8 +195,8 @@ class Motions:
     def _moves(self) -> bool:
         """Whether the last updates say that it moves. Notes them in `kept`."""
         try:
-            system = commands.system_state(self.link.updates[Command.SYSTEM_STATE][0])
-            grasping = commands.grasping_state(self.link.updates[Command.GRASPING_STATE][0])
+            system = commands.system_state(self.link.updates[CommandId.SYSTEM_STATE][0])
+            grasping = commands.grasping_state(self.link.updates[CommandId.GRASPING_STATE][0])
         except WireError:
             return True  # not known: look again
         self.kept &= system

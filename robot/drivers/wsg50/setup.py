@@ -10,7 +10,7 @@ from typing import Any
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
-from robot.drivers.wsg50.commands import Command, GraspingState, GripperLimits, Status, SystemState
+from robot.drivers.wsg50.commands import CommandId, GraspingState, GripperLimits, Status, SystemState
 from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost
 from robot.drivers.wsg50.motion import UPDATE_BYTES, Motions, Reading, causes
 from robot.errors import DeviceError, RobotConfigError
@@ -118,7 +118,7 @@ class Setup:
 
     def run(self, may_home: bool) -> None:
         """All of it, over an open line. Homes where the reference is lost, or raises DeviceError where it may not."""
-        self.limits = self.link.ask(commands.ask(Command.LIMITS), commands.limits)
+        self.limits = self.link.ask(commands.ask(CommandId.LIMITS), commands.limits)
         force, speed = self.settings.max_force_n, self.settings.max_speed_mm_s
         least = self.settings.on_finger(self.limits.min_force_n)
         if force < least or speed < self.limits.min_speed_mm_s:
@@ -186,8 +186,8 @@ class Setup:
         """Set the force limit and read it back; a gripper that would clamp harder than asked is not used."""
         settings, least = self.settings, self.limits.min_force_n
         wanted, ceiling = (max(settings.of_gripper(each), least) for each in (force_n, settings.max_force_n))
-        self.link.tell(commands.packet(Command.SET_FORCE_LIMIT, wanted))
-        has = self.link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number)
+        self.link.tell(commands.packet(CommandId.SET_FORCE_LIMIT, wanted))
+        has = self.link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number)
         self._note("force_n", force_n, settings.on_finger(has))
         if has > min(wanted * (1 + _ROUNDING), ceiling):
             raise DeviceError(
@@ -197,18 +197,18 @@ class Setup:
     def read_back(self) -> dict[str, Any]:
         """Everything that the gripper says of its settings; forces as the contract counts them."""
         link = self.link
-        force = link.ask(commands.ask(Command.GET_FORCE_LIMIT), commands.number)
+        force = link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number)
         return {
-            "info": asdict(link.ask(commands.ask(Command.INFO), commands.info)),
-            "limits": asdict(link.ask(commands.ask(Command.LIMITS), commands.limits)),
-            "acceleration_mm_s2": link.ask(commands.ask(Command.GET_ACCELERATION), commands.number),
+            "info": asdict(link.ask(commands.ask(CommandId.INFO), commands.info)),
+            "limits": asdict(link.ask(commands.ask(CommandId.LIMITS), commands.limits)),
+            "acceleration_mm_s2": link.ask(commands.ask(CommandId.GET_ACCELERATION), commands.number),
             "force_limit_n": self.settings.on_finger(force),
             "finger_share": self.settings.finger_share,
             "soft_limits_mm": self._soft_limits(),
         }
 
     def _system_state(self) -> SystemState:
-        return self.link.ask(commands.ask(Command.SYSTEM_STATE), commands.system_state)
+        return self.link.ask(commands.ask(CommandId.SYSTEM_STATE), commands.system_state)
 
     def _end_fast_stop(self) -> None:
         """Say a FAST STOP aloud, and acknowledge it if that is allowed."""
@@ -237,8 +237,8 @@ class Setup:
         if asked := settings.acceleration_mm_s2:
             least, most = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
             self._require("acceleration_mm_s2", asked, least, most)
-            link.tell(commands.packet(Command.SET_ACCELERATION, asked))
-            has = link.ask(commands.ask(Command.GET_ACCELERATION), commands.number)
+            link.tell(commands.packet(CommandId.SET_ACCELERATION, asked))
+            has = link.ask(commands.ask(CommandId.GET_ACCELERATION), commands.number)
             self._note("acceleration_mm_s2", asked, has)
         self._set_soft_limits()
         self.refused.pop("tare", None)
@@ -246,7 +246,7 @@ class Setup:
             self.refused["tare"] = "asked true, but something is held; open it, then call recover()"
         elif settings.tare:
             try:
-                link.tell(Packet(Command.TARE))
+                link.tell(Packet(CommandId.TARE))
             except CommandFailed as error:
                 self.refused["tare"] = f"asked true, but {error}: has it force-measuring fingers, and holds nothing?"
 
@@ -257,7 +257,7 @@ class Setup:
             for each in asked:
                 self._require("soft_limits_mm", each, 0.0, self.limits.stroke_mm)
             self._check_grasp_width(asked[1])
-            self.link.tell(commands.packet(Command.SET_SOFT_LIMITS, *asked))
+            self.link.tell(commands.packet(CommandId.SET_SOFT_LIMITS, *asked))
         has = self._soft_limits()
         self.refused.pop("soft_limits_mm", None)
         if asked and (has is None or not all(map(_near, asked, has))):
@@ -268,7 +268,7 @@ class Setup:
 
     def _soft_limits(self) -> tuple[float, float] | None:
         try:
-            found = self.link.ask(commands.ask(Command.GET_SOFT_LIMITS), commands.soft_limits)
+            found = self.link.ask(commands.ask(CommandId.GET_SOFT_LIMITS), commands.soft_limits)
         except CommandFailed:
             return None
         return found if found[0] < found[1] else None
