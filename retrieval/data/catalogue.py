@@ -15,7 +15,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -91,11 +91,12 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     found = list(_walk(root, "", Path(os.path.realpath(root)), set()))
     skipped = [item for item in found if isinstance(item, SkippedPhoto)]
     files = sorted(item for item in found if isinstance(item, str))
-    photos: list[CataloguePhoto] = []
-    unread: set[str] = set()
+    photos: list[tuple[str, str]] = []
+    ignored, unfit, unread = [], [], set()
     for path in files:
-        ending = _ending(path)
-        if ending not in EXTENSIONS | UNREAD:
+        ending = os.path.splitext(path)[1].lower()
+        if ending not in EXTENSIONS and ending not in UNREAD:
+            ignored += [path] if path != METADATA_FILE else []
             continue
         name = naming.object_of(path)
         if ending in UNREAD:
@@ -104,10 +105,10 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         elif name is None:
             why = ": a number alone" if naming.text == STEM else ""
             skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
+            unfit.append(path)
         else:
-            photos.append(CataloguePhoto(path, name))
-    ignored = [path for path in files if _ending(path) not in EXTENSIONS | UNREAD and path != METADATA_FILE]
-    if not photos and (unfit := [path for path in files if _ending(path) in EXTENSIONS]):
+            photos.append((path, name))
+    if not photos and unfit:
         raise DatasetError(
             f"no photo in {root} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
             "Give folder, stem, or a pattern for paths like this one"
@@ -118,13 +119,12 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         kinds = ", ".join(sorted(EXTENSIONS))
         raise DatasetError(f"no photo ({kinds}) in the catalogue {root}, only {others}{left_out}: {_LAYOUT}")
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
-    strange = sorted(by_photo.keys() - {photo.path for photo in photos})
-    strange += sorted(by_object.keys() - {photo.object_id for photo in photos})
+    strange = sorted(by_photo.keys() - {path for path, _ in photos})
+    strange += sorted(by_object.keys() - {name for _, name in photos})
     return Catalogue(
         root,
         tuple(
-            replace(photo, metadata={**by_object.get(photo.object_id, {}), **by_photo.get(photo.path, {})})
-            for photo in photos
+            CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})}) for path, name in photos
         ),
         tuple(ignored),
         tuple(skipped),
@@ -148,10 +148,6 @@ def decode_photo(file: PhotoBytes) -> RgbImage | SkippedPhoto:
         return decode_rgb(file.data, file.photo.path)
     except ImageError as error:
         return SkippedPhoto(file.photo.path, error.reason)
-
-
-def _ending(path: str) -> str:
-    return os.path.splitext(path)[1].lower()
 
 
 def _walk(folder: Path, prefix: str, root: Path, followed: set[Path]) -> Iterator[str | SkippedPhoto]:
