@@ -117,7 +117,7 @@ def test_what_it_fails_on_costs_one_client(monkeypatch, caplog):
     def broken(*_):
         raise RuntimeError("as a mistake in it would")
 
-    monkeypatch.setitem(wsg50_emulated._ACTIONS, 0x52, broken)
+    monkeypatch.setitem(wsg50_emulated._ACTIONS, 0x33, broken)
     with serve_tcp(EmulatedWSG50()) as url:
         with client_of(url) as client:
             client.sendall(bytes_of("get force limit"))

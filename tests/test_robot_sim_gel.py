@@ -262,7 +262,7 @@ def test_drawn_gels_lie_in_their_ranges_and_their_pictures_stay_off_the_ends():
 
 def test_the_field_is_that_of_a_mini():
     sensor = draw_sensor(0, "a")
-    assert sensor.field_mm == pytest.approx((15.2, 20.3), abs=0.05)
+    assert sensor.field.size_mm == pytest.approx((15.2, 20.3), abs=0.05)
     assert sensor.background(0).shape == (240, 320, 3)
 
 

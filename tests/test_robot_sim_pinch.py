@@ -77,7 +77,7 @@ def test_the_jaws_end_at_the_width_less_both_approaches():
     made = pinch(thing(Slanted()))
     approach = made.contact("a").approach_mm + made.contact("b").approach_mm
     angle = made.turned.yaw_rad
-    pad = SENSORS["a"].field_mm[1] * (1 - 1 / 160)
+    pad = SENSORS["a"].field.size_mm[1] * (1 - 1 / 160)
     width = 20 / math.cos(angle) + pad * abs(math.tan(angle))
     assert made.closed_mm == pytest.approx(width - approach, abs=0.02)
 

@@ -133,7 +133,7 @@ def test_both_gels_carry_the_clamping_force():
     pinch = scene([]).pinch
     for finger in "ab":
         contact = pinch.contact(finger)
-        pixel_area = (SENSORS[finger].field_mm[1] / contact.pressure_mpa.shape[1]) ** 2
+        pixel_area = (SENSORS[finger].field.size_mm[1] / contact.pressure_mpa.shape[1]) ** 2
         assert contact.pressure_mpa.sum() * pixel_area == pytest.approx(12.0, rel=0.02)
 
 

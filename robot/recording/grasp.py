@@ -64,8 +64,10 @@ class RecordedGrasp:
                 object.__setattr__(self, key, _number(key, getattr(self, key)))
         if self.pose is not None:
             object.__setattr__(self, "pose", _pose(self.pose))
+        if not isinstance(self.grasped, bool | np.bool_ | None):
+            raise RecordingError(f"grasped must be true or false, got {self.grasped!r}")
         if self.grasped is not None:
-            object.__setattr__(self, "grasped", _boolean("grasped", self.grasped))
+            object.__setattr__(self, "grasped", bool(self.grasped))
         if self.outcome is not None and self.outcome not in OUTCOMES:
             raise RecordingError(f"outcome must be one of {', '.join(OUTCOMES)}, got {self.outcome!r}")
 
@@ -120,19 +122,13 @@ def check_name(key: str, value: object, optional: bool = False) -> None:
         raise RecordingError(f"{key} must be a non-empty printable string, got {value!r}")
 
 
-def _check_path(column: str, path: object) -> None:
+def _check_path(column: str, path: Any) -> None:
     """A path must stay inside the recording wherever the folder is copied to."""
     if not _IMAGE_KEY.fullmatch(f"{column}_file_name"):
         raise RecordingError(f"{column!r} is no image column; fingers are named by one letter, a to z")
-    if not isinstance(path, str) or not _is_inside(path):
+    parts = PurePosixPath(path).parts if isinstance(path, str) and path.isprintable() else ()
+    if not parts or ".." in parts or path.startswith("/") or re.match("[A-Za-z]:", path) or "\\" in path:
         raise RecordingError(f"{column}_file_name must be a path inside the recording, got {path!r}")
-
-
-def _is_inside(path: str) -> bool:
-    parts = PurePosixPath(path).parts
-    if not parts or ".." in parts or path.startswith("/") or re.match("[A-Za-z]:", path):
-        return False
-    return path.isprintable() and "\\" not in path
 
 
 def _number(key: str, value: object) -> float:
@@ -147,9 +143,3 @@ def _pose(value: object) -> tuple[float, ...]:
     if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__"):
         raise RecordingError(f"pose must be a list of numbers, got {value!r}")
     return tuple(_number("pose", number) for number in value)
-
-
-def _boolean(key: str, value: object) -> bool:
-    if not isinstance(value, bool | np.bool_):
-        raise RecordingError(f"{key} must be true or false, got {value!r}")
-    return bool(value)

@@ -136,7 +136,7 @@ class Pinch:
 
     @cached_property
     def _field_mm(self) -> tuple[float, float]:
-        return next(iter(self.sensors.values())).field_mm if self.sensors else PAD_MM
+        return next(iter(self.sensors.values())).field.size_mm if self.sensors else PAD_MM
 
     @cached_property
     def missed(self) -> str | None:

@@ -10,7 +10,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from robot.drivers.vendor import MakerSettings, load, start_again, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
+T = TypeVar("T", bound=np.generic)
 WIDTH, HEIGHT = 512, 424
 PIPELINES = {
     "opengl": "OpenGLPacketPipeline",
@@ -160,8 +161,9 @@ class Kinect2(Camera):
             with self._frames() as frames:
                 time_s = self.clock()
                 colour, depth_mm = self._register(frames)
-        depth_m = self._in_metre(depth_mm) if depth else None
-        return RGBD(self._upright(colour), depth_m, self._intrinsics, time_s)
+        known = np.isfinite(depth_mm) & (depth_mm > 0)
+        depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
+        return RGBD(self._upright(colour), self._upright(depth_m) if depth else None, self._intrinsics, time_s)
 
     def _register(self, frames: Any) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
         """Colour (RGB) of the pixels of the depth, and the depth in mm, both as copies: their memory goes back."""
@@ -171,10 +173,5 @@ class Kinect2(Camera):
         colour = np.array(registered.asarray(np.uint8)[:, :, 2::-1])
         return colour, np.array(undistorted.asarray(np.float32))
 
-    def _in_metre(self, depth_mm: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        known = np.isfinite(depth_mm) & (depth_mm > 0)
-        depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
-        return np.ascontiguousarray(depth_m[::-1, ::-1] if self._asked.upside_down else depth_m)
-
-    def _upright(self, colour: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        return np.ascontiguousarray(colour[::-1, ::-1] if self._asked.upside_down else colour)
+    def _upright(self, picture: npt.NDArray[T]) -> npt.NDArray[T]:
+        return np.ascontiguousarray(picture[::-1, ::-1] if self._asked.upside_down else picture)

@@ -116,7 +116,12 @@ class RosbridgeLink:
 
     def open(self) -> None:
         """Connect, once: a closed link is replaced by a new one. Raises DeviceError."""
-        connect = _websocket_client()
+        try:
+            from websockets.sync.client import connect
+        except ImportError as error:
+            raise DeviceError(
+                "a robot behind rosbridge needs websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
+            ) from error
         try:
             connection = connect(
                 self.url,
@@ -272,16 +277,6 @@ class RosbridgeLink:
 def _in_short(words: object) -> str:
     """What the other side says, cut off, and harmless on a terminal."""
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(words)[:_WORDS])
-
-
-def _websocket_client() -> Callable[..., Any]:
-    try:
-        from websockets.sync.client import connect
-    except ImportError as error:
-        raise DeviceError(
-            "a robot behind rosbridge needs websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
-        ) from error
-    return connect
 
 
 def _tcp(url: str, timeout_s: float) -> socket.socket:

@@ -22,7 +22,6 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 from robot.drivers.wsg50.codec import PREAMBLE, Packet, decode, encode
 from robot.emulators.interrupts import until_interrupted
@@ -38,22 +37,13 @@ class _Cut(Exception):
     """The line is gone."""
 
 
-class _Line(Protocol):
-    """Bytes to and from one client. `read` and `write` raise OSError where it is gone."""
-
-    def fileno(self) -> int: ...
-    def read(self) -> bytes: ...
-    def write(self, data: bytes) -> None: ...
-    def close(self) -> None: ...
-
-
 @contextlib.contextmanager
 def serve_tcp(emulator: EmulatedWSG50, faults: LineFaults | None = None, *, port: int = 0) -> Iterator[str]:
     """Serve one client at a time on 127.0.0.1; gives the URL for the driver. port 0: any free one."""
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(0.02)
 
-        def wait_for_client(stop: threading.Event) -> _Line | None:
+        def wait_for_client(stop: threading.Event) -> _Socket | _Terminal | None:
             while not stop.is_set():
                 try:
                     return _Socket(server.accept()[0])
@@ -73,7 +63,7 @@ def serve_pty(emulator: EmulatedWSG50, faults: LineFaults | None = None) -> Iter
         path = Path(folder) / "wsg50"
         first = [_Terminal(path)]
 
-        def wait_for_client(stop: threading.Event) -> _Line | None:
+        def wait_for_client(stop: threading.Event) -> _Socket | _Terminal | None:
             return None if stop.is_set() else first.pop() if first else _Terminal(path)
 
         with _thread(lambda stop: _serve(emulator, faults or LineFaults(), wait_for_client, stop)):
@@ -125,6 +115,10 @@ class _Terminal:
     def close(self) -> None:
         os.close(self._own)
         os.close(self._other)
+
+
+_Line = _Socket | _Terminal
+"""Bytes to and from one client; reading and writing raise OSError where it is gone."""
 
 
 @contextlib.contextmanager

@@ -82,11 +82,6 @@ class GelSensor:
         """The part of the gel that the camera sees."""
         return Field(self.rows, self.cols, self.pixel_mm)
 
-    @property
-    def field_mm(self) -> tuple[float, float]:
-        """(height, width) of the field in mm."""
-        return self.field.size_mm
-
     def background(self, seed: int) -> Picture:
         """The untouched gel: (rows, cols, 3) uint8 RGB; the same as render() of no displacement."""
         return self._exposed(_untouched(self), seed)
