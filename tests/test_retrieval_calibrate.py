@@ -5,20 +5,21 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.evaluation.calibrate import (
-    Choice,
+    KWayTest,
     calibrate,
     calibrate_pairs,
     drawn_choices,
     drawn_pairs,
     questions,
     reliability,
-    reliability_bins,
 )
 from retrieval.evaluation.table import ScoreTable
 from retrieval.metrics.pairs import fit_calibration
+from retrieval.metrics.reliability import reliability_bins
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 
 
@@ -71,7 +72,7 @@ def test_the_object_of_a_false_pair_is_drawn_before_its_photo():
 
 def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement():
     owner = np.repeat(np.arange(7), 3)
-    scores = drawn_choices(table_of(np.tile(owner, (21, 1)), owner), Choice(4, photos=2), seed=0)
+    scores = drawn_choices(table_of(np.tile(owner, (21, 1)), owner), KWayTest(4, photos=2), seed=0)
     assert scores.shape == (4 * 21, 4)
     np.testing.assert_array_equal(scores[:21, 0], owner)
     assert all(len(set(row)) == 4 for row in scores.tolist())
@@ -80,9 +81,9 @@ def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement
 
 
 def test_with_few_objects_a_choice_is_among_those_that_there_are():
-    assert drawn_choices(planted(objects=3), Choice(10), seed=0).shape[1] == 3
+    assert drawn_choices(planted(objects=3), KWayTest(10), seed=0).shape[1] == 3
     with pytest.raises(BadInput, match="two objects at least; got 1"):
-        drawn_choices(table_of(np.zeros((2, 2)), [0, 0]), Choice(5), seed=0)
+        drawn_choices(table_of(np.zeros((2, 2)), [0, 0]), KWayTest(5), seed=0)
     with pytest.raises(BadInput, match="two objects at least; got 1"):
         drawn_pairs(table_of(np.zeros((2, 2)), [0, 0]), seed=0)
 
@@ -106,10 +107,9 @@ def test_sums_of_grasps_that_err_alike_get_a_smaller_slope_than_the_sum_of_log_o
     # Naively, by one grasp's calibration, a sum of alike ones is far too sure of itself.
     sums = sets_of(one, 5, 1.0, seed=1)
     scores, labels = drawn_pairs(sums, seed=0)
-    said = (
-        calibrate_pairs(one).probability(scores, grasps=5),
-        calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores),
-    )
+    single = calibrate_pairs(one)
+    added = expit(single.slope * scores + 5 * single.intercept)
+    said = (added, calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores))
     naive, ours = (reliability_bins(probability, labels)["ece"] for probability in said)
     assert ours < 0.04 < 0.08 < naive
 
@@ -144,11 +144,11 @@ def test_a_candidate_is_shown_by_what_the_posterior_makes_of_its_photos():
     """Photos of 3 and 0, and none is another's: log of the mean of e^3 and 1, where the mean is 1.5."""
     owner = np.repeat([0, 1], 2)
     table = table_of(np.tile([3.0, 0.0, 0.0, 3.0], (4, 1)), owner, own=np.zeros((4, 4), dtype=bool))
-    pooled = drawn_choices(table, Choice(2, photos=2), 0, Posterior())
+    pooled = drawn_choices(table, KWayTest(2, photos=2), 0, Posterior())
     assert pooled == pytest.approx(np.full((16, 2), math.log((math.exp(3) + 1) / 2)))
-    assert drawn_choices(table, Choice(2, photos=2), 0) == pytest.approx(np.full((16, 2), 1.5))
+    assert drawn_choices(table, KWayTest(2, photos=2), 0) == pytest.approx(np.full((16, 2), 1.5))
     np.testing.assert_allclose(
-        drawn_choices(table, Choice(2), 0, Posterior()), drawn_choices(table, Choice(2), 0), atol=1e-12
+        drawn_choices(table, KWayTest(2), 0, Posterior()), drawn_choices(table, KWayTest(2), 0), atol=1e-12
     )
 
 
@@ -164,7 +164,7 @@ def test_choices_that_never_err_have_a_finite_slope_and_a_doubt():
 def test_constant_scores_say_nothing_and_get_even_chances(value):
     table = constant(value)
     for photos in (1, 3):
-        found = reliability(calibrate({1: table}), {1: table}, [Choice(5, photos=photos)])
+        found = reliability(calibrate({1: table}), {1: table}, [KWayTest(5, photos=photos)])
         assert found["k5"]["ece"] == pytest.approx(0, abs=1e-12)
         only = {"probability": pytest.approx(0.2), "share": pytest.approx(0.2), "count": 4 * 24}
         assert found["k5"]["bins"] == [only]
@@ -195,7 +195,7 @@ def test_scores_that_say_the_opposite_are_hardly_believed():
 @pytest.mark.parametrize("scale", [1e-6, 1e6, 1e37])
 def test_scores_of_any_size_give_finite_probabilities(scale):
     fitted = calibrate({1: planted(scale=scale)})
-    found = reliability(fitted, {1: planted(seed=1, scale=scale)}, [Choice(5), Choice(10)])
+    found = reliability(fitted, {1: planted(seed=1, scale=scale)}, [KWayTest(5), KWayTest(10)])
     json.dumps({**found, **fitted.to_dict()}, allow_nan=False)
     assert SLOPE_BOUNDS[0] <= fitted.posteriors[1].slope <= SLOPE_BOUNDS[1]
     assert all(0 <= found[name]["ece"] <= 1 for name in ("pairs", "k5", "k10"))
@@ -205,7 +205,7 @@ def test_two_objects_leave_the_posterior_out_and_pairs_in():
     fitted = calibrate({1: planted(objects=2)})
     assert list(fitted.pairs) == [1]
     assert fitted.posteriors == {}
-    assert set(reliability(fitted, {1: planted(objects=2)}, [Choice(2)])) == {"pairs"}
+    assert set(reliability(fitted, {1: planted(objects=2)}, [KWayTest(2)])) == {"pairs"}
     with pytest.raises(BadInput, match="three objects at least"):
         questions(planted(objects=2))
 
@@ -243,7 +243,7 @@ def test_no_probabilities_and_impossible_ones_are_refused():
 def test_what_was_fitted_on_validation_objects_holds_on_others_where_scores_are_made_alike():
     fitted = calibrate({1: views(), 5: views(scale=5)})
     tests = {1: views(seed=7), 5: views(scale=5, seed=7)}
-    found = reliability(fitted, tests, [Choice(5), Choice(5, 5, 3)])
+    found = reliability(fitted, tests, [KWayTest(5), KWayTest(5, 5, 3)])
     assert list(found) == ["pairs", "k5", "k5_g5"]
     assert all(found[name]["ece"] < 0.05 for name in found)
     assert set(fitted.to_dict()) == {"pairs", "posteriors"}
@@ -255,5 +255,5 @@ def test_a_choice_that_the_test_objects_cannot_fill_is_left_out_and_so_is_one_of
     fitted = calibrate({1: planted(objects=4)})
     assert list(fitted.posteriors) == [1]
     test = planted(objects=4, seed=1)
-    found = reliability(fitted, {1: test, 8: test}, [Choice(5), Choice(3), Choice(3, 8, 3)])
+    found = reliability(fitted, {1: test, 8: test}, [KWayTest(5), KWayTest(3), KWayTest(3, 8, 3)])
     assert set(found) == {"pairs", "k3"}

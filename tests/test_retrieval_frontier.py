@@ -13,7 +13,6 @@ from retrieval.lab.frontier.candidates import default_k, ranks
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.correlation import Problem, _by_covariance, _ours, known_problem
 from retrieval.lab.frontier.formats import FORMATS, encoders
-from retrieval.lab.frontier.grasps import sets_of
 from retrieval.lab.frontier.pixels import load_touch
 from retrieval.lab.frontier.points import Panel, Point, Row, duration, missed, number
 from retrieval.lab.frontier.sample import Sample, Scale, blend
@@ -269,11 +268,6 @@ def test_winners_are_the_photos_of_the_highest_logit_and_are_found_once(sample, 
     again = dataclasses.replace(sample)
     monkeypatch.setattr(Sample, "_find_winners", nobody)
     assert again.winners.tolist() == sample.winners.tolist()
-
-
-def test_sets_of_grasps_stay_within_an_object():
-    owner = np.array([0, 1, 0, 1, 1])
-    assert sets_of(owner, 2).tolist() == [[0, 2], [1, 3], [2, 0], [3, 4], [4, 1]]
 
 
 # Canonical correlations ------------------------------------------------------------------------------------

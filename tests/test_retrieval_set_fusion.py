@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from retrieval.methods import set_fusion
-from retrieval.methods.set_fusion import SetHead, neighbours
+from retrieval.methods.selection import neighbours
+from retrieval.methods.set_fusion import SetHead
 from retrieval.model.fusion import FusionHead
 
 

@@ -11,20 +11,20 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.evaluation.protocols import asked
 from retrieval.evaluation.table import ScoreTable, object_scores
 from retrieval.metrics.pairs import Calibration, fit_calibration
+from retrieval.metrics.reliability import reliability_bins
 from retrieval.model.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
 
-BINS = 15
 _PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
 
 
-class Choice(NamedTuple):
+class KWayTest(NamedTuple):
     """A K-way test: the true object among k candidates, after so many grasps, each shown by so many photos."""
 
     k: int
@@ -114,7 +114,7 @@ def _other_photos(table: ScoreTable, count: int, rng: np.random.Generator) -> ND
 
 
 def drawn_choices(
-    table: ScoreTable, choice: Choice, seed: int, posterior: Posterior | None = None
+    table: ScoreTable, choice: KWayTest, seed: int, posterior: Posterior | None = None
 ) -> NDArray[np.float64]:
     """Scores (Q, k) of candidates, the true one first; rivals drawn uniformly, 4 tests a row.
 
@@ -133,7 +133,7 @@ def drawn_choices(
 
 
 def reliability(
-    calibrations: Calibrations, test: Mapping[int, ScoreTable], choices: Sequence[Choice], *, seed: int = 0
+    calibrations: Calibrations, test: Mapping[int, ScoreTable], choices: Sequence[KWayTest], *, seed: int = 0
 ) -> dict[str, Any]:
     """How often what was said came true, on test objects: {"pairs": ..., "k5": ..., "k5_g5": ...}.
 
@@ -154,22 +154,3 @@ def _choice_reliability(logits: NDArray[np.float64], posterior: Posterior) -> di
     tied = logits == logits.max(1, keepdims=True)
     said = [posterior.believe(row, none_prior=0).objects.max() for row in logits]
     return reliability_bins(said, tied[:, 0] / tied.sum(1))
-
-
-def reliability_bins(probability: ArrayLike, came_true: ArrayLike) -> dict[str, Any]:
-    """{"ece", "bins": [{"probability", "share", "count"}]}: means over 15 equal bins, empty ones left out.
-
-    probability, came_true (P,): 1 or 0, or a share where equals were settled by a draw. Expected calibration error:
-    the mean over all of |probability - share| of its bin.
-    """
-    p, y = np.asarray(probability, dtype=np.float64), np.asarray(came_true, dtype=np.float64)
-    if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():
-        raise BadInput(f"probabilities between 0 and 1 and as many outcomes are needed; got {p.shape} and {y.shape}")
-    which = np.minimum((p * BINS).astype(int), BINS - 1)
-    used, place, counts = np.unique(which, return_inverse=True, return_counts=True)
-    said, share = (np.bincount(place, weights=values) / counts for values in (p, y))
-    bins = [
-        {"probability": float(said[row]), "share": float(share[row]), "count": int(counts[row])}
-        for row in range(len(used))
-    ]
-    return {"ece": float((np.abs(said - share) * counts).sum() / len(p)), "bins": bins}

@@ -5,14 +5,13 @@ The gallery of a row never holds photos of its own grasps, except in the two pro
 not asked, and the gallery's words count such rows. Objects count alike: each is a rival as often as any other.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.evaluation.table import ScoreTable, object_scores
 from retrieval.metrics import ranking
+from retrieval.metrics.auc import weight_below
 from retrieval.metrics.guesses import guess_curves
 from retrieval.metrics.measure import Measure, object_means, object_weights
 from retrieval.metrics.pairs import Calibration
@@ -58,18 +57,8 @@ def pair_auc(table: ScoreTable) -> Measure:
     kept = asked(table)
     weights = _rival_weights(kept)
     rows = zip(kept.scores, kept.relevant, kept.relevant & ~kept.own, weights, strict=True)
-    values = [share_below(row[mine], row[~same], weight[~same]).mean() for row, same, mine, weight in rows]
+    values = [weight_below(row[mine], row[~same], weight[~same]).mean() for row, same, mine, weight in rows]
     return _measure(table, kept, np.array(values), 0.5)
-
-
-def share_below(
-    values: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Weighted share of `others` (their weights sum to 1) that each of `values` is above; equals half."""
-    order = np.argsort(others)
-    below = np.append(0.0, np.cumsum(weights[order]))
-    ranks = [np.searchsorted(others[order], values, side) for side in ("left", "right")]
-    return np.asarray((below[ranks[0]] + below[ranks[1]]) / 2)
 
 
 def _halves(table: ScoreTable, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

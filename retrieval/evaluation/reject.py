@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retrieval.evaluation.calibrate import questions
-from retrieval.evaluation.protocols import asked, gallery_words, share_below
+from retrieval.evaluation.protocols import asked, gallery_words
 from retrieval.evaluation.table import ScoreTable
+from retrieval.metrics.auc import weight_below
 from retrieval.metrics.measure import Measure, object_weights
 from retrieval.model.posterior import Posterior
 
@@ -97,7 +98,7 @@ def _areas(present: Floats, absent: Floats, weights: Floats) -> Floats:
 
     DeLong 1988; Obuchowski 1997 for clusters: v = P(present > others' absent) + P(others' present > absent) - area.
     """
-    hits, alarms = share_below(present, absent, weights), 1 - share_below(absent, present, weights)
+    hits, alarms = weight_below(present, absent, weights), 1 - weight_below(absent, present, weights)
     return np.asarray(hits + alarms - np.sum(weights * hits))
 
 

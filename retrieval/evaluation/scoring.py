@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.evaluation import protocols
-from retrieval.evaluation.calibrate import Calibrations, Choice, calibrate, enough_objects, reliability
+from retrieval.evaluation.calibrate import Calibrations, KWayTest, calibrate, enough_objects, reliability
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import SHOWN_PHOTOS, Queries
 from retrieval.evaluation.reject import Rejection, reject
@@ -17,7 +17,7 @@ from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import Calibration
 
-CHOICES = (Choice(5), Choice(10), Choice(5, 5, SHOWN_PHOTOS))
+CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, SHOWN_PHOTOS))
 _CONFUSIONS, _EXAMPLES, _RANKED = 12, 6, 6
 
 Measures = dict[str, Measure]

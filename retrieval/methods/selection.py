@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import NumericalError
+from retrieval.metrics.auc import weight_below
 from retrieval.training.features import Features
 
 MOST_JUDGED = 512
@@ -38,10 +39,8 @@ def ranking_auc(
     for row, (score, owner) in enumerate(zip(scores, touch_owner, strict=True)):
         same = photo_owner == owner
         own = same & ~left_out[row]
-        others = np.sort(score[~same])
-        mine = score[own if own.any() else same]
-        below = np.searchsorted(others, mine, "left") + np.searchsorted(others, mine, "right")
-        values[row] = below.mean() / (2 * len(others))
+        others = score[~same]
+        values[row] = weight_below(score[own if own.any() else same], others).mean() / len(others)
     return float(np.mean([values[touch_owner == owner].mean() for owner in np.unique(touch_owner)]))
 
 

@@ -4,7 +4,6 @@ Ranking uses logits and never what stands here; probabilities are for people to 
 """
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.auc import weight_below
+from retrieval.metrics.reliability import reliability_bins
 
 SLOPE_BOUNDS = (0.01, 100.0)
 _LARGEST = float(np.finfo(np.float32).max)
@@ -19,7 +20,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Calibration:
-    """`log_odds = slope * logit + intercept` for one grasp, fitted on validation pairs at even odds.
+    """`log_odds = slope * logit + intercept`, fitted on validation pairs at even odds.
 
     reject_log_odds: below it the pair is better called "no match" (largest balanced accuracy on those pairs).
     positives, negatives: how many pairs it was fitted on. nll_*, ece_*: mean negative log-likelihood in nats and
@@ -36,37 +37,21 @@ class Calibration:
     ece_before: float
     ece_after: float
 
-    def log_odds(self, logit: ArrayLike, grasps: int = 1) -> NDArray[np.float64]:
-        """Calibrated log-odds of a sum of `grasps` match logits (the grasps taken as independent).
-
-        Raises NumericalError for a logit that is not finite: it is not above any threshold, and would count as "no
-        match".
-        """
+    def log_odds(self, logit: ArrayLike) -> NDArray[np.float64]:
+        """Calibrated log-odds of match logits. Raises NumericalError for one that is not finite: it is above no
+        threshold, and would count as "no match"."""
         z = np.asarray(logit, dtype=np.float64)
         if not np.isfinite(z).all():
             raise NumericalError(f"every logit must be finite to be calibrated; got {z[~np.isfinite(z)][0]}")
-        return self.slope * z + grasps * self.intercept
+        return self.slope * z + self.intercept
 
-    def probability(self, logit: ArrayLike, grasps: int = 1) -> NDArray[np.float64]:
+    def probability(self, logit: ArrayLike) -> NDArray[np.float64]:
         """Probability of a match at even odds, for people; never rank by it."""
-        return _expit(self.log_odds(logit, grasps))
+        return _expit(self.log_odds(logit))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as in `results.json`."""
         return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Calibration":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(data, Mapping) or set(data) != set(names):
-            raise BadInput(f"calibration must hold exactly {', '.join(names)}; got {data!r}")
-        for name, value in data.items():
-            if type(value) not in (int, float) or not np.isfinite(value):
-                raise BadInput(f"calibration must hold finite numbers; {name} is {value!r}")
-        if data["slope"] <= 0:
-            raise BadInput(f"the slope of a calibration must be positive; got {data['slope']}")
-        return cls(**data)
 
 
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
@@ -87,8 +72,8 @@ def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
         negatives=int((1 - y).sum()),
         nll_before=_nll(z, y),
         nll_after=_nll(x, y),
-        ece_before=_ece(z, y),
-        ece_after=_ece(x, y),
+        ece_before=reliability_bins(_expit(z), y)["ece"],
+        ece_after=reliability_bins(_expit(x), y)["ece"],
     )
 
 
@@ -137,14 +122,11 @@ def pair_accuracy(logits: ArrayLike, labels: ArrayLike) -> float:
 def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
     """Chance that a random true pair has a higher logit than a random false one; equals count half.
 
-    Rank-based (Mann-Whitney), so it needs no threshold; a constant scorer has exactly 0.5.
+    It needs no threshold; a constant scorer has exactly 0.5.
     """
     z, y = _checked(logits, labels)
-    positives, negatives = y.sum(), (1 - y).sum()
-    from scipy.stats import rankdata  # slow to import, and no query needs it
-
-    rank_sum = rankdata(z)[y == 1].sum()
-    return float((rank_sum - positives * (positives + 1) / 2) / (positives * negatives))
+    true, false = z[y == 1], z[y == 0]
+    return float(weight_below(true, false).sum() / (len(true) * len(false)))
 
 
 def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -173,13 +155,6 @@ def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 
 def _nll(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
     return float(-np.mean(-np.logaddexp(0, np.where(y == 1, -x, x))))
-
-
-def _ece(x: NDArray[np.float64], y: NDArray[np.float64], bins: int = 15) -> float:
-    p = _expit(x)
-    which = np.minimum((p * bins).astype(int), bins - 1)
-    gaps = np.bincount(which, weights=p - y, minlength=bins)
-    return float(np.abs(gaps).sum() / len(y))
 
 
 def _expit(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.pixels import SLACK, load_touch
 from retrieval.lab.frontier.points import Panel, Row, missed
 from retrieval.lab.frontier.sample import Array, Sample
+from retrieval.methods.selection import neighbours
 from retrieval.model.encode import encode_touches
 
 COUNTS = (1, 2, 3, 4, 5, 8)
@@ -22,7 +23,8 @@ def grasps(sample: Sample) -> Row:
     table = np.array([sample.logits(half, sample.own["half"]) for half in codes])
     counts = [count for count in COUNTS if count <= most]
     points = [
-        missed("", _words(count), _wrong(sample, table, sets_of(owner, count), owner), count == 1) for count in counts
+        missed("", _words(count), _wrong(sample, table, neighbours(owner, count), owner), count == 1)
+        for count in counts
     ]
     points = list(timed(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
     panel = Panel(
@@ -40,15 +42,6 @@ def grasps(sample: Sample) -> Row:
         "touches of its object. The time is that of the computer; the arm's is longer.",
         (panel,),
     )
-
-
-def sets_of(owner: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """(n, count) for each row itself and the next rows of its object, round."""
-    sets = np.empty((len(owner), count), dtype=np.int64)
-    for name in np.unique(owner):
-        rows = np.flatnonzero(owner == name)
-        sets[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(count)) % len(rows)]
-    return sets
 
 
 def _wrong(sample: Sample, table: Array, sets: NDArray[np.int64], owner: NDArray[np.int64]) -> NDArray[np.bool_]:

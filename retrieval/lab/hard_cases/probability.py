@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, log_expit, softmax
 
-from retrieval.evaluation.calibrate import reliability_bins
 from retrieval.evaluation.reject import galleries, statistic
 from retrieval.lab.hard_cases.case import HardCase, refused
 from retrieval.metrics.pairs import fit_calibration
+from retrieval.metrics.reliability import reliability_bins
 from retrieval.model.posterior import Judged, Posterior, fit_posterior
 
 Matrix = NDArray[np.float64]
