@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from retrieval.data.dataset import data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.run import DRAWS
-from retrieval.evaluation.scoring import main_measures, summaries
-from retrieval.evaluation.table import ScoreTable
+from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
+from retrieval.metrics.registry import Scored, take
+from retrieval.metrics.table import ScoreTable
 from retrieval.model.config import Config, load_config
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.train import build_matcher
@@ -112,11 +113,11 @@ def first_grasps(features: Features, most: int) -> Features:
 
 def judge(method: Method, validation: Features, unseen: Features) -> dict[str, Any]:
     """Summaries of the measures on unseen objects, by name."""
-    fitted = calibrate_pairs(scored(method, validation), seed=0)
-    return summaries([main_measures(scored(method, unseen), fitted, seed=0)], DRAWS, seed=0)
+    fitted, table = calibrate_pairs(scores_of(method, validation), seed=0), scores_of(method, unseen)
+    return summaries([take(Scored(table, table, {}, fitted, seed=0), SHOWN)], DRAWS, seed=0)
 
 
-def scored(method: Method, features: Features) -> ScoreTable:
+def scores_of(method: Method, features: Features) -> ScoreTable:
     """Every touch with every photo."""
     scores = method.score(method.encode_touch(features.touch), method.encode_photo(features.photo))
     return ScoreTable(scores, features.owner, features.owner, np.eye(len(features), dtype=bool))

@@ -17,9 +17,9 @@ from retrieval.evaluation.calibrate import (
     questions,
     reliability,
 )
-from retrieval.evaluation.table import ScoreTable
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.metrics.reliability import reliability_bins
+from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 
 

@@ -1,6 +1,7 @@
 """Calibration of match logits and the two pair metrics: by hand, by grids and loops, and where logits are extreme."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np

@@ -6,21 +6,29 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
-from retrieval.evaluation.protocols import (
+from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.protocols import (
+    average_precision,
     confusions,
-    full_gallery,
     k_way,
-    objectfolder,
     pair_accuracy,
     pair_auc,
     paired,
     per_object,
+    recall,
+    reciprocal_rank,
     true_ranks,
 )
-from retrieval.evaluation.table import ScoreTable, object_scores
-from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.registry import METRICS, SET_SIZES, Scored, of_grasps, take
+from retrieval.metrics.table import ScoreTable, object_scores
 
 EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
+
+
+def full_gallery(table):
+    """Every measure of the whole gallery."""
+    recalls = {f"recall_{k}": recall(table, k) for k in (1, 5, 10)}
+    return {**recalls, "mrr": reciprocal_rank(table), "map": average_precision(table)}
 
 
 def table_of(scores, touch_owner, photo_owner=None, own=None):
@@ -214,7 +222,7 @@ def test_without_equals_one_order_is_all_there_is():
     rng = np.random.default_rng(3)
     table = uneven()
     table = table_of(rng.permutation(196).reshape(14, 14), table.touch_owner)
-    found, shown = full_gallery(table), objectfolder(table)
+    found, shown = full_gallery(table), average_precision(table.with_own())
     for row in range(14):
         places = ranked_places(table, row, False, range(14))
         assert found["mrr"].values[row, 0] == 1 / places[0]
@@ -230,7 +238,7 @@ def test_the_own_photo_would_flatter_a_scorer_that_knows_the_lighting_of_each_gr
     """Its own photo first, all else equal: chance where that is left out, more than twice chance where it is not."""
     blind = constant(objects=10, grasps=4)
     table = table_of(np.eye(40), blind.touch_owner)
-    left_out, included = full_gallery(table)["map"], objectfolder(table)
+    left_out, included = full_gallery(table)["map"], average_precision(table.with_own())
     assert values_of(left_out).mean() == pytest.approx(left_out.chance[0])
     assert values_of(included).mean() > 2 * included.chance[0]
     assert "included" in included.gallery
@@ -253,30 +261,52 @@ def paired_by_loops(table, k):
 def test_a_paired_batch_is_that_of_two_loops_both_ways():
     table = uneven(values=4)
     for k in (1, 5):
-        found = paired(table)[f"paired_top{k}"]
+        found = paired(table, k)
         np.testing.assert_allclose(values_of(found), paired_by_loops(table, k), atol=1e-12)
         assert found.chance[0] == k / 14
 
 
 def test_in_a_paired_batch_another_photo_of_the_object_is_a_wrong_answer():
     table = knowing()
-    assert values_of(paired(table)["paired_top1"]).mean() == pytest.approx(1 / 4)
+    assert values_of(paired(table, 1)).mean() == pytest.approx(1 / 4)
     assert values_of(full_gallery(table)["recall_1"]).mean() == 1
 
 
 def test_photos_in_another_order_are_paired_all_the_same():
     table = uneven()
     order = np.random.default_rng(1).permutation(14)
-    for k in ("paired_top1", "paired_top5"):
-        np.testing.assert_allclose(paired(table)[k].values, paired(table.select(np.arange(14), order))[k].values)
+    for k in (1, 5):
+        np.testing.assert_allclose(paired(table, k).values, paired(table.select(np.arange(14), order), k).values)
 
 
 def test_a_paired_batch_needs_one_photo_for_each_touch():
     table = uneven()
     with pytest.raises(BadInput, match="one photo for each touch"):
-        paired(table.select(np.arange(13), np.arange(14)))
+        paired(table.select(np.arange(13), np.arange(14)), 1)
     with pytest.raises(BadInput, match="one photo for each touch"):
-        paired(table.with_own())
+        paired(table.with_own(), 1)
+
+
+# The table of metrics --------------------------------------------------------------------------------------
+
+
+def test_every_metric_is_taken_of_scores_that_can_be_asked_all_of_them():
+    table = knowing(objects=10, grasps=12)
+    taken = take(Scored(table, table, dict.fromkeys(SET_SIZES, table), EVEN, seed=0))
+    assert list(taken) == list(METRICS)
+    labels = [(metric.section, metric.column) for metric in METRICS.values()]
+    assert len(set(labels)) == len(labels)
+
+
+def test_a_metric_that_cannot_be_asked_is_left_out():
+    """Four objects make no test of five, no sets were drawn, and two grasps share each photo."""
+    table = knowing(objects=4, grasps=4)
+    shared = table.select(np.arange(16), np.arange(0, 16, 2))
+    shared.own[np.arange(1, 16, 2), np.arange(8)] = True
+    taken = set(take(Scored(shared, shared, {}, EVEN, seed=0)))
+    assert {"pair_accuracy", "recall_1", "photo_to_touch_map"} <= taken
+    left_out = {"guesses_k5", "guesses_k10", "all_objects_k5", "paired_top1", "paired_top5"}
+    assert not taken & (left_out | set(map(of_grasps, SET_SIZES)))
 
 
 # Chance and certainty --------------------------------------------------------------------------------------
@@ -290,8 +320,8 @@ def every_measure(table):
         "k4p3": k_way(table, 4, photos=3),
         **full_gallery(table),
         **{f"back_{name}": measure for name, measure in full_gallery(table.transposed()).items()},
-        "objectfolder": objectfolder(table),
-        **paired(table),
+        "objectfolder": average_precision(table.with_own()),
+        **{f"paired_top{k}": paired(table, k) for k in (1, 5)},
     }
 
 

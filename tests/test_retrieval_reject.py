@@ -8,9 +8,9 @@ import pytest
 from retrieval.errors import BadInput
 from retrieval.evaluation.calibrate import questions
 from retrieval.evaluation.reject import _false_accepts, galleries, reject, statistic
-from retrieval.evaluation.table import ScoreTable
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means
+from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior, fit_questions
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.evaluation.table import ScoreTable, object_scores
 from retrieval.metrics.measure import Measure
+from retrieval.metrics.table import ScoreTable, object_scores
 from tests.test_retrieval_protocols import mine_of, others_of, table_of, uneven
 
 # The table -------------------------------------------------------------------------------------------------

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.evaluation.protocols import asked
-from retrieval.evaluation.table import ScoreTable, object_scores
 from retrieval.metrics.pairs import Calibration, fit_calibration
 from retrieval.metrics.reliability import reliability_bins
+from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
 
 _PAIRS_OF_A_ROW = 8  # of each kind
@@ -78,10 +77,10 @@ def enough_objects(table: ScoreTable) -> bool:
 def questions(table: ScoreTable, seed: int = 0) -> Questions:
     """ "Which object, or none?" for every row that has a photo to find; a row counts as one grasp.
 
-    Objects stand in the order of `table.objects`, rows in that of `asked(table)`. Raises BadInput for fewer than
+    Objects stand in the order of `table.objects`, rows in that of `table.asked`. Raises BadInput for fewer than
     three objects.
     """
-    kept = asked(table)
+    kept = table.asked
     judged = Judged(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
     return Questions.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
 
@@ -91,7 +90,7 @@ def drawn_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDAr
 
     The object of a false pair is drawn uniformly, then its photo, so that both kinds are even in every row.
     """
-    kept = asked(table)
+    kept = table.asked
     rng = np.random.default_rng([seed, 1])
     keys = np.where(kept.relevant & ~kept.own, rng.random(kept.own.shape), np.inf)
     true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
@@ -121,8 +120,8 @@ def drawn_choices(
     posterior: what makes one logit of a candidate's photos, in place of their mean. Raises BadInput for fewer than
     two objects; with fewer than k there are as many candidates as objects.
     """
-    kept = asked(table)
-    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior)
+    kept = table.asked
+    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None)
     count = min(choice.k, len(kept.objects))
     if count < 2:
         raise BadInput(f"a choice needs two objects at least; got {len(kept.objects)}")

@@ -13,10 +13,12 @@ from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
-from retrieval.evaluation.scoring import Judged, main_measures, summaries
+from retrieval.evaluation.scoring import MethodScores, summaries
+from retrieval.metrics.registry import take
 from retrieval.training.features import encode_recording
 
 METHOD = "late_fusion"
+MEASURED = ("pair_accuracy", "guesses_k5", "guesses_k10")
 CONTROLS = {
     "shuffled": "touches are dealt to other objects before fitting, so that there is nothing to learn",
     "before": "the frames taken before the contact stand in for the touch, in fitting and in judging",
@@ -63,7 +65,7 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
 
 def score_control(name: str, bench: Bench, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
     """A control's entry of results.json."""
-    judged = Judged(bench.queries, bench.predictions(METHOD, training_seed), seed)
+    judged = MethodScores(bench.queries, bench.predictions(METHOD, training_seed), seed)
     pairs = calibrate_pairs(judged.touches("validation", "validation"), seed=seed)
-    measures = main_measures(judged.touches("test", "test"), pairs, seed)
+    measures = take(judged.scored(pairs), MEASURED)
     return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
+from retrieval.metrics.registry import SET_SIZES, SHOWN_PHOTOS
 
 PARTS = ("train", "validation", "test")
 MOST_GRASPS = {"train": 8, "validation": 12}
 """Judged grasps of an object; of a test object all are judged."""
-SET_SIZES = (1, 2, 3, 5, 8)
 SETS_OF_AN_OBJECT = 20
-SHOWN_PHOTOS = 3
-"""Photos of a candidate where sets of grasps are judged."""
 
 Rows = NDArray[np.int64]
 

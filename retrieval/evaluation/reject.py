@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retrieval.evaluation.calibrate import questions
-from retrieval.evaluation.protocols import asked, gallery_words
-from retrieval.evaluation.table import ScoreTable
 from retrieval.metrics.auc import weight_below
 from retrieval.metrics.measure import Measure, object_weights
+from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
 
 TRUE_ACCEPTS = 0.95
@@ -74,12 +73,12 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     false_accepts_at_95: share accepted without the object by the threshold that accepts 95 % with it. Chance is 1/2,
     1/2 and .95. Raises BadInput for fewer than three objects.
     """
-    kept = asked(table)
+    kept = table.asked
     true = np.asarray(kept.touch_owner[:, None] == kept.objects)
     shown = galleries(questions(kept, seed).log_ratios(posterior), true, seed)
     present, absent = map(statistic, shown)
     weights = object_weights(kept.touch_owner)
-    words = f"{gallery_words(table, kept)}; each asked with its object and without, a rival dropped in its stead"
+    words = f"{table.gallery}; each asked with its object and without, a rival dropped in its stead"
 
     def measure(values: Floats, chance: float) -> Measure:
         return Measure(values[:, None], kept.touch_owner, np.array([chance]), words)

@@ -7,15 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.evaluation import protocols
 from retrieval.evaluation.calibrate import Calibrations, KWayTest, calibrate, enough_objects, reliability
 from retrieval.evaluation.predictions import Predictions
-from retrieval.evaluation.queries import SHOWN_PHOTOS, Queries
+from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
-from retrieval.evaluation.table import ScoreTable
+from retrieval.metrics import protocols
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.registry import SHOWN_PHOTOS, Scored, guesses, take
+from retrieval.metrics.table import ScoreTable
 
 CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, SHOWN_PHOTOS))
 _CONFUSIONS, _EXAMPLES, _RANKED = 12, 6, 6
@@ -24,7 +25,7 @@ Measures = dict[str, Measure]
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class MethodScores:
     """One method and seed: its scores as tables for the protocols, and what validation objects say of them."""
 
     queries: Queries
@@ -67,42 +68,19 @@ class Judged:
         """For calibration: single touches, and sets of more grasps."""
         return {1: self.touches(part, part)} | {size: table for size, table in self.sets(part).items() if size > 1}
 
-    def calibrations(self) -> Calibrations:
-        """Fitted on validation objects."""
-        return calibrate(self.by_grasps("validation"), seed=self.seed)
+    def scored(self, calibration: Calibration) -> Scored:
+        """What metrics are taken of; calibration: of single touches, fitted on validation objects."""
+        return Scored(
+            test=self.touches("test", "test"),
+            among_all=self.touches("test", None),
+            sets=self.sets("test"),
+            calibration=calibration,
+            seed=self.seed,
+        )
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
     return np.arange(len(owner)) if part is None else queries.of_part(owner, part)
-
-
-def main_measures(test: ScoreTable, pairs: Calibration, seed: int) -> Measures:
-    """Pair accuracy and guess curves of single touches; a curve needs as many objects as candidates."""
-    found = {"pair_accuracy": protocols.pair_accuracy(test, pairs)}
-    for k in (5, 10):
-        found |= _guesses(f"guesses_k{k}", test, k, seed)
-    return found
-
-
-def all_measures(judged: Judged, calibrations: Calibrations) -> Measures:
-    """Every measure of results.json."""
-    test = judged.touches("test", "test")
-    found = main_measures(test, calibrations.pairs[1], judged.seed) | {"pair_auc": protocols.pair_auc(test)}
-    for size, table in judged.sets("test").items():
-        found |= _guesses(f"guesses_k5_g{size}_p{SHOWN_PHOTOS}", table, 5, judged.seed, SHOWN_PHOTOS)
-    found |= _guesses("all_objects_k5", judged.touches("test", None), 5, judged.seed)
-    photos = test.transposed()
-    found |= protocols.full_gallery(test)
-    found |= {f"photo_to_touch_{name}": measure for name, measure in protocols.full_gallery(photos).items()}
-    found["objectfolder_touch_to_photo"] = protocols.objectfolder(test)
-    found["objectfolder_photo_to_touch"] = protocols.objectfolder(photos)
-    if (test.own.sum(0) == 1).all():  # photos that grasps share have no one touch to be paired with
-        found |= protocols.paired(test)
-    return found
-
-
-def _guesses(name: str, table: ScoreTable, k: int, seed: int, photos: int = 1) -> Measures:
-    return {name: protocols.k_way(table, k, photos=photos, seed=seed)} if len(table.objects) >= k else {}
 
 
 def summaries(by_seed: Sequence[Measures], draws: int, seed: int) -> dict[str, Any]:
@@ -118,9 +96,9 @@ def score_method(
     Values are means over the training seeds; reliability, reject's curves and the examples are those of the first.
     "reject" is None where validation or test objects are fewer than three.
     """
-    judged = [Judged(queries, predictions, seed) for predictions in by_seed]
-    calibrations = [one.calibrations() for one in judged]
-    measures = [all_measures(one, fitted) for one, fitted in zip(judged, calibrations, strict=True)]
+    judged = [MethodScores(queries, predictions, seed) for predictions in by_seed]
+    calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in judged]
+    measures = [take(one.scored(fitted.pairs[1])) for one, fitted in zip(judged, calibrations, strict=True)]
     entry = {
         "chosen": [predictions.chosen for predictions in by_seed],
         "measures": summaries(measures, draws, seed),
@@ -135,13 +113,13 @@ def score_method(
 
 
 def _per_object(
-    queries: Queries, judged: Sequence[Judged], measures: Sequence[Measures], seed: int
+    queries: Queries, judged: Sequence[MethodScores], measures: Sequence[Measures], seed: int
 ) -> dict[str, dict[str, float]]:
     """Mean first guess at K = 5 of each object: among test objects, and of every object among all."""
-    every = [_guesses("all", one.touches(None, None), 5, seed) for one in judged]
+    every = [guesses(one.touches(None, None), 5, seed) for one in judged]
     shares = {
         "test_candidates": [found["guesses_k5"] for found in measures if "guesses_k5" in found],
-        "all_candidates": [found["all"] for found in every if found],
+        "all_candidates": [measure for measure in every if measure],
     }
     return {name: _mean_by_name(queries, map(protocols.per_object, found)) for name, found in shares.items()}
 
@@ -154,7 +132,7 @@ def _mean_by_name(queries: Queries, by_seed: Iterable[Mapping[int, float]]) -> d
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def _confusions(queries: Queries, judged: Sequence[Judged], seed: int) -> list[dict[str, Any]]:
+def _confusions(queries: Queries, judged: Sequence[MethodScores], seed: int) -> list[dict[str, Any]]:
     """The largest shares of first guesses among all test objects that fell on a wrong one."""
     shares: dict[tuple[int, int], float] = {}
     for one in judged:
@@ -168,7 +146,7 @@ def _confusions(queries: Queries, judged: Sequence[Judged], seed: int) -> list[d
 
 
 def _reject(
-    judged: Sequence[Judged], calibrations: Sequence[Calibrations], draws: int, seed: int
+    judged: Sequence[MethodScores], calibrations: Sequence[Calibrations], draws: int, seed: int
 ) -> dict[str, Any] | None:
     """Of single grasps all, and by number of grasps how well the two are parted."""
     found = [_rejections(one, fitted, seed) for one, fitted in zip(judged, calibrations, strict=True)]
@@ -187,7 +165,7 @@ def _reject(
     }
 
 
-def _rejections(judged: Judged, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
+def _rejections(judged: MethodScores, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
     """By number of grasps, where validation objects gave a posterior and test objects can be missed."""
     tables = judged.by_grasps("test").items()
     fitted = calibrations.posteriors

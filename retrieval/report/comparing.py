@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
+from retrieval.metrics.registry import PHOTO_TO_TOUCH, SET_SIZES, TOUCH_TO_PHOTO, of_grasps
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
-from retrieval.report.results import GRASPS, of_grasps
 
 INTERVALS = (
     "Brackets hold 95 % intervals: a bootstrap that resamples objects, since queries of one object are alike. Every "
@@ -13,6 +13,16 @@ INTERVALS = (
     "covers other objects of this kind; it does not cover another recording, split or rig. "
     "Equal scores count by their expected rank, so a constant scorer gets exactly chance."
 )
+
+
+SECTIONS = {
+    TOUCH_TO_PHOTO: "From a touch to all photos of the unseen objects; any photo of the object is right.",
+    PHOTO_TO_TOUCH: "The other way: from a photo to all touches.",
+    "objectfolder": "ObjectFolder's cross-sensory retrieval: mAP over all instances, those of the query's grasp too.",
+    "paired": "Paired, as TVL does it: the whole test set is one batch, and only the photo of the same grasp is right; "
+    "mean of both directions.",
+}
+"""Tables of the full gallery, and what stands above each."""
 
 
 def side_by_side(builder: Builder) -> Iterator[Block | None]:
@@ -26,7 +36,7 @@ def side_by_side(builder: Builder) -> Iterator[Block | None]:
             plots.overview,
             builder.results,
         )
-    yield tables.measures(builder.results, ("pair_accuracy", "pair_auc", "guesses_k5", "guesses_k10", "all_objects_k5"))
+    yield tables.section(builder.results, "main")
     yield Text("Bold: the highest of a column, whether or not the next one is apart from it.")
     yield Text(INTERVALS)
 
@@ -49,7 +59,7 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
 
 def grasps(builder: Builder) -> Iterator[Block | None]:
     """What several grasps of one object add."""
-    keys = [of_grasps(count) for count in GRASPS]
+    keys = [of_grasps(count) for count in SET_SIZES]
     if builder.any(*keys):
         yield builder.picture(
             "grasps.png",
@@ -58,7 +68,7 @@ def grasps(builder: Builder) -> Iterator[Block | None]:
             plots.grasps,
             builder.results,
         )
-        yield tables.measures(builder.results, keys, [f"{count} grasp{'s' * (count > 1)}" for count in GRASPS])
+        yield tables.section(builder.results, "grasps")
 
 
 def time(builder: Builder) -> Iterator[Block | None]:
@@ -78,21 +88,8 @@ def time(builder: Builder) -> Iterator[Block | None]:
 
 def gallery(builder: Builder) -> Iterator[Block | None]:
     """Ranks in the full gallery, both ways, and the protocols of ObjectFolder and TVL."""
-    ranks = ("recall_1", "recall_5", "recall_10", "mrr", "map")
-    both = ("objectfolder_touch_to_photo", "objectfolder_photo_to_touch")
-    short = ("R@1", "R@5", "R@10", "MRR", "mAP")
-    for text, keys, headings in (
-        ("From a touch to all photos of the unseen objects; any photo of the object is right.", ranks, short),
-        ("The other way: from a photo to all touches.", tuple(f"photo_to_touch_{key}" for key in ranks), short),
-        ("ObjectFolder's cross-sensory retrieval: mAP over all instances, those of the query's grasp too.", both, ()),
-        (
-            "Paired, as TVL does it: the whole test set is one batch, and only the photo of the same grasp is "
-            "right; mean of both directions.",
-            ("paired_top1", "paired_top5"),
-            (),
-        ),
-    ):
-        if table := tables.measures(builder.results, keys, headings):
+    for name, text in SECTIONS.items():
+        if table := tables.section(builder.results, name):
             yield Text(text)
             yield table
 

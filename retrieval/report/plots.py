@@ -7,17 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.metrics.registry import SET_SIZES, of_grasps
 from retrieval.report.canvas import FAINT, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
-from retrieval.report.results import (
-    GRASPS,
-    KNOW_NOTHING,
-    Results,
-    measure_label,
-    method_label,
-    of_grasps,
-    percent,
-    short,
-)
+from retrieval.report.results import KNOW_NOTHING, Results, measure_label, method_label, percent, short
 
 OVERVIEW = ("pair_accuracy", "guesses_k5", "guesses_k10", of_grasps(5), "map")
 _LABELLED_OBJECTS = 130
@@ -101,17 +93,17 @@ def grasps(results: Results) -> Figure:
     """First guess of five against the number of grasps of the query, three photos of each candidate."""
     figure = canvas(8, 4.4)
     panel = figure.subplots()
-    names = [name for name in results.methods if any(results.summary(name, of_grasps(count)) for count in GRASPS)]
+    names = [name for name in results.methods if any(results.summary(name, of_grasps(count)) for count in SET_SIZES)]
     for place, name in enumerate(names):
         shift, style = 0.055 * (place - (len(names) - 1) / 2), style_of(name)
-        found = [(at, results.summary(name, of_grasps(count))) for at, count in enumerate(GRASPS)]
+        found = [(at, results.summary(name, of_grasps(count))) for at, count in enumerate(SET_SIZES)]
         points = np.array([(at + shift, *_first(summary)) for at, summary in found if summary])
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
         panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
         for at, summary in found:
             if summary:
                 panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=FAINT, ls="--", lw=1.2, zorder=1)
-    panel.set_xticks(range(len(GRASPS)), [str(count) for count in GRASPS])
+    panel.set_xticks(range(len(SET_SIZES)), [str(count) for count in SET_SIZES])
     panel.set_xlabel("grasps of the same object in one query")
     percent_axis(panel, "right first guess among 5 objects, %")
     _legend(figure, names)

@@ -10,10 +10,11 @@ from indexes.store.regular import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.metrics.intervals import FEW_OBJECTS
+from retrieval.metrics.registry import METRICS
 
 NOTHING = "–"
 
-# Order of every table and figure. A method or measure that is not here comes last, under its own name.
+# Order of every table and figure. A method that is not here comes last, under its own name.
 METHODS = {
     "late_fusion": "late fusion",
     "set_fusion": "set fusion",
@@ -26,36 +27,6 @@ METHODS = {
     "constant": "constant score",
 }
 KNOW_NOTHING = frozenset({"chance", "constant"})
-GRASPS = (1, 2, 3, 5, 8)
-
-
-def of_grasps(count: int) -> str:
-    """The measure of a query of so many grasps, three photos of each candidate."""
-    return f"guesses_k5_g{count}_p3"
-
-
-MEASURES = {
-    "pair_accuracy": "pair accuracy",
-    "pair_auc": "pair AUC",
-    "guesses_k5": "first guess of 5",
-    "guesses_k10": "first guess of 10",
-    **{of_grasps(count): f"first guess of 5, {count} grasp{'s' * (count > 1)}, 3 photos" for count in GRASPS},
-    "all_objects_k5": "first guess of 5, all objects",
-    **{
-        f"{prefix}{key}": f"{label}{way}"
-        for prefix, way in (("", ", touch to photo"), ("photo_to_touch_", ", photo to touch"))
-        for key, label in (
-            *((f"recall_{k}", f"R@{k}") for k in (1, 5, 10)),
-            ("mrr", "MRR"),
-            ("map", "mAP"),
-        )
-    },
-    "objectfolder_touch_to_photo": "mAP, touch to photo",
-    "objectfolder_photo_to_touch": "mAP, photo to touch",
-    "paired_top1": "top 1",
-    "paired_top5": "top 5",
-}
-
 Summary = Mapping[str, Any]
 
 
@@ -129,7 +100,7 @@ def at_start(label: str) -> str:
 
 def measure_label(name: str) -> str:
     """What a measure is called in the report."""
-    return MEASURES.get(name, name.replace("_", " "))
+    return METRICS[name].label if name in METRICS else name.replace("_", " ")
 
 
 def percent(share: float | None, digits: int = 1) -> str:

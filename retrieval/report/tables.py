@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
 from retrieval.report.results import (
@@ -24,13 +25,14 @@ Column = tuple[str, str, int]
 """Heading, measure, place in the measure's list of values."""
 
 
-def measures(results: Results, keys: Sequence[str], headings: Sequence[str] = ()) -> Table | None:
-    """A row for each method and a column for each measure that was taken; None where none was.
+def section(results: Results, name: str) -> Table | None:
+    """A row for each method and a column for each metric of the section that was taken; None where none was."""
+    return _table(results, [(metric.column, key, 0) for key, metric in METRICS.items() if metric.section == name])
 
-    headings: of the columns, where the measures' own labels would repeat themselves.
-    """
-    labels = headings or [measure_label(key) for key in keys]
-    return _table(results, [(label, key, 0) for label, key in zip(labels, keys, strict=True)])
+
+def measures(results: Results, keys: Sequence[str]) -> Table | None:
+    """The same of any metrics."""
+    return _table(results, [(measure_label(key), key, 0) for key in keys])
 
 
 def guesses(results: Results, measure: str) -> Table | None:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy import special
 from torch import nn
 
-from retrieval.evaluation.table import ScoreTable
 from retrieval.lab.hard_cases.case import HardCase, refused
 from retrieval.methods.selection import ranking_auc
 from retrieval.metrics.binomial import binomial_interval
@@ -16,6 +15,7 @@ from retrieval.metrics.guesses import guess_curve
 from retrieval.metrics.intervals import bootstrap_interval, sign_flip_p
 from retrieval.metrics.pairs import pair_auc
 from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.table import ScoreTable
 from retrieval.model.fusion import FusionHead, score_halves
 
 _TOP, _MEASURES, _HALVES, _INTERVALS = "top k", "rank measures", "halves", "intervals"

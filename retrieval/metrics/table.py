@@ -1,5 +1,6 @@
-"""What protocols take: a table of scores with its owners, and scores of objects drawn from it."""
+"""What metrics are taken of: a table of scores with its owners, and scores of objects drawn from it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -7,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import Posterior
+from retrieval.metrics.ranking import FirstRelevant, first_relevant
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,29 @@ class ScoreTable:
         return np.asarray((self.relevant & ~self.own).any(1))
 
     @cached_property
+    def asked(self) -> "ScoreTable":
+        """The table of the rows that are askable. Raises BadInput where none is."""
+        if not self.askable.any():
+            raise BadInput(
+                f"to be asked, {self.row_words} need {self.column_words} of their object from another grasp; none has "
+                "any; record more grasps of each object"
+            )
+        return self if self.askable.all() else self.select(self.askable, np.arange(len(self.photo_owner)))
+
+    @cached_property
+    def gallery(self) -> str:
+        """What was searched, as a reader is told it."""
+        own = "those of the same grasp left out" if self.own.any() else "those of the same grasp included"
+        words = f"{len(self.objects)} {self.object_words}, {len(self.photo_owner)} {self.column_words}; {own}"
+        missing = np.count_nonzero(~self.askable)
+        return words + (f"; {missing} {self.row_words} not asked, which have no other" if missing else "")
+
+    @cached_property
+    def first(self) -> FirstRelevant:
+        """Where the first photo of each row's object stands among all, own photos left out; every row is askable."""
+        return first_relevant(self.scores, self.relevant, ~self.own)
+
+    @cached_property
     def objects(self) -> NDArray[np.int64]:
         """(O,) numbers of the objects that have photos, ascending."""
         return np.unique(self.photo_owner)
@@ -81,15 +105,19 @@ class ScoreTable:
         return replace(self, own=np.zeros_like(self.own))
 
 
+Pool = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
+"""Scores of shown photos (P,), the row of each (P,) and their number by row (T,) to the rows' scores (T,)."""
+
+
 def object_scores(
-    table: ScoreTable, photos: int, draws: int, seed: int, posterior: Posterior | None = None
+    table: ScoreTable, photos: int, draws: int, seed: int, pool: Pool | None = None
 ) -> NDArray[np.float64]:
     """Scores (draws, T, O) of rows with objects, each shown by `photos` photos drawn without replacement.
 
-    Their mean, or where a posterior is given the logit that it gives the object (`Posterior.object_logits`). Columns
-    stand in the order of `table.objects`. Own photos are never drawn; an object with fewer photos shows all that it
-    has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the same.
-    Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
+    Their mean, or what `pool` makes of them, such as a posterior's logit of the object (`Posterior.object_logits`).
+    Columns stand in the order of `table.objects`. Own photos are never drawn; an object with fewer photos shows all
+    that it has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the
+    same. Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
     """
     if not (table.askable | ~table.relevant.any(1)).all():
         raise BadInput("every row must leave its object a photo to show; one has none but its own: leave the row out")
@@ -99,8 +127,8 @@ def object_scores(
         for place, name in enumerate(table.objects):
             columns = rng.permutation(np.flatnonzero(table.photo_owner == name))
             mine = np.flatnonzero(table.touch_owner == name)
-            found[draw, :, place] = _of_photos(*_window(table.scores, columns, photos, rng), posterior)
-            found[draw, mine, place] = _of_photos(*_without_own(table, mine, columns, photos, rng), posterior)
+            found[draw, :, place] = _of_photos(*_window(table.scores, columns, photos, rng), pool)
+            found[draw, mine, place] = _of_photos(*_without_own(table, mine, columns, photos, rng), pool)
     return found
 
 
@@ -125,10 +153,8 @@ def _without_own(
     return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
 
 
-def _of_photos(
-    scores: NDArray[np.float64], shown: NDArray[np.bool_], posterior: Posterior | None
-) -> NDArray[np.float64]:
+def _of_photos(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pool | None) -> NDArray[np.float64]:
     """(T,) from the photos that each row is shown."""
-    if posterior is None:
+    if pool is None:
         return np.asarray((scores * shown).sum(1) / shown.sum(1))
-    return posterior.object_logits(scores[shown], np.nonzero(shown)[0], shown.sum(1))
+    return pool(scores[shown], np.nonzero(shown)[0], shown.sum(1))

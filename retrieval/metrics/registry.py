@@ -1,0 +1,130 @@
+"""Every metric of an evaluation: its name in results.json, what the report calls it, and how it is taken.
+
+A new metric is one function from a `ScoreTable` to a `Measure` (`retrieval.metrics.protocols`) and one row here.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+from retrieval.metrics import protocols
+from retrieval.metrics.measure import Measure
+from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.table import ScoreTable
+
+SET_SIZES = (1, 2, 3, 5, 8)
+"""Grasps in a set."""
+SHOWN_PHOTOS = 3
+"""Photos of a candidate where sets of grasps are judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """What metrics are taken of: the scores of one method and seed, as tables.
+
+    test: touches with photos of test objects; among_all: the same touches with the photos of all objects; sets: by
+    number of grasps, sets of test touches with photos of test objects; calibration: of single touches, fitted on
+    validation objects; seed: of what is drawn.
+    """
+
+    test: ScoreTable
+    among_all: ScoreTable
+    sets: dict[int, ScoreTable]
+    calibration: Calibration
+    seed: int
+
+    @cached_property
+    def photos(self) -> ScoreTable:
+        """Photos of test objects that ask for touches."""
+        return self.test.transposed()
+
+
+@dataclass(frozen=True)
+class Metric:
+    """label: what the report calls it; column: at the head of its own table; section: which table that is; take: gives
+    its values, None where these scores cannot be asked so."""
+
+    label: str
+    column: str
+    section: str
+    take: Callable[[Scored], Measure | None]
+
+
+def of_grasps(count: int) -> str:
+    """The metric of a query of so many grasps, three photos of each candidate."""
+    return f"guesses_k5_g{count}_p{SHOWN_PHOTOS}"
+
+
+def guesses(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
+    """`protocols.k_way`; None where there are fewer objects than candidates."""
+    return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
+
+
+def _of_set(count: int) -> Metric:
+    words = f"{count} grasp{'s' * (count > 1)}"
+    label = f"first guess of 5, {words}, {SHOWN_PHOTOS} photos"
+    return Metric(label, words, "grasps", lambda of: guesses(of.sets.get(count), 5, of.seed, SHOWN_PHOTOS))
+
+
+def _paired(table: ScoreTable, k: int) -> Measure | None:
+    return protocols.paired(table, k) if protocols.is_paired(table) else None
+
+
+TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
+
+METRICS: dict[str, Metric] = {
+    "pair_accuracy": Metric(
+        "pair accuracy", "pair accuracy", "main", lambda of: protocols.pair_accuracy(of.test, of.calibration)
+    ),
+    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda of: protocols.pair_auc(of.test)),
+    "guesses_k5": Metric("first guess of 5", "first guess of 5", "main", lambda of: guesses(of.test, 5, of.seed)),
+    "guesses_k10": Metric("first guess of 10", "first guess of 10", "main", lambda of: guesses(of.test, 10, of.seed)),
+    "all_objects_k5": Metric(
+        "first guess of 5, all objects",
+        "first guess of 5, all objects",
+        "main",
+        lambda of: guesses(of.among_all, 5, of.seed),
+    ),
+    **{of_grasps(count): _of_set(count) for count in SET_SIZES},
+    "recall_1": Metric("R@1, touch to photo", "R@1", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 1)),
+    "recall_5": Metric("R@5, touch to photo", "R@5", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 5)),
+    "recall_10": Metric("R@10, touch to photo", "R@10", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 10)),
+    "mrr": Metric("MRR, touch to photo", "MRR", TOUCH_TO_PHOTO, lambda of: protocols.reciprocal_rank(of.test)),
+    "map": Metric("mAP, touch to photo", "mAP", TOUCH_TO_PHOTO, lambda of: protocols.average_precision(of.test)),
+    "photo_to_touch_recall_1": Metric(
+        "R@1, photo to touch", "R@1", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 1)
+    ),
+    "photo_to_touch_recall_5": Metric(
+        "R@5, photo to touch", "R@5", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 5)
+    ),
+    "photo_to_touch_recall_10": Metric(
+        "R@10, photo to touch", "R@10", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 10)
+    ),
+    "photo_to_touch_mrr": Metric(
+        "MRR, photo to touch", "MRR", PHOTO_TO_TOUCH, lambda of: protocols.reciprocal_rank(of.photos)
+    ),
+    "photo_to_touch_map": Metric(
+        "mAP, photo to touch", "mAP", PHOTO_TO_TOUCH, lambda of: protocols.average_precision(of.photos)
+    ),
+    "objectfolder_touch_to_photo": Metric(
+        "mAP, touch to photo",
+        "mAP, touch to photo",
+        "objectfolder",
+        lambda of: protocols.average_precision(of.test.with_own()),
+    ),
+    "objectfolder_photo_to_touch": Metric(
+        "mAP, photo to touch",
+        "mAP, photo to touch",
+        "objectfolder",
+        lambda of: protocols.average_precision(of.photos.with_own()),
+    ),
+    "paired_top1": Metric("top 1", "top 1", "paired", lambda of: _paired(of.test, 1)),
+    "paired_top5": Metric("top 5", "top 5", "paired", lambda of: _paired(of.test, 5)),
+}
+"""Name in results.json -> what it is, in the order of every table."""
+
+
+def take(scored: Scored, names: Iterable[str] = METRICS) -> dict[str, Measure]:
+    """The metrics of these names that can be asked of a method's scores."""
+    found = {name: METRICS[name].take(scored) for name in names}
+    return {name: measure for name, measure in found.items() if measure is not None}
