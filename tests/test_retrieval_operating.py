@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from indexes import load_kind
+from indexes import KINDS, load_kind
 from indexes.errors import ParameterError
+from indexes.kinds.flat import FlatIndex
+from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import Matcher
@@ -310,6 +312,22 @@ def test_the_first_kind_within_the_time_that_finds_the_neighbours_is_taken(ms, k
 def test_a_kind_that_needs_more_vectors_is_not_tried():
     assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw"]
     assert NeighbourBench(unit(600)).tried() == ["hnsw"]
+
+
+class Newcomer(FlatIndex):
+    """A kind as somebody adds one: a class that says what is to be known of it."""
+
+    kind, exact, tried, fewest = "newcomer", False, True, 5
+
+
+def test_a_new_kind_is_a_class_and_a_row_of_the_table(monkeypatch, tmp_path):
+    monkeypatch.setitem(KINDS, "newcomer", f"{__name__}:Newcomer")
+    assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw", "newcomer"]
+    assert Asked("newcomer").kind == "newcomer"
+    rows = [{"id": str(number)} for number in range(20)]
+    IndexStore(tmp_path).write(rows, unit(20), fingerprint={}, kind="newcomer")
+    found = IndexStore(tmp_path).open()
+    assert (type(found.index), found.manifest.recall["value"]) == (Newcomer, 1.0)
 
 
 def test_the_time_of_a_search_among_neighbours_is_measured_on_this_machine():
