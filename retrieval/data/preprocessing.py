@@ -81,7 +81,7 @@ class Preprocessing:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON types; `from_dict` reads them back."""
-        return asdict(self)
+        return asdict(self) | {"views": list(self.views)}
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":

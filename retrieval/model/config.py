@@ -163,7 +163,11 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, as in a TOML file."""
-        return dataclasses.asdict(self) | {"training": self.training.to_dict()}
+        return {
+            "matcher": dataclasses.asdict(self.matcher),
+            "training": self.training.to_dict(),
+            "preprocessing": self.preprocessing.to_dict(),
+        }
 
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
@@ -213,9 +217,7 @@ def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) ->
 def _typed(name: str, wanted: type[Any], value: Any) -> Any:
     if wanted is float and type(value) is int and abs(value) < 2**63:
         return float(value)
-    if wanted is tuple and isinstance(value, list) and all(isinstance(each, str) for each in value):
-        return tuple(value)
-    if type(value) is not wanted:
+    if type(value) is not wanted or (wanted is list and not all(isinstance(each, str) for each in value)):
         raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")
     return value
 
