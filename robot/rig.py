@@ -166,7 +166,7 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
         raise UnknownName(f"no rig is called {name!r}; known: {', '.join(sorted(RIGS))}, or give a .toml file")
     module, class_name = RIGS[name].split(":")
     rig_class: type[Rig] = getattr(import_module(module), class_name)
-    rig = build(rig_class, settings, seed=seed)
+    rig = build(rig_class, settings, where=spec if spec.endswith(".toml") else "", seed=seed)
     rig.info |= {"rig": name, "rig_settings": settings}
     return rig
 

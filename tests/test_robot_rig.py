@@ -166,10 +166,10 @@ def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
         ("contact_grid = [120.0, 160.0]", "contact_grid must be a list of 2, each of them a whole number"),
     ],
 )
-def test_a_setting_of_another_type_says_which_is_wanted(tmp_path, setting, said):
+def test_a_setting_of_another_type_says_which_is_wanted_and_in_which_file(tmp_path, setting, said):
     path = tmp_path / "rig.toml"
     path.write_text(f'rig = "sim"\n{setting}\n')
-    with pytest.raises(RobotConfigError, match=f"^{said}"):
+    with pytest.raises(RobotConfigError, match=f"rig.toml: {said}"):
         load_rig(str(path), seed=0)
 
 

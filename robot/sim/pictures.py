@@ -24,7 +24,7 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, file_content, read_regular, storage_errors, sync_folder, write_file
+from robot.storage import append_line, content_of, file_content, object_of, storage_errors, sync_folder, write_file
 from robot.workers import Jobs, Work
 
 INFO_FILE = "pictures.json"
@@ -106,7 +106,7 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
     plain = json.loads(json.dumps(info))
     with storage_errors(folder):
         if (folder / INFO_FILE).exists():
-            held = json.loads(read_regular(folder / INFO_FILE))
+            held = object_of(content_of(folder / INFO_FILE, RecordingError), RecordingError)
             if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
                 raise RecordingError(
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
@@ -123,8 +123,7 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
 
 def _done(path: Path) -> dict[str, int]:
     """Objects whose lines are whole. Half a last line is cut off, and with it the last object, whose it may be."""
-    content = read_regular(path)
-    lines = content.splitlines(keepends=True)
+    lines = content_of(path, RecordingError).splitlines(keepends=True)
     names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
     if len(names) < len(lines):
         kept = [name for name in names if name != names[-1]]
