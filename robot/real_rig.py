@@ -29,7 +29,7 @@
     [gel.a]                                   # what it is made of, as far as is known (robot.gel_settings)
     thickness_mm = 3.0
     modulus_mpa = 0.35
-    [grasp]                                   # how grasps are drawn (robot.grasping.plan.GraspSettings)
+    [grasp]                                   # how grasps are drawn (robot.grasping.settings.GraspSettings)
     force_n = [5, 15]
     [attempt]                                 # how they are made (robot.grasping.settings.AttemptSettings)
     settle_s = 1.0
@@ -53,8 +53,7 @@ import numpy as np
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
-from robot.grasping.plan import GraspSettings
-from robot.grasping.settings import AttemptSettings, attempt_of
+from robot.grasping.settings import AttemptSettings, GraspSettings, attempt_of
 from robot.readings import Box
 from robot.rig import Rig, ask_on_terminal
 from robot.settings import TypedSettings, build, check_type, limited

@@ -32,8 +32,7 @@ from robot.emulators.wsg50.faults import LineFaults
 from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
-from robot.grasping.plan import GraspSettings
-from robot.grasping.settings import AttemptSettings
+from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD, Box, Intrinsics, Pose
 from robot.recording.folder import read_recording
 from robot.rig import Rig

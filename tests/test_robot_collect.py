@@ -12,8 +12,7 @@ from robot.collect import CollectSettings, Progress, collect, name_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
 from robot.grasping.attempt import Attempter, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
-from robot.grasping.plan import GraspSettings
-from robot.grasping.settings import AttemptSettings
+from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD
 from robot.recording.attempt_log import read_attempts
 from robot.recording.folder import RecordingWriter, read_recording

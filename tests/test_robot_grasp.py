@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from robot.errors import PlanError, RobotConfigError
-from robot.grasping.plan import GraspSettings, plan_grasp
+from robot.grasping.plan import plan_grasp
+from robot.grasping.settings import GraspSettings
 from robot.readings import Box
 from robot.settings import build
 from robot.sight.cylinder import CylinderFit

@@ -84,9 +84,8 @@ class SimSettings(TypedSettings):
     shapes of these. meshes: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). contact_grid
     (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one.
     localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
-    tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: force and place of a grasp
-    (robot.grasping.plan.GraspSettings), how attempts are made (robot.grasping.settings.AttemptSettings), and what the
-    gels are made of (robot.gel_settings.GelSettings); what is not known of a gel is drawn for each.
+    tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts are made
+    (robot.grasping.settings), and what the gels are made of (robot.gel_settings); what is not known of one is drawn.
     """
 
     fingers: Sequence[str] = ("a", "b")
