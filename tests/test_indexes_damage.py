@@ -164,7 +164,7 @@ def test_a_pickled_array_is_not_loaded(folder):
 
 @pytest.mark.parametrize(
     ("version", "words"),
-    [(4, "has format 4.*update"), (1, "older format 1.*build-index"), (0, "older format 0"), (-1, "older")],
+    [(4, "newer format 4.*update"), (1, "older format 1.*build-index"), (0, "older format 0"), (-1, "older")],
 )
 def test_other_formats_say_whether_they_are_newer_or_older(folder, version, words):
     rewrite_manifest(folder, format=version)

@@ -1,10 +1,12 @@
 """What commands write: whole, over nothing but files of their own kind, and swept after those that were killed."""
 
+import contextlib
 import errno
 import os
 import resource
 import signal
 import socket
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -157,6 +159,22 @@ def test_what_another_writer_is_writing_is_not_swept(tmp_path, monkeypatch):
     write_atomically(path, b"first")
     assert path.read_bytes() == b"first"
     assert [one.name for one in tmp_path.iterdir()] == ["page"]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EACCES, errno.EIO])
+def test_a_disk_that_flushes_no_folders_is_written_to_and_a_broken_one_is_told(tmp_path, monkeypatch, number):
+    real = os.fsync
+
+    def refusing(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refusing)
+    told = pytest.raises(OSError, match="cannot be written") if number == errno.EIO else contextlib.nullcontext()
+    with told:
+        write_atomically(tmp_path / "page", b"whole")
+    assert (tmp_path / "page").read_bytes() == b"whole"
 
 
 def test_a_name_as_long_as_the_disk_takes_can_be_written(tmp_path):

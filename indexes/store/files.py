@@ -21,6 +21,8 @@ from indexes.errors import RowError
 from indexes.store.regular import DEEPEST, is_deep, open_regular
 
 _ENDING = ".tmp"
+_UNFLUSHED = (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP)
+"""Of a folder that may be written to but not read, and of disks that flush no folders."""
 
 
 @contextmanager
@@ -58,8 +60,11 @@ def write_atomically(path: Path, data: bytes) -> None:
                 file.write(data)
             os.fsync(descriptor)
             temporary.replace(place)
-        with suppress(PermissionError):  # a folder that may be written to, but not read
+        try:
             sync(place.parent)
+        except OSError as error:
+            if error.errno not in _UNFLUSHED:
+                raise
 
 
 @contextmanager

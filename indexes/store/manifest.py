@@ -99,25 +99,21 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
         try:
             with open_regular(path) as file:
                 size = os.fstat(file.fileno()).st_size
-            fits = size == must["bytes"] and (not verify or file_digest(path) == must["sha256"])
+            if size != must["bytes"]:
+                raise CorruptIndex(f"{path}: must have {must['bytes']} bytes, has {size}; {AGAIN}")
+            if verify and file_digest(path) != must["sha256"]:
+                raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest's, it was altered; {AGAIN}")
         except OSError as error:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
-        if size != must["bytes"]:
-            raise CorruptIndex(f"{path}: must have {must['bytes']} bytes, has {size}; {AGAIN}")
-        if not fits:
-            raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest's, it was altered; {AGAIN}")
 
 
 def _check_format(path: Path, version: object) -> None:
     if not isinstance(version, int) or isinstance(version, bool):
         raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
-    if version > FORMAT:
+    if not OLDER <= version <= FORMAT:
+        age, remedy = ("newer", f"update the software, or {AGAIN}") if version > FORMAT else ("older", AGAIN)
         raise UnsupportedFormat(
-            f"{path}: has format {version}, this software reads {OLDER} to {FORMAT}; update the software, or {AGAIN}"
-        )
-    if version < OLDER:
-        raise UnsupportedFormat(
-            f"{path}: has the older format {version}, this software reads {OLDER} to {FORMAT}; {AGAIN}"
+            f"{path}: has the {age} format {version}, this software reads {OLDER} to {FORMAT}; {remedy}"
         )
 
 
