@@ -183,6 +183,12 @@ def test_two_objects_are_too_few_to_fit_on():
         fit_posterior(Judged(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
 
 
+def test_touches_without_another_photo_of_their_object_are_nothing_to_fit_on():
+    owner = np.arange(3)
+    with pytest.raises(BadInput, match="another photo of theirs; got 3 objects and 0 such touches"):
+        fit_posterior(Judged(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
+
+
 def test_it_is_written_and_read_back():
     posterior = Posterior(0.9, -0.1, 0.7, tests=321)
     assert Posterior.from_dict(posterior.to_dict()) == posterior

@@ -179,20 +179,18 @@ def fit_posterior(judged: Judged, *, seed: int = 0) -> Posterior:
     With one grasp of each object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than
     three objects, or where no touch has another photo of its object.
     """
-    sets = [_sets(judged, grasps, seed) for grasps in range(1, _MOST_GRASPS + 1)]
-    return fit_questions([Questions.of(judged, rows, seed) for rows in sets if len(rows)])
-
-
-def _sets(judged: Judged, grasps: int, seed: int) -> Numbers:
-    """(S, grasps) touches of one object each, which leave that object a photo; of one grasp every touch."""
-    rng = np.random.default_rng([seed, grasps])
-    found = []
-    for name in np.unique(judged.touch_owner):
-        mine = np.flatnonzero(judged.touch_owner == name)
-        draws = mine[:, None] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(_SETS)]
-        photos = judged.photo_owner == name
-        found += [rows for rows in draws if len(rows) == grasps and (photos & ~judged.own[rows].any(0)).any()]
-    return np.array(found, dtype=np.int64).reshape(-1, grasps)
+    asked = []
+    for grasps in range(1, _MOST_GRASPS + 1):
+        rng = np.random.default_rng([seed, grasps])
+        sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch
+        for name in np.unique(judged.touch_owner):
+            mine = np.flatnonzero(judged.touch_owner == name)
+            draws = mine[:, None] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(_SETS)]
+            photos = judged.photo_owner == name
+            sets += [rows for rows in draws if len(rows) == grasps and (photos & ~judged.own[rows].any(0)).any()]
+        if sets or grasps == 1:
+            asked.append(Questions.of(judged, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed))
+    return fit_questions(asked)
 
 
 @dataclass(frozen=True, eq=False)
