@@ -21,23 +21,19 @@ def overview(results: Results) -> Figure:
     figure = canvas(10.5, 0.9 + 0.32 * len(results.methods))
     panels = figure.subplots(1, len(keys), sharey=True, squeeze=False)[0]
     for panel, key in zip(panels, keys, strict=True):
-        _forest(panel, results, key)
+        for row, name in enumerate(results.methods):
+            if summary := results.summary(name, key):
+                value, low, high = _first(summary)
+                panel.plot([low, high], [row, row], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
+                panel.plot(value, row, style_of(name).marker, color=style_of(name).colour, ms=6.5)
+                panel.axvline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1, zorder=0)
+        panel.set_title(measure_label(key).replace(", ", "\n", 1), fontsize=9)
+        panel.set_xlabel("%")
+        panel.tick_params(axis="y", length=0)
+        panel.grid(axis="y", visible=False)
     panels[0].set_yticks(range(len(results.methods)), [method_label(name) for name in results.methods])
     panels[0].invert_yaxis()
     return figure
-
-
-def _forest(panel: Axes, results: Results, key: str) -> None:
-    for row, name in enumerate(results.methods):
-        if summary := results.summary(name, key):
-            value, low, high = _first(summary)
-            panel.plot([low, high], [row, row], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
-            panel.plot(value, row, style_of(name).marker, color=style_of(name).colour, ms=6.5)
-            panel.axvline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1, zorder=0)
-    panel.set_title(measure_label(key).replace(", ", "\n", 1), fontsize=9)
-    panel.set_xlabel("%")
-    panel.tick_params(axis="y", length=0)
-    panel.grid(axis="y", visible=False)
 
 
 def _first(summary: Any) -> tuple[float, float, float]:
@@ -57,8 +53,14 @@ def guess_curves(results: Results) -> Figure:
     figure = canvas(2.5 + 4 * len(keys), 4.6)
     for panel, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
         for name in reversed(results.methods):
-            if summary := results.summary(name, key):
-                _curve(panel, name, summary)
+            if (summary := results.summary(name, key)) is None:
+                continue
+            value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
+            guesses, style = np.arange(1, len(value) + 1), style_of(name)
+            panel.plot(guesses, _percents(summary["chance"]), color=FAINT, ls="--", lw=1.2, zorder=1)
+            panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
+            if name not in KNOW_NOTHING:
+                panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('guesses_k')} candidate objects")
         panel.set_xlabel("guesses")
         panel.xaxis.get_major_locator().set_params(integer=True)
@@ -67,16 +69,7 @@ def guess_curves(results: Results) -> Figure:
     return figure
 
 
-def _curve(panel: Axes, name: str, summary: Any) -> None:
-    value, low, high = (_percents(summary[key]) for key in ("value", "low", "high"))
-    guesses, style = np.arange(1, len(value) + 1), style_of(name)
-    panel.plot(guesses, _percents(summary["chance"]), color=FAINT, ls="--", lw=1.2, zorder=1)
-    panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
-    if name not in KNOW_NOTHING:
-        panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
-
-
-def _legend(figure: Figure, names: Sequence[str], chance: bool = True) -> None:
+def _legend(figure: Figure, names: Sequence[str]) -> None:
     """One legend on the right, in the order of the tables."""
     from matplotlib.lines import Line2D
 
@@ -84,8 +77,7 @@ def _legend(figure: Figure, names: Sequence[str], chance: bool = True) -> None:
         Line2D([], [], color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
         for name, style in ((name, style_of(name)) for name in names)
     ]
-    if chance:
-        handles.append(Line2D([], [], color=FAINT, ls="--", lw=1.2, label="chance, closed form"))
+    handles.append(Line2D([], [], color=FAINT, ls="--", lw=1.2, label="chance, closed form"))
     figure.legend(handles=handles, loc="outside right center", frameon=False)
 
 
@@ -126,6 +118,8 @@ def objects_among_test(results: Results, method: str) -> Figure:
 
 def objects_among_all(results: Results, method: str) -> Figure:
     """First guess of five for every object, candidates from all objects; the parts of the split coloured apart."""
+    from matplotlib.patches import Patch
+
     shares = results.data["methods"][method]["per_object"]["all_candidates"]
     bars = [
         (name, shares[name], PART_COLOURS[part])
@@ -135,7 +129,9 @@ def objects_among_all(results: Results, method: str) -> Figure:
     figure = canvas(13, 3.8)
     panel = figure.subplots()
     _bars(panel, bars, results, "all_objects_k5", method, letters=24)
-    _legend_of_parts(panel)
+    names = {"test": "test: never seen", "validation": "validation: chosen on", "train": "train: fitted on"}
+    handles = [Patch(color=PART_COLOURS[part], label=label) for part, label in names.items()]
+    panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
     return figure
 
 
@@ -161,14 +157,6 @@ def _bars(
     panel.set_xlim(-0.7, len(bars) - 0.3)
     panel.grid(axis="x", visible=False)
     percent_axis(panel, "right first guess, %")
-
-
-def _legend_of_parts(panel: Axes) -> None:
-    from matplotlib.patches import Patch
-
-    names = {"test": "test: never seen", "validation": "validation: chosen on", "train": "train: fitted on"}
-    handles = [Patch(color=PART_COLOURS[part], label=label) for part, label in names.items()]
-    panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
 
 
 def among_test(results: Results) -> dict[str, dict[str, float]]:
@@ -215,9 +203,19 @@ def reliability(results: Results, method: str) -> Figure:
     kinds = [kind for kind in RELIABILITIES if kind in diagrams]
     figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
     grid = figure.subplots(2, len(kinds), sharex=True, sharey="row", squeeze=False, height_ratios=[4, 1])
-    for column, kind in enumerate(kinds):
-        _diagram(grid[0][column], grid[1][column], diagrams[kind], style_of(method).colour)
-        grid[0][column].set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
+    colour = style_of(method).colour
+    for panel, counts, kind in zip(*grid, kinds, strict=True):
+        bins = [found for found in diagrams[kind]["bins"] if found["count"]]
+        given, found = _percents([one["probability"] for one in bins]), _percents([one["share"] for one in bins])
+        panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
+        panel.vlines(given, given, found, color=colour, lw=1, alpha=0.5)
+        panel.plot(given, found, "o-", color=colour, ms=5)
+        panel.set_xlim(-2, 102)
+        panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
+        counts.bar(given, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
+        counts.set_yscale("log")
+        logarithmic(counts.yaxis, (1,))
+        counts.set_xlabel("probability given, %")
     percent_axis(grid[0][0], "right answers, %")
     grid[1][0].set_ylabel("answers")
     return figure
@@ -230,19 +228,6 @@ def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
     axis.set_major_locator(LogLocator(subs=steps, numticks=16))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def _diagram(panel: Axes, counts: Axes, diagram: Any, colour: str) -> None:
-    bins = [found for found in diagram["bins"] if found["count"]]
-    said, found = _percents([one["probability"] for one in bins]), _percents([one["share"] for one in bins])
-    panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
-    panel.vlines(said, said, found, color=colour, lw=1, alpha=0.5)
-    panel.plot(said, found, "o-", color=colour, ms=5)
-    panel.set_xlim(-2, 102)
-    counts.bar(said, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
-    counts.set_yscale("log")
-    logarithmic(counts.yaxis, (1,))
-    counts.set_xlabel("probability given, %")
 
 
 def reject(results: Results) -> Figure:
@@ -277,20 +262,31 @@ def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> No
 # Time ------------------------------------------------------------------------------------------------
 
 
-def accuracy_and_time(results: Results, measure: str = "guesses_k5") -> Figure:
+def accuracy_and_time(results: Results) -> Figure:
     """First guess of five against the time of a query and against the time of fitting; upper left is better."""
     figure = canvas(10.5, 4.4)
     panels = figure.subplots(1, 2, sharey=True)
     titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
     for panel, (what, title) in zip(panels, titles.items(), strict=True):
-        points = _timed(results, measure, what)
-        for name, time, summary in points:
+        front: list[tuple[float, float]] = []
+        for name in results.methods:
+            time, summary = results.time(name, what), results.summary(name, "guesses_k5")
+            if not (time and summary):
+                continue
             value, low, high = _first(summary)
+            front.append((time, value))
             panel.errorbar(
                 time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
             )
             panel.axhline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1.2, zorder=0)
-        _front(panel, [(time, _first(summary)[0]) for _, time, summary in points])
+        # Steps through the methods that no other one beats in both time and accuracy.
+        front = [
+            (time, value)
+            for time, value in sorted(front)
+            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in front)
+        ]
+        if front:
+            panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
         panel.set_xscale("log")
         low, high = panel.get_xlim()
         logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
@@ -298,18 +294,3 @@ def accuracy_and_time(results: Results, measure: str = "guesses_k5") -> Figure:
     percent_axis(panels[0], "right first guess among 5 objects, %")
     _legend(figure, results.methods)
     return figure
-
-
-def _timed(results: Results, measure: str, what: str) -> list[tuple[str, float, Any]]:
-    found = [(name, results.time(name, what), results.summary(name, measure)) for name in results.methods]
-    return [(name, time, summary) for name, time, summary in found if time and summary]
-
-
-def _front(panel: Axes, points: Sequence[tuple[float, float]]) -> None:
-    """Steps through the methods that no other one beats in both time and accuracy."""
-    front: list[tuple[float, float]] = []
-    for time, value in sorted(points, key=lambda point: (point[0], -point[1])):
-        if not front or value > front[-1][1]:
-            front.append((time, value))
-    if front:
-        panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)

@@ -56,11 +56,14 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
         (method_label(name), *(with_interval(results.summary(name, key), place) for _, key, place in columns))
         for name in results.methods
     ]
-    chance = ("chance, closed form", *(_chance(results, key, place) for _, key, place in columns))
+    chance = ["chance, closed form"]
+    for _, key, place in columns:
+        found = [summary for name in results.methods if (summary := results.summary(name, key))]
+        chance.append(" or ".join(sorted({percent(summary["chance"][place]) for summary in found})) or NOTHING)
     return _explained(
         Table(
             ("method, %", *(heading for heading, _, _ in columns)),
-            (*rows, chance),
+            (*rows, tuple(chance)),
             tuple(_basis(results, list(dict.fromkeys(key for _, key, _ in columns)))),
             bold=frozenset(_best(results, columns)),
         )
@@ -80,11 +83,6 @@ def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:
         if len(highest) == 1 < len(values):
             found.append((highest[0], at))
     return found
-
-
-def _chance(results: Results, key: str, place: int) -> str:
-    shares = {percent(found["chance"][place]) for name in results.methods if (found := results.summary(name, key))}
-    return " or ".join(sorted(shares)) or NOTHING
 
 
 def _basis(results: Results, keys: Sequence[str]) -> list[str]:
@@ -111,25 +109,22 @@ def everything(results: Results) -> Table:
     known = [key for name in results.methods for key in results.data["methods"][name].get("measures", {})]
     keys = sorted(set(known), key=lambda key: known.index(key))
     rows = [
-        (method_label(name), measure_label(key), *_full_row(found))
+        (
+            method_label(name),
+            measure_label(key),
+            "; ".join(with_interval(found, place) for place in range(len(found["value"]))),
+            "; ".join(percent(share) for share in found["chance"]),
+            ", ".join(percent(values[0]) for values in found["by_seed"]),
+            f"{found['queries']:,}",
+            str(found["objects"]),
+            found["gallery"],
+        )
         for key in keys
         for name in results.methods
         if (found := results.summary(name, key))
     ]
     header = ("method", "measure", "value [interval], %", "chance, %", "by seed, %", "queries", "objects", "gallery")
     return _explained(Table(header, tuple(rows), words=frozenset({1, 7})))
-
-
-def _full_row(summary: Summary) -> tuple[str, ...]:
-    places = range(len(summary["value"]))
-    return (
-        "; ".join(with_interval(summary, place) for place in places),
-        "; ".join(percent(share) for share in summary["chance"]),
-        ", ".join(percent(values[0]) for values in summary["by_seed"]),
-        f"{summary['queries']:,}",
-        str(summary["objects"]),
-        summary["gallery"],
-    )
 
 
 def comparisons(results: Results) -> Table:
@@ -157,25 +152,15 @@ def probability(value: float) -> str:
 def controls(results: Results) -> Table:
     """What late fusion gives when the answer is taken out of its input, and whether that is chance."""
     keys = ("pair_accuracy", "guesses_k5")
-    rows = [
-        (
-            name,
-            control["what"],
-            *(with_interval(control["measures"].get(key)) for key in keys),
-            *(_at_chance(control["measures"].get(key)) for key in keys[:1]),
-        )
-        for name, control in results.data["controls"].items()
-    ]
-    real = tuple(with_interval(results.summary("late_fusion", key)) for key in keys)
-    rows.insert(0, ("the result", "late fusion as it is", *real, ""))
+    real = (with_interval(results.summary("late_fusion", key)) for key in keys)
+    rows = [("the result", "late fusion as it is", *real, "")]
+    for name, control in results.data["controls"].items():
+        left, at_chance = (control["measures"].get(key) for key in keys), NOTHING
+        if pairs := control["measures"].get(keys[0]):
+            at_chance = "yes" if pairs["low"][0] <= pairs["chance"][0] <= pairs["high"][0] else "no"
+        rows.append((name, control["what"], *map(with_interval, left), at_chance))
     header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
     return _explained(Table(header, tuple(rows), words=frozenset({1})))
-
-
-def _at_chance(summary: Summary | None) -> str:
-    if summary is None:
-        return NOTHING
-    return "yes" if summary["low"][0] <= summary["chance"][0] <= summary["high"][0] else "no"
 
 
 def rejects(results: Results) -> Table:
@@ -254,17 +239,14 @@ def times(results: Results) -> Table:
         for name in results.methods
         if name in results.timings.get("methods", {})
     ]
-    return Table(("method", *columns.values()), tuple(rows), (_machine(results.timings),))
-
-
-def _machine(timings: Any) -> str:
-    towers, machine = timings.get("encode", {}), timings.get("machine", {})
-    return (
+    towers, machine = results.timings.get("encode", {}), results.timings.get("machine", {})
+    note = (
         f"On {machine.get('cpus', NOTHING)} CPU(s) with {machine.get('threads', NOTHING)} thread(s). Times of the "
         "methods alone: one query is one touch against the whole gallery, features given. The towers, shared "
         f"by all methods, take {number(towers.get('touch_ms'))} ms for a touch and {number(towers.get('photo_ms'))} ms "
         "for a photo."
     )
+    return Table(("method", *columns.values()), tuple(rows), (note,))
 
 
 def split(results: Results) -> Table:
