@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import SLOPE_BOUNDS, Judged, Posterior, fit_posterior
+from retrieval.model.posterior import SLOPE_BOUNDS, JudgedTouches, Posterior, fit_posterior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
@@ -99,11 +99,11 @@ def normal_logits(objects, touches, photos, apart, alike, seed=0):
     common = rng.normal(size=(objects, len(photo_owner)))[owner]
     noise = math.sqrt(alike) * common + math.sqrt(1 - alike) * rng.normal(size=same.shape)
     logits = apart * (noise + np.where(same, apart / 2, -apart / 2))
-    return Judged(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
+    return JudgedTouches(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
 
 
 def changed(judged, scale, shift):
-    return Judged(scale * judged.logits + shift, judged.touch_owner, judged.photo_owner, judged.own)
+    return JudgedTouches(scale * judged.logits + shift, judged.touch_owner, judged.photo_owner, judged.own)
 
 
 def test_the_fit_finds_planted_numbers_again():
@@ -136,7 +136,7 @@ def test_the_unit_of_the_logits_makes_no_difference_and_for_one_grasp_neither_do
 
 def test_logits_that_never_err_have_a_finite_slope():
     owner = np.arange(20)
-    judged = Judged(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
+    judged = JudgedTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
     found = fit_posterior(judged)
     assert SLOPE_BOUNDS[0] < found.slope < 3
     assert 0.5 < found.believe([5.0] + [-5.0] * 18).objects[0] < 1
@@ -146,7 +146,7 @@ def test_logits_that_say_nothing_leave_the_prior():
     owner = np.arange(20)
     for noise in (0.0, 1.0):
         scores = noise * np.random.default_rng(0).normal(size=(20, 20))
-        found = fit_posterior(Judged(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
+        found = fit_posterior(JudgedTouches(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
         assert found.believe(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
 
 
@@ -155,8 +155,8 @@ def test_a_photo_of_the_touchs_own_grasp_is_never_counted():
     own = np.zeros_like(judged.own)
     own[np.arange(60), np.arange(60)] = True
     with_secret = np.where(own, 1e6, judged.logits)
-    hidden = Judged(with_secret, judged.touch_owner, judged.photo_owner, own)
-    plain = Judged(np.where(own, 0.0, judged.logits), judged.touch_owner, judged.photo_owner, own)
+    hidden = JudgedTouches(with_secret, judged.touch_owner, judged.photo_owner, own)
+    plain = JudgedTouches(np.where(own, 0.0, judged.logits), judged.touch_owner, judged.photo_owner, own)
     assert fit_posterior(hidden) == fit_posterior(plain)
 
 
@@ -180,13 +180,13 @@ def test_without_a_sample_what_was_not_judged_cannot_be_estimated():
 def test_two_objects_are_too_few_to_fit_on():
     owner = np.array([0, 1])
     with pytest.raises(BadInput, match="three objects at least"):
-        fit_posterior(Judged(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
+        fit_posterior(JudgedTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
 
 
 def test_touches_without_another_photo_of_their_object_are_nothing_to_fit_on():
     owner = np.arange(3)
     with pytest.raises(BadInput, match="another photo of theirs; got 3 objects and 0 such touches"):
-        fit_posterior(Judged(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
+        fit_posterior(JudgedTouches(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
 
 
 def test_it_is_written_and_read_back():

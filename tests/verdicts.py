@@ -33,7 +33,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.fusion import judge_of
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.posterior import Judged, Questions
+from retrieval.model.posterior import JudgedTouches, Questions
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
 from retrieval.training.foreign import draw_foreign
@@ -109,7 +109,7 @@ def judge_catalogues(made: Checkpoint, folder: Path) -> tuple[list[dict[str, Any
     return rows, curves
 
 
-def judge_photos(made: Checkpoint, folder: Path) -> Judged:
+def judge_photos(made: Checkpoint, folder: Path) -> JudgedTouches:
     """Match logits of the touches of the felt objects with photos of all."""
     grasps = load_grasps(folder / "recording")
     features = encode_recording(grasps, made.matcher, made.config, folder / "features")
@@ -124,10 +124,10 @@ def judge_photos(made: Checkpoint, folder: Path) -> Judged:
     owner = np.concatenate([felt, felt.max() + 1 + np.arange(len(files))])
     own = np.zeros((len(felt), len(owner)), dtype=bool)
     own[np.arange(len(felt)), np.arange(len(felt))] = True
-    return Judged(np.stack([judge.logits(half[None], halves) for half in touches]), felt, owner, own)
+    return JudgedTouches(np.stack([judge.logits(half[None], halves) for half in touches]), felt, owner, own)
 
 
-def questions(made: Checkpoint, judged: Judged, grasps: int) -> Iterator[tuple[int, Asked]]:
+def questions(made: Checkpoint, judged: JudgedTouches, grasps: int) -> Iterator[tuple[int, Asked]]:
     """Of sets of so many grasps, for every size of catalogue; rivals drawn by a seed."""
     assert made.posterior is not None
     rng = np.random.default_rng([7, grasps])

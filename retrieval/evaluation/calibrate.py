@@ -17,7 +17,7 @@ from retrieval.errors import BadInput
 from retrieval.metrics.pairs import Calibration, fit_calibration
 from retrieval.metrics.reliability import reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
-from retrieval.model.posterior import LEAST_OBJECTS, Judged, Posterior, Questions, fit_questions
+from retrieval.model.posterior import LEAST_OBJECTS, JudgedTouches, Posterior, Questions, fit_questions
 
 _PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
@@ -81,7 +81,7 @@ def questions(table: ScoreTable, seed: int = 0) -> Questions:
     three objects.
     """
     kept = table.asked
-    judged = Judged(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
+    judged = JudgedTouches(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
     return Questions.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
 
 

@@ -163,7 +163,7 @@ _SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedTouches:
     """Match logits (T, N) of touches with photos; whose they are (T,), (N,); own (T, N): photos that were taken in a
     grasp of that very touch and are not shown to it."""
 
@@ -173,7 +173,7 @@ class Judged:
     own: NDArray[np.bool_]
 
 
-def fit_posterior(judged: Judged, *, seed: int = 0) -> Posterior:
+def fit_posterior(judged: JudgedTouches, *, seed: int = 0) -> Posterior:
     """Fit on single touches of validation objects and, where an object has more, on sets of up to 5 grasps of it.
 
     With one grasp of each object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than
@@ -209,7 +209,7 @@ class Questions:
     catalogues: tuple[Numbers, ...]
 
     @classmethod
-    def of(cls, judged: Judged, sets: Numbers, seed: int = 0) -> "Questions":
+    def of(cls, judged: JudgedTouches, sets: Numbers, seed: int = 0) -> "Questions":
         """Of sets of touches (S, G). Raises BadInput where there are none, or fewer than three objects."""
         objects, owner = np.unique(judged.photo_owner, return_inverse=True)
         if len(objects) < LEAST_OBJECTS or not len(sets):

@@ -33,10 +33,10 @@ class Builder:
         chance = next((summary["chance"][0] for _, summary in found if summary), None)
         return f"{measure_label(measure)}: {', '.join(values)}; chance {percent(chance)} %"
 
-    def each(self, what: str, show: Callable[[str], Iterator[Block]]) -> Iterator[Block]:
+    def each(self, what: str, show: Callable[["Builder", str], Iterator[Block]]) -> Iterator[Block]:
         """Blocks of the main method, then folded those of the other ones that have `what`."""
         for name in self.results.learned:
             if self.results.data["methods"][name].get(what):
-                blocks = tuple(show(name))
+                blocks = tuple(show(self, name))
                 folded = (Details(at_start(method_label(name)), blocks),) if blocks else ()
                 yield from blocks if name == self.main else folded

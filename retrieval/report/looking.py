@@ -1,7 +1,6 @@
 """Sections on single objects, queries and decisions: where a method is right, where wrong, and how sure it is."""
 
 from collections.abc import Iterator
-from functools import partial
 
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
@@ -16,7 +15,7 @@ TOO_FEW = (
 
 def objects(builder: Builder) -> Iterator[Block | None]:
     """First guess for every object, among test objects and among all."""
-    yield from builder.each("per_object", partial(_bars, builder))
+    yield from builder.each("per_object", _bars)
     if len(plots.among_test(builder.results)) > 1:
         yield builder.picture(
             "objects-methods.png",
@@ -51,7 +50,7 @@ def confusions(builder: Builder) -> Iterator[Block | None]:
     if not builder.grasps:
         yield Text("The pictures need the recording, which was not given.")
         return
-    yield from builder.each("confusions", partial(_mistaken, builder))
+    yield from builder.each("confusions", _mistaken)
 
 
 def _mistaken(builder: Builder, name: str) -> Iterator[Block]:
@@ -71,7 +70,7 @@ def _mistaken(builder: Builder, name: str) -> Iterator[Block]:
 def examples(builder: Builder) -> Iterator[Block | None]:
     """Galleries of best and worst queries."""
     if builder.grasps:
-        yield from builder.each("examples", partial(_queries, builder))
+        yield from builder.each("examples", _queries)
 
 
 def _queries(builder: Builder, name: str) -> Iterator[Block]:
@@ -94,7 +93,7 @@ def _queries(builder: Builder, name: str) -> Iterator[Block]:
 
 def calibration(builder: Builder) -> Iterator[Block | None]:
     """Whether probabilities mean what they say."""
-    yield from builder.each("reliability", partial(_reliability, builder))
+    yield from builder.each("reliability", _reliability)
     found = {name: builder.results.data["methods"][name] for name in builder.results.methods}
     if any(one.get("reliability") for one in found.values()):
         yield tables.calibrations(builder.results, plots.RELIABILITIES)

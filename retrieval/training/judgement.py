@@ -23,7 +23,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
 from retrieval.model.fusion import KINDS, GelHead, Matcher, judge_of
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.model.posterior import Judged, Posterior, fit_posterior
+from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign import draw_foreign
 
@@ -109,7 +109,7 @@ def posterior_of(
         photo_halves = matcher.photo_code(torch.stack(list(photos.values()))).half.cpu().numpy()
     judge = judge_of(matcher.head)
     logits = np.stack([judge.logits(half[None], photo_halves) for half in touch_halves])
-    return fit_posterior(Judged(logits, touch_owner, photo_owner, own), seed=seed)
+    return fit_posterior(JudgedTouches(logits, touch_owner, photo_owner, own), seed=seed)
 
 
 # What does a gel image show? -------------------------------------------------------------------------------

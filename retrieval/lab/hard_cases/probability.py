@@ -11,7 +11,7 @@ from retrieval.evaluation.reject import galleries, statistic
 from retrieval.lab.hard_cases.case import HardCase, refused
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.metrics.reliability import reliability_bins
-from retrieval.model.posterior import Judged, Posterior, fit_posterior
+from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 
 Matrix = NDArray[np.float64]
 _LOGITS, _CALIBRATION = "logits", "calibration"
@@ -154,11 +154,11 @@ def _choices_that_never_err() -> HardCase:
     return HardCase("softmax", "30 of 30 choices right", wanted, naive, ours, wrong[1] > 0.01, wrong[0] > 0.01)
 
 
-def judged_choices(scores: Matrix) -> Judged:
+def judged_choices(scores: Matrix) -> JudgedTouches:
     """The choices (Q, k), the true one first, as touches of k objects with one photo each; objects take turns."""
     owner = np.arange(len(scores)) % scores.shape[1]
     logits = np.stack([np.roll(row, place) for row, place in zip(scores, owner, strict=True)])
-    return Judged(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
+    return JudgedTouches(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
 
 
 def _odds_of_a_gallery() -> HardCase:
