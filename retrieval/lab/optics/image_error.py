@@ -12,7 +12,7 @@ from robot.errors import BadRobotInput
 _SSIM_SIGMA, _SSIM_REACH = 1.5, 5
 
 
-class ImageError(NamedTuple):
+class PictureError(NamedTuple):
     """Mean absolute and mean squared difference, structural similarity, and signal to noise in dB."""
 
     l1: float
@@ -21,7 +21,7 @@ class ImageError(NamedTuple):
     psnr: float
 
 
-def compare(picture: NDArray[Any], truth: NDArray[Any]) -> ImageError:
+def compare(picture: NDArray[Any], truth: NDArray[Any]) -> PictureError:
     """Errors of `picture` (rows, cols, channels; rounded and clipped to 0..255) against `truth` (uint8).
 
     PSNR is 20 log10(255 / rms), infinite for equal pictures. Raises BadRobotInput for pictures that differ in shape
@@ -39,7 +39,7 @@ def compare(picture: NDArray[Any], truth: NDArray[Any]) -> ImageError:
     difference = shown - truth
     mse = float(np.mean(difference**2))
     psnr = 10 * math.log10(255**2 / mse) if mse > 0 else math.inf
-    return ImageError(float(np.abs(difference).mean()), mse, ssim(shown, truth), psnr)
+    return PictureError(float(np.abs(difference).mean()), mse, ssim(shown, truth), psnr)
 
 
 def ssim(one: NDArray[Any], other: NDArray[Any]) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.lab.optics.image_error import ImageError, compare
+from retrieval.lab.optics.image_error import PictureError, compare
 from retrieval.lab.optics.least_squares import (
     Gram,
     Matrix,
@@ -167,7 +167,7 @@ def _tuples(values: Matrix) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, row)) for row in values)
 
 
-def held_out_error(presses: Presses, index: int, model: Fit) -> ImageError:
+def held_out_error(presses: Presses, index: int, model: Fit) -> PictureError:
     """The error of a model on a press that it was not fitted to."""
     if model.align:
         start = first_pose(presses, index, model.setting)
@@ -177,7 +177,7 @@ def held_out_error(presses: Presses, index: int, model: Fit) -> ImageError:
     return judged(presses, index, _change(presses, index, pose, model), model.blur_px)
 
 
-def judged(presses: Presses, index: int, change: Any, blur_px: float = 0.0) -> ImageError:
+def judged(presses: Presses, index: int, change: Any, blur_px: float = 0.0) -> PictureError:
     """Errors of untouched + change on the crop of a press."""
     rows, cols = presses.crop(index)
     return compare(

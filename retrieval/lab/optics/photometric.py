@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.lab.optics.image_error import ImageError
+from retrieval.lab.optics.image_error import PictureError
 from retrieval.lab.optics.least_squares import Matrix
 from retrieval.lab.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, judged, select, to_optics
 from retrieval.lab.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses, taxim_change
@@ -48,9 +48,9 @@ SOURCE = (
 class Scores:
     """Errors of one way of predicting, by press: a press may be held out by several splits."""
 
-    by_press: dict[int, list[ImageError]] = field(default_factory=dict)
+    by_press: dict[int, list[PictureError]] = field(default_factory=dict)
 
-    def add(self, index: int, error: ImageError) -> None:
+    def add(self, index: int, error: PictureError) -> None:
         """Note the error on one held-out press."""
         self.by_press.setdefault(index, []).append(error)
 
@@ -64,7 +64,7 @@ class Scores:
         rng = np.random.default_rng([seed, 0xB007])
         means = table[rng.integers(0, len(table), (draws, len(table)))].mean(axis=1)
         low, high = np.percentile(means, [2.5, 97.5], axis=0)
-        keys = ImageError._fields
+        keys = PictureError._fields
         return {
             key: {"mean": float(table[:, at].mean()), "low": float(low[at]), "high": float(high[at])}
             for at, key in enumerate(keys)
