@@ -1,12 +1,13 @@
 """How the code hangs together: `python -m tests.structure`.
 
-Files, lines and imports of every folder; then three ways through the code, each followed as it runs: of a query's gel
-images, of a catalogue's photo into an index, and of a grasp's force to the gripper. A way's modules stand in the order
+Files, lines and imports of every folder; then ways through the code, each followed as it runs: of a query's gel images
+(by an exported encoder, and by PyTorch), of a catalogue's photo into an index, and of a grasp's force to the gripper. A way's modules stand in the order
 in which it first enters them. "again": calls into a module where the way had been before. What every module may use
 (errors, speaking, progress) is left out.
 """
 
 import ast
+import shutil
 import sys
 import tempfile
 import threading
@@ -101,23 +102,29 @@ class Way:
 
 
 def follow(folder: Path) -> dict[str, Way]:
-    """The three ways, on things drawn into `folder`; what is set up once has been set up before."""
+    """The ways, on things drawn into `folder`; what is set up once has been set up before."""
     import retrieval
+    from retrieval.model.export import export
     from tests import synthetic
     from tests.wsg50_bench import bench
 
     drawn = synthetic.make_objects(4, seed=1)
     synthetic.write_catalogue(folder / "catalog", drawn)
     touch = synthetic.write_queries(folder / "drawn", drawn, touches_per_object=1)[drawn[0].object_id][0]
-    checkpoint = retrieval.load_checkpoint(retrieval.shipped_model())
-    ways = {name: Way() for name in ("a query's images", "a catalogue's photo", "a grasp's force")}
+    model = Path(shutil.copy(retrieval.shipped_model(), folder / "model.safetensors"))
+    checkpoint = retrieval.load_checkpoint(model)
+    names = ("a catalogue's photo", "a query's images, PyTorch", "a query's images, exported", "a grasp's force")
+    ways = {name: Way() for name in names}
     with ways["a catalogue's photo"]:
-        retrieval.build_index(folder / "catalog", checkpoint, folder / "index")
-    with retrieval.open(folder / "index") as searcher:
-        searcher.gel_check = None  # which would send drawn pictures back
-        searcher.query(touch)
-        with ways["a query's images"]:
+        retrieval.build_index(folder / "catalog", checkpoint, folder / "index", quiet=True)
+    for encoder in ("PyTorch", "exported"):
+        if encoder == "exported":
+            export(checkpoint)
+        with retrieval.open(folder / "index") as searcher:
+            searcher.gel_check = None  # which would send drawn pictures back
             searcher.query(touch)
+            with ways[f"a query's images, {encoder}"]:
+                searcher.query(touch)
     with bench() as (gripper, _), ways["a grasp's force"]:
         gripper.grasp(20.0)
     return ways
