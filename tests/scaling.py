@@ -42,6 +42,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--preset", default="mobilenet")
     parser.add_argument("--init", default="imagenet", help="first weights of the towers")
+    for side in ("photo", "touch"):
+        parser.add_argument(
+            f"--init-{side}", default="", help="of one tower alone, from `retrieve train --task relief`"
+        )
+    parser.add_argument("--views", nargs="+", help="ablation: other views of a photo than the preset's")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["late_fusion", "cca"])
     parser.add_argument("--objects", type=int, nargs="+", default=[20, 80, 320, 1280])
@@ -85,6 +90,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "iterations": config.training.iterations,
         "fingers": arguments.fingers,
         "touch_px": config.preprocessing.touch_px,
+        "views": config.preprocessing.views,
         "recording": seen_digest,
         "unseen": unseen_digest,
         "points": points,
@@ -93,9 +99,17 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _config(arguments: argparse.Namespace) -> Config:
     config = load_config(arguments.preset)
-    training = dataclasses.replace(config.training.of_steps(arguments.iterations), init=arguments.init)
-    touch_px = arguments.touch_px or config.preprocessing.touch_px
-    preprocessing = dataclasses.replace(config.preprocessing, touch_px=touch_px)
+    training = dataclasses.replace(
+        config.training.of_steps(arguments.iterations),
+        init=arguments.init,
+        init_photo=arguments.init_photo,
+        init_touch=arguments.init_touch,
+    )
+    preprocessing = dataclasses.replace(
+        config.preprocessing,
+        touch_px=arguments.touch_px or config.preprocessing.touch_px,
+        views=tuple(arguments.views or config.preprocessing.views),
+    )
     return dataclasses.replace(config, training=training, preprocessing=preprocessing)
 
 
