@@ -1,9 +1,9 @@
 """How the code hangs together: `python -m tests.structure`.
 
 Files, lines and imports of every folder; then ways through the code, each followed as it runs: of a query's gel images
-(by an exported encoder, and by PyTorch), of a catalogue's photo into an index, and of a grasp's force to the gripper. A way's modules stand in the order
-in which it first enters them. "again": calls into a module where the way had been before. What every module may use
-(errors, speaking, progress) is left out.
+(by an exported encoder, and by PyTorch), of a catalogue's photo into an index, and of a grasp's force to the gripper. A
+way's modules stand in the order in which it first enters them. "again": calls into a module where the way had been
+before. What every module may use (errors, speaking, progress) is left out.
 """
 
 import ast
