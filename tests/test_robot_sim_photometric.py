@@ -309,7 +309,7 @@ def test_splits_share_no_press():
 def test_an_interval_goes_over_presses_not_over_repeats_of_one():
     scores = photometric.Scores()
     for index, value in ((0, 1.0), (0, 3.0), (1, 6.0)):
-        scores.add(index, photometric.ImageError(value, value, value, value))
+        scores.add(index, photometric.PictureError(value, value, value, value))
     summary = scores.summary()["psnr"]
     assert summary["mean"] == 4.0
     assert (summary["low"], summary["high"]) == (2.0, 6.0)
