@@ -10,9 +10,11 @@ import tomllib
 
 import cv2
 import pytest
+import torch
 import typer
 
 from retrieval.commands.main import main
+from retrieval.model.towers import build_tower
 from retrieval.search.answer import EXIT_CODES
 from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
@@ -52,7 +54,8 @@ def of_program(name, *pages):
 
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
-    """Everything that the commands name: catalog/, gel images, recording/, model.safetensors, billets/, rig.toml."""
+    """Everything that the commands name: catalog/, gel images, recording/, billets/, model.safetensors, rig.toml,
+    mobilenet_v2.pth."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copy(model, tmp_path / "model.safetensors")
@@ -66,6 +69,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
     (tmp_path / "points.csv").write_text(POINTS)
+    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
     monkeypatch.chdir(tmp_path)
     with replay_file(EmulatedWSG50(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
         shutil.copy(rig, tmp_path)
