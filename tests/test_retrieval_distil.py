@@ -21,14 +21,14 @@ from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
 HIDDEN = 16
-UNTAUGHT = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
+UNPRUNED = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
 
 
 @pytest.fixture
 def matcher():
     """Its head says how far apart touch and photo are: minus the sum of |t - v|, each as relu(t - v) + relu(v - t)."""
     torch.manual_seed(3)
-    matcher = Matcher(UNTAUGHT).eval()
+    matcher = Matcher(UNPRUNED).eval()
     with torch.no_grad():
         matcher.head.second.weight.copy_(torch.eye(HIDDEN))
         matcher.head.second.bias.zero_()
@@ -97,7 +97,7 @@ def test_a_loss_that_is_not_finite_is_told_and_the_matcher_stays_as_it_was(match
     with pytest.raises(NumericalError, match="loss must stay finite"):
         taught(matcher, halves)
     assert matcher.pruner is None
-    assert matcher.config == UNTAUGHT
+    assert matcher.config == UNPRUNED
 
 
 # Its data --------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_nothing_but_the_pruner_changes(matcher, halves):
     after = matcher.state_dict()
     assert same(before, after)
     assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"pruner"}
-    assert matcher.config == dataclasses.replace(UNTAUGHT, pruner_width=32)
+    assert matcher.config == dataclasses.replace(UNPRUNED, pruner_width=32)
     assert all(parameter.grad is None for name, parameter in matcher.named_parameters() if "pruner" not in name)
 
 
@@ -191,7 +191,7 @@ def checkpoint(matcher, tmp_path):
         path=tmp_path / "m.safetensors",
         digest="",
         matcher=matcher,
-        config=Config(UNTAUGHT),
+        config=Config(UNPRUNED),
         split=None,
         gel_check=None,
         provenance=about,
@@ -199,7 +199,7 @@ def checkpoint(matcher, tmp_path):
 
 
 def wanted(steps=20):
-    return Config(dataclasses.replace(UNTAUGHT, pruner_width=32), TrainingConfig(distil_steps=steps))
+    return Config(dataclasses.replace(UNPRUNED, pruner_width=32), TrainingConfig(distil_steps=steps))
 
 
 def test_a_checkpoint_gets_a_pruner_queries_and_the_pruners_own_measure(checkpoint, halves):

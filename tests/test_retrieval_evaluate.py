@@ -12,8 +12,8 @@ import torch
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
-from retrieval.evaluation.bench import Bench, _shuffled
 from retrieval.evaluation.controls import thinned
+from retrieval.evaluation.experiment import Experiment, _shuffled
 from retrieval.evaluation.run import evaluate
 from retrieval.methods.base import Method
 from retrieval.model.checkpoint import load_checkpoint
@@ -175,7 +175,7 @@ def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkey
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch, made):
     fitted = []
-    real = Bench._fitted
+    real = Experiment._fitted
 
     def stopping(self, name, seed):
         if name == "cca":
@@ -184,11 +184,11 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch,
         return real(self, name, seed)
 
     with monkeypatch.context() as during:
-        during.setattr(Bench, "_fitted", stopping)
+        during.setattr(Experiment, "_fitted", stopping)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "out", seeds=2)
     assert fitted == ["late_fusion", "late_fusion", "prune_rerank", "prune_rerank"]
-    monkeypatch.setattr(Bench, "_fitted", lambda self, *job: fitted.append(job[0]) or real(self, *job))
+    monkeypatch.setattr(Experiment, "_fitted", lambda self, *job: fitted.append(job[0]) or real(self, *job))
     assert run(tmp_path / "out", seeds=2) == made[0]
     assert fitted[4:] == ["cca", "constant", "late_fusion", "late_fusion", "late_fusion"]  # the last are controls
 
@@ -208,11 +208,11 @@ def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch
 def test_shuffled_touches_stay_in_their_part_and_photos_where_they_are():
     touch = np.arange(40, dtype=np.float32).reshape(20, 1, 2)
     features = Features(tuple(map(str, range(20))), ("a",) * 10 + ("b",) * 10, touch, touch[:, 0])
-    dealt = _shuffled(features, 0)
-    assert sorted(dealt.touch[:, 0, 0]) == sorted(touch[:, 0, 0])
-    assert (dealt.touch != touch).any()
-    np.testing.assert_array_equal(dealt.photo, features.photo)
-    assert dealt.object_ids == features.object_ids
+    permuted = _shuffled(features, 0)
+    assert sorted(permuted.touch[:, 0, 0]) == sorted(touch[:, 0, 0])
+    assert (permuted.touch != touch).any()
+    np.testing.assert_array_equal(permuted.photo, features.photo)
+    assert permuted.object_ids == features.object_ids
 
 
 def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tmp_path):

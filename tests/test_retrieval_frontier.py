@@ -11,10 +11,10 @@ from retrieval.errors import ConfigError, DatasetError
 from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation, run
 from retrieval.lab.frontier.candidates import default_k, ranks
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.correlation import Problem, _by_covariance, _ours, known_problem
+from retrieval.lab.frontier.correlation import Problem, _by_covariance, _by_svd, known_problem
 from retrieval.lab.frontier.formats import FORMATS, encoders
 from retrieval.lab.frontier.pixels import load_touch
-from retrieval.lab.frontier.points import Panel, Point, Row, duration, missed, number
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, duration, missed, number
 from retrieval.lab.frontier.sample import Sample, Scale, blend
 from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
@@ -27,7 +27,7 @@ TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
 
 
 def panel(*points, tolerance=1.0):
-    made = tuple(Point("", f"s{place}", error, seconds=seconds) for place, (seconds, error) in enumerate(points))
+    made = tuple(Tradeoff("", f"s{place}", error, seconds=seconds) for place, (seconds, error) in enumerate(points))
     return Panel("errors", "one go", "%", "the truth", tolerance, made, 0.1)
 
 
@@ -282,7 +282,7 @@ def test_the_constructed_problem_has_the_correlations_that_it_says():
 
 def test_the_textbook_way_fails_where_ours_does_not():
     problem = known_problem(500, 24, spread=1e6)
-    assert _ours(problem) == pytest.approx(problem.rho, abs=1e-6)
+    assert _by_svd(problem) == pytest.approx(problem.rho, abs=1e-6)
     naive = _by_covariance(np.float32, problem)
     assert np.abs(naive - problem.rho).max() > 0.05
 
@@ -290,7 +290,7 @@ def test_the_textbook_way_fails_where_ours_does_not():
 def test_a_correlation_that_was_not_found_counts_as_zero():
     problem = known_problem(40, 3, spread=2.0)
     same = Problem(np.repeat(problem.x[:, :1], 3, axis=1), problem.y, problem.rho)
-    assert _ours(same)[1:].tolist() == [0.0, 0.0]
+    assert _by_svd(same)[1:].tolist() == [0.0, 0.0]
 
 
 # Run -------------------------------------------------------------------------------------------------------

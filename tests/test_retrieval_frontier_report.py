@@ -6,7 +6,7 @@ import pytest
 
 from retrieval.commands.main import main
 from retrieval.lab import reports as frontier_report
-from retrieval.lab.frontier.points import Panel, Point, Row
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff
 from retrieval.lab.frontier.report import write_frontier
 from retrieval.lab.hard_cases import run
 from retrieval.lab.hard_cases.case import HardCase
@@ -28,7 +28,7 @@ def document(*panels, skipped=None):
 
 def points(errors):
     return tuple(
-        Point("a", f"k = {k}", error, 0.0, error + 1, seconds=1e-3 * (k + 1)) for k, error in enumerate(errors)
+        Tradeoff("a", f"k = {k}", error, 0.0, error + 1, seconds=1e-3 * (k + 1)) for k, error in enumerate(errors)
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
-from retrieval.methods.selection import judge, judged_rows, ranking_auc
+from retrieval.methods.selection import Validator, judged_rows, ranking_auc
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training.features import Features
@@ -88,12 +88,14 @@ def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
 
 @pytest.mark.parametrize("name", LEARNS)
 def test_photos_of_the_touched_object_score_higher(name):
-    assert judge(TEST).touches(fitted(name).score(*codes(fitted(name)))) > 0.8
+    assert Validator.of(TEST).touches(fitted(name).score(*codes(fitted(name)))) > 0.8
 
 
 def test_the_constant_is_exactly_chance_and_chance_is_about_chance():
-    assert judge(TEST).touches(fitted("constant").score(*codes(fitted("constant")))) == 0.5
-    values = [judge(TEST).touches(fitted("chance", seed).score(*codes(fitted("chance", seed)))) for seed in range(12)]
+    assert Validator.of(TEST).touches(fitted("constant").score(*codes(fitted("constant")))) == 0.5
+    values = [
+        Validator.of(TEST).touches(fitted("chance", seed).score(*codes(fitted("chance", seed)))) for seed in range(12)
+    ]
     assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
 
 
@@ -135,7 +137,7 @@ def test_a_set_scores_the_sum_over_its_grasps(name):
 @pytest.mark.parametrize("name", LEARNS)
 def test_five_grasps_tell_more_than_one(name):
     noisy = planted(6, 2, noise=6.0)
-    judged = judge(noisy)
+    judged = Validator.of(noisy)
     touch, photo = codes(fitted(name), noisy)
     rows = np.arange(len(TEST))
     sets = rows[:, None] // 8 * 8 + (rows[:, None] + np.arange(5)) % 8

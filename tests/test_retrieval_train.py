@@ -124,7 +124,7 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recordin
 PRUNED = dataclasses.replace(
     with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, pruner_width=8)
 )
-TINY_UNTAUGHT = dataclasses.replace(PRUNED, matcher=TINY.matcher)
+TINY_UNPRUNED = dataclasses.replace(PRUNED, matcher=TINY.matcher)
 
 
 def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, tmp_path):
@@ -132,7 +132,7 @@ def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, 
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(trainer, 4)
     underway = load_checkpoint(trainer.out)
-    assert underway.config == TINY_UNTAUGHT
+    assert underway.config == TINY_UNPRUNED
     assert underway.queries is None
     trainer = trainer_for(recording, trainer.out, PRUNED)
     trainer.run(quiet=True)
@@ -198,7 +198,7 @@ def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_on
     ):
         train(recording, out, PRUNED, quiet=True)
     left = load_checkpoint(out)
-    assert left.config == TINY_UNTAUGHT
+    assert left.config == TINY_UNPRUNED
     assert left.posterior is None
     monkeypatch.undo()
     made = train(recording, out, PRUNED, resume=True, quiet=True)

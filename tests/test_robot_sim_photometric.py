@@ -15,7 +15,7 @@ from retrieval.lab.optics import model_choice as press_model
 from retrieval.lab.optics import photometric
 from retrieval.lab.optics import real_presses as presses
 from retrieval.lab.optics.image_error import compare, ssim
-from retrieval.lab.optics.least_squares import Setting, aligned, columns_of, features, gram, labelled_poses, solve
+from retrieval.lab.optics.least_squares import OpticsSetting, aligned, columns_of, features, gram, labelled_poses, solve
 from retrieval.lab.optics.model_choice import fit, held_out_error, judged, select, to_optics
 from retrieval.lab.optics.real_presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
 from robot.errors import BadRobotInput, UnknownName
@@ -23,7 +23,7 @@ from robot.sim.gel.fitted_optics import fitted_document, fitted_names, load_fitt
 from robot.sim.gel.surface import Field, Surface
 
 real = pytest.mark.skipif(find_spec("taxim") is None, reason="real presses come with taxim: pip install .[calibration]")
-PLAIN = Setting(degree=2, places=3, reaches_mm=())
+PLAIN = OpticsSetting(degree=2, places=3, reaches_mm=())
 
 
 def draw_presses(count=6, seed=0, setting=PLAIN, noise=1.0):
@@ -223,10 +223,10 @@ def test_the_loss_of_a_gram_is_the_mean_squared_error():
     assert gram(drawn, 1, pose, PLAIN).loss(weights) == pytest.approx(np.mean(error**2))
 
 
-@pytest.mark.parametrize("narrow", [Setting(2, 3, reaches_mm=()), Setting(3, 1), Setting(1, 6)])
+@pytest.mark.parametrize("narrow", [OpticsSetting(2, 3, reaches_mm=()), OpticsSetting(3, 1), OpticsSetting(1, 6)])
 def test_a_narrow_model_is_some_columns_of_a_wide_one(narrow):
     drawn, _ = draw_presses(1)
-    wide, pose = Setting(4, 6), labelled_poses(drawn, PLAIN)[0]
+    wide, pose = OpticsSetting(4, 6), labelled_poses(drawn, PLAIN)[0]
     whole, part = features(drawn, 0, pose, wide), features(drawn, 0, pose, narrow)
     np.testing.assert_array_equal(whole[:, columns_of(wide, narrow)], part)
 
@@ -276,7 +276,7 @@ def test_held_out_pictures_have_no_say_in_the_fit(monkeypatch):
 
 
 def test_the_optics_of_a_fit_draw_what_the_fit_predicts():
-    setting = Setting(2, 3, reaches_mm=(0.6,))
+    setting = OpticsSetting(2, 3, reaches_mm=(0.6,))
     drawn, _ = draw_presses(4, setting=setting)
     model = fit(drawn, range(4), setting, align=False)
     field = Field(260, 320, PIXEL_MM)
@@ -350,7 +350,7 @@ def packs():
 
 def shipped_setting(name):
     values = fitted_document(name)["setting"]
-    return Setting(**{**values, "reaches_mm": tuple(values["reaches_mm"])})
+    return OpticsSetting(**{**values, "reaches_mm": tuple(values["reaches_mm"])})
 
 
 @pytest.mark.slow

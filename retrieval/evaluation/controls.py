@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from retrieval.data.dataset import Grasp
-from retrieval.evaluation.bench import Bench
 from retrieval.evaluation.calibrate import calibrate_pairs
+from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import MethodScores, summaries
@@ -28,11 +28,10 @@ MOST_GRASPS = 12
 """Grasps of an object whose other images are encoded for a control."""
 
 
-def control_benches(bench: Bench, material: Material, cache: Path, seed: int) -> dict[str, Bench]:
-    """The bench of each control; "before" is left out where the recording lacks frames from before the contact."""
-    benches = {
-        "shuffled": dataclasses.replace(bench, folder=_folder(bench, "shuffled"), checkpoint=None, shuffled=True)
-    }
+def control_experiments(experiment: Experiment, material: Material, cache: Path, seed: int) -> dict[str, Experiment]:
+    """The experiment of each control; "before" is left out where the recording lacks frames from before the contact."""
+    folder, unfitted = experiment.folder / "controls", dataclasses.replace(experiment, checkpoint=None)
+    experiments = {"shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True)}
     grasps = thinned(material.grasps, MOST_GRASPS)
     queries = draw_queries(grasps, material.split, seed)
     for variant in ("before", "blurred"):
@@ -40,16 +39,12 @@ def control_benches(bench: Bench, material: Material, cache: Path, seed: int) ->
             continue
         towers = material.matcher, material.config
         features = encode_recording(
-            grasps, *towers, cache, variant=variant, photos_of=bench.features, quiet=bench.quiet
+            grasps, *towers, cache, variant=variant, photos_of=experiment.features, quiet=experiment.quiet
         )
-        benches[variant] = dataclasses.replace(
-            bench, folder=_folder(bench, variant), features=features, queries=queries, checkpoint=None
+        experiments[variant] = dataclasses.replace(
+            unfitted, folder=folder / variant, features=features, queries=queries
         )
-    return benches
-
-
-def _folder(bench: Bench, name: str) -> Path:
-    return bench.folder / "controls" / name
+    return experiments
 
 
 def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
@@ -63,9 +58,9 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
     return [grasps[row] for row in sorted(kept)]
 
 
-def score_control(name: str, bench: Bench, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
+def score_control(name: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
     """A control's entry of results.json."""
-    judged = MethodScores(bench.queries, bench.predictions(METHOD, training_seed), seed)
+    judged = MethodScores(experiment.queries, experiment.predictions(METHOD, training_seed), seed)
     pairs = calibrate_pairs(judged.touches("validation", "validation"), seed=seed)
     measures = take(judged.scored(pairs), MEASURED)
     return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}

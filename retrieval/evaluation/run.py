@@ -17,8 +17,8 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
-from retrieval.evaluation.bench import Bench
-from retrieval.evaluation.controls import METHOD, control_benches, score_control
+from retrieval.evaluation.controls import METHOD, control_experiments, score_control
+from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
@@ -65,27 +65,31 @@ def evaluate(
     seed = config.training.seed
     try:
         material = prepare(recording, out, config, model=model, split=split, quiet=quiet)
-        bench, controls = _benches(material, out, cache or out / "features", seed, quiet)
-        jobs = {name: bench.seeds_of(name, [seed + turn for turn in range(seeds)]) for name in dict.fromkeys(methods)}
-        _predict(bench, controls, jobs, seed)
+        experiment, controls = _experiments(material, out, cache or out / "features", seed, quiet)
+        jobs = {
+            name: experiment.seeds_of(name, [seed + turn for turn in range(seeds)]) for name in dict.fromkeys(methods)
+        }
+        _predict(experiment, controls, jobs, seed)
     except Interrupted as error:
         raise Interrupted(f"stopped; what was made is kept in {out}, and the same command goes on with it") from error
     results = {
-        **_about(material, bench, preset, [seed + turn for turn in range(seeds)]),
+        **_about(material, experiment, preset, [seed + turn for turn in range(seeds)]),
         "audit": _audited(material, out, quiet),
-        **_scored(bench, jobs, seed, quiet),
+        **_scored(experiment, jobs, seed, quiet),
         "controls": {
             name: score_control(name, control, seed, draws=DRAWS, seed=seed) for name, control in controls.items()
         },
     }
     _write(out / "results.json", results)
-    _write(out / "timings.json", _timings(material, bench, jobs))
+    _write(out / "timings.json", _timings(material, experiment, jobs))
     return results
 
 
-def _benches(material: Material, out: Path, cache: Path, seed: int, quiet: bool) -> tuple[Bench, dict[str, Bench]]:
-    """The bench of the evaluation, and those of the controls."""
-    bench = Bench(
+def _experiments(
+    material: Material, out: Path, cache: Path, seed: int, quiet: bool
+) -> tuple[Experiment, dict[str, Experiment]]:
+    """The experiment of the evaluation, and those of the controls."""
+    experiment = Experiment(
         folder=out,
         config=material.config,
         split=material.split,
@@ -95,19 +99,19 @@ def _benches(material: Material, out: Path, cache: Path, seed: int, quiet: bool)
         shuffled=False,
         quiet=quiet,
     )
-    return bench, control_benches(bench, material, cache, seed)
+    return experiment, control_experiments(experiment, material, cache, seed)
 
 
-def _predict(bench: Bench, controls: Mapping[str, Bench], jobs: Jobs, seed: int) -> None:
+def _predict(experiment: Experiment, controls: Mapping[str, Experiment], jobs: Jobs, seed: int) -> None:
     for name, seeds in jobs.items():
         for one in seeds:
-            bench.predict(name, one)
+            experiment.predict(name, one)
     for control in controls.values():
         control.predict(METHOD, seed)
 
 
-def _about(material: Material, bench: Bench, preset: str, seeds: list[int]) -> dict[str, Any]:
-    features = bench.features
+def _about(material: Material, experiment: Experiment, preset: str, seeds: list[int]) -> dict[str, Any]:
+    features = experiment.features
     return {
         "schema_version": SCHEMA_VERSION,
         "software": __version__,
@@ -142,15 +146,15 @@ def _without_paths(config: Config) -> dict[str, Any]:
     return tables
 
 
-def _scored(bench: Bench, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any]:
+def _scored(experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any]:
     """ "methods" and "comparisons" of results.json."""
     entries: dict[str, Any] = {}
     measures: dict[str, list[Measures]] = {}
     with Bar("score", len(jobs), "methods", quiet=quiet) as bar:
         for name, seeds in jobs.items():
-            predictions = [bench.predictions(name, one) for one in seeds]
+            predictions = [experiment.predictions(name, one) for one in seeds]
             entries[name], measures[name] = score_method(
-                bench.queries, bench.features.grasp_ids, predictions, draws=DRAWS, seed=seed
+                experiment.queries, experiment.features.grasp_ids, predictions, draws=DRAWS, seed=seed
             )
             bar.advance(note=name)
     return {"methods": entries, "comparisons": _compared(measures, seed)}
@@ -183,8 +187,8 @@ def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
     return found
 
 
-def _timings(material: Material, bench: Bench, jobs: Jobs) -> dict[str, Any]:
-    found = {name: _method_times([bench.predictions(name, seed).seconds for seed in jobs[name]]) for name in jobs}
+def _timings(material: Material, experiment: Experiment, jobs: Jobs) -> dict[str, Any]:
+    found = {name: _method_times([experiment.predictions(name, seed).seconds for seed in jobs[name]]) for name in jobs}
     if {"late_fusion", "prune_rerank"} <= set(found):  # one training serves both
         found["prune_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
     return {

@@ -2,7 +2,7 @@
 
 Three things make it a rival instead of a straw man: a ridge (with fewer grasps than features the plain method fits any
 noise with correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: cosine would count noise dimensions in
-full), and settings chosen by ranking on validation objects. Everything is reckoned in float64 from the singular value
+full), and settings chosen by ranking on validation objects. Everything is computed in float64 from the singular value
 decomposition of the centred data; X'X would square the condition number.
 """
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.methods.base import Array, Method
-from retrieval.methods.selection import Judge, judge
+from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def cosine(touch_codes: Array, photo_codes: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Choice:
+class CcaCell:
     """One cell of the grid, and how well it ranks photos of validation objects."""
 
     ridge: float
@@ -156,20 +156,20 @@ class Cca(Method):
         self._standardise = touch.standardise, photo.standardise
         # The decompositions are made once; a ridge only damps them.
         found = ((ridge, canonical(touch, photo, train.owner, ridge)) for ridge in RIDGES)
-        cells = (cell for ridge, one in found for cell in self._cells(ridge, one, judge(validation)))
+        cells = (cell for ridge, one in found for cell in self._cells(ridge, one, Validator.of(validation)))
         self._keep(*max(cells, key=lambda cell: cell[0].auc))
         self.chosen["rank"] = {"touch": touch.rank, "photo": photo.rank}
 
-    def _cells(self, ridge: float, found: Canonical, judged: Judge) -> Iterator[tuple[Choice, Canonical]]:
+    def _cells(self, ridge: float, found: Canonical, judged: Validator) -> Iterator[tuple[CcaCell, Canonical]]:
         touch = self._standardise[0](judged.features.touch) @ found.touch_weights
         photo = self._standardise[1](judged.features.photo) @ found.photo_weights
         for components in admissible(COMPONENTS, len(found.correlations)):
             for power in POWERS:
                 weights = found.correlations[:components] ** power
                 codes = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
-                yield Choice(ridge, components, power, judged.touches(cosine(*codes))), found
+                yield CcaCell(ridge, components, power, judged.touches(cosine(*codes))), found
 
-    def _keep(self, choice: Choice, found: Canonical) -> None:
+    def _keep(self, choice: CcaCell, found: Canonical) -> None:
         weights = found.correlations[: choice.components] ** choice.power
         self._maps = (
             found.touch_weights[:, : choice.components] * weights,

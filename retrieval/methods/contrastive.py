@@ -10,7 +10,7 @@ from torch.nn import functional
 from retrieval.console.progress import Bar
 from retrieval.methods.base import Array, Method
 from retrieval.methods.draws import ObjectDraws, seeded
-from retrieval.methods.selection import Judge, judge
+from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
 from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
@@ -77,7 +77,7 @@ class Contrastive(Method):
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
-        judged = judge(validation)
+        judged = Validator.of(validation)
         steps = min(self.setting.config.training.iterations, MOST_STEPS)
         with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.setting.quiet) as bar:
             fits = [self._trained(train, judged, *cell, steps, bar) for cell in REGULARISATIONS]
@@ -95,7 +95,7 @@ class Contrastive(Method):
         }
 
     def _trained(
-        self, train: "Features", judged: Judge, dropout: float, weight_decay: float, steps: int, bar: Bar
+        self, train: "Features", judged: Validator, dropout: float, weight_decay: float, steps: int, bar: Bar
     ) -> tuple[Projections, Best]:
         """Projections trained with one regularisation, as they were at their best step."""
         with seeded(self.setting.seed) as generator:
@@ -122,7 +122,7 @@ class Contrastive(Method):
 
         return loss
 
-    def _worth(self, module: Projections, judged: Judge) -> Callable[[], float]:
+    def _worth(self, module: Projections, judged: Validator) -> Callable[[], float]:
         touch = self._touch.tensor(judged.features.touch)
         photo = self._photo.tensor(judged.features.photo)
         return lambda: judged.touches((module(touch, module.touch) @ module(photo, module.photo).T).numpy())

@@ -7,7 +7,7 @@ import numpy as np
 
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import Matrix, admissible, cosine, decompose, unit_rows
-from retrieval.methods.selection import judge, neighbours
+from retrieval.methods.selection import Validator, neighbours
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -30,7 +30,7 @@ class Plsca(Method):
         self._touch = _Reduced(train.touch)
         self._photo = _Reduced(train.photo)
         maps = _rotations(self._touch(train.touch), self._photo(train.photo)[neighbours(train.owner, 2)[:, 1]])
-        judged = judge(validation)
+        judged = Validator.of(validation)
         touch, photo = self._touch(judged.features.touch) @ maps[0], self._photo(judged.features.photo) @ maps[1]
         # Components are found one after another, so those of a smaller number are the first of a larger one.
         aucs = {

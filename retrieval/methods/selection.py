@@ -45,10 +45,15 @@ def ranking_auc(
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """The validation grasps to choose by. Both methods of it give what the scores of their touches are worth."""
+class Validator:
+    """The validation grasps to choose by; both methods give the area that the scores of their touches are worth."""
 
     features: Features
+
+    @classmethod
+    def of(cls, validation: Features) -> "Validator":
+        """By enough of the validation grasps."""
+        return cls(validation.select(judged_rows(validation)))
 
     def touches(self, scores: NDArray[np.floating[Any]]) -> float:
         """Worth of scores (n, n) of every touch with every photo."""
@@ -60,11 +65,6 @@ class Judge:
         np.put_along_axis(left_out, sets, True, axis=1)
         owner = self.features.owner
         return ranking_auc(scores, owner[sets[:, 0]], owner, left_out)
-
-
-def judge(validation: Features) -> Judge:
-    """A judge by enough of the validation grasps."""
-    return Judge(validation.select(judged_rows(validation)))
 
 
 def neighbours(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from retrieval.console.progress import Bar
 from retrieval.methods.base import Array, Method
 from retrieval.methods.draws import ObjectDraws, seeded
-from retrieval.methods.selection import judge, neighbours
+from retrieval.methods.selection import Validator, neighbours
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.fusion import FusionHead
 from retrieval.model.losses.match import match_loss
@@ -90,7 +90,7 @@ class SetFusion(Method):
         return loss
 
     def _worth(self, validation: "Features") -> Callable[[], float]:
-        judged = judge(validation)
+        judged = Validator.of(validation)
         groups = neighbours(judged.features.owner, JUDGED_GRASPS)
 
         def worth() -> float:

@@ -1,7 +1,8 @@
 """The training loop: everything that is learned by steps down a gradient is learned in it."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -73,6 +74,15 @@ def fit(
         if stop:
             break
     return done
+
+
+def one_ahead(prepare: Callable[[int], Future[Batch]], steps: range) -> Iterator[Batch]:
+    """The batches of these steps, a step or more; each is prepared while the step before it is computed."""
+    upcoming = prepare(steps[0])
+    for step in steps[1:]:
+        batch, upcoming = upcoming.result(), prepare(step)
+        yield batch
+    yield upcoming.result()
 
 
 @dataclass(frozen=True)

@@ -73,9 +73,9 @@ def with_verdicts(
         return made
     others, _ = recorded_features(matcher, source, learned, what="check of touches", quiet=quiet, stopped=stopped)
     preprocessing = made.config.preprocessing
-    lesson = Pictures.of(matcher, preprocessing, learned, others, FOREIGN, seed)
+    fitting = Pictures.of(matcher, preprocessing, learned, others, FOREIGN, seed)
     test = Pictures.of(matcher, preprocessing, judged, touches, FOREIGN // 2, seed + 1)
-    matcher.gel_head = fit_gel_head(lesson)
+    matcher.gel_head = fit_gel_head(fitting)
     check = fit_gel_check(matcher.gel_head, test, contact_levels(judged))
     return dataclasses.replace(made, gel_check=check)
 
@@ -169,22 +169,22 @@ def _pairs_of_frames(grasps: Iterable[Grasp]) -> Iterator[tuple[tuple[Path, ...]
             yield first.backgrounds, second.backgrounds
 
 
-def fit_gel_head(lesson: Pictures) -> GelHead:
+def fit_gel_head(fitting: Pictures) -> GelHead:
     """Softmax regression on standardised features, kinds alike whatever their numbers, with a penalty on the weights.
 
     Without untouched gels, that kind is never read.
     """
     from scipy.optimize import minimize
 
-    kinds = [part.reshape(-1, part.shape[-1]).double().numpy() for part in (lesson.touch, lesson.untouched)]
-    kinds.append(lesson.foreign.double().numpy())
+    kinds = [part.reshape(-1, part.shape[-1]).double().numpy() for part in (fitting.touch, fitting.untouched)]
+    kinds.append(fitting.foreign.double().numpy())
     x, which = np.concatenate(kinds), np.repeat(np.arange(len(KINDS)), [len(part) for part in kinds])
     centre, spread = x.mean(0), x.std(0)
     spread = np.where(spread > 1e-6, spread, 1.0)
     x = (x - centre) / spread
-    taught = np.array([len(part) > 0 for part in kinds])
-    weights = np.array([1 / len(part) if len(part) else 0.0 for part in kinds])[which] / taught.sum()
-    targets, absent = np.eye(len(KINDS))[which], np.where(taught, 0.0, -1e4)
+    present = np.array([len(part) > 0 for part in kinds])
+    weights = np.array([1 / len(part) if len(part) else 0.0 for part in kinds])[which] / present.sum()
+    targets, absent = np.eye(len(KINDS))[which], np.where(present, 0.0, -1e4)
 
     def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         matrix = flat.reshape(-1, len(KINDS))

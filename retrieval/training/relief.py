@@ -7,8 +7,8 @@ learns which family of relief an object wears, its pitch and its amplitude; its 
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.training.fit import Plan, fit
+from retrieval.training.fit import Plan, fit, one_ahead
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
 WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
@@ -147,7 +147,7 @@ class ReliefTraining:
             fit(
                 self.optimizer,
                 plan,
-                self._batches(ahead),
+                one_ahead(lambda step: ahead.submit(self._batch, step), range(self.step, self.iterations)),
                 self._loss,
                 bar=bar,
                 done=self.step,
@@ -162,16 +162,6 @@ class ReliefTraining:
 
     def _stepped(self, done: int) -> None:
         self.step = done
-
-    def _batches(self, ahead: ThreadPoolExecutor) -> Iterator[tuple[list[LabelledPicture], Tensor]]:
-        def prepare(step: int) -> Future[tuple[list[LabelledPicture], Tensor]]:
-            return ahead.submit(self._batch, step)
-
-        upcoming = prepare(self.step)
-        for step in range(self.step + 1, self.iterations):
-            batch, upcoming = upcoming.result(), prepare(step)
-            yield batch
-        yield upcoming.result()
 
     def _batch(self, step: int) -> tuple[list[LabelledPicture], Tensor]:
         rng = np.random.default_rng([self.config.training.seed, 2, step])

@@ -7,7 +7,6 @@ machine ends bit for bit where an unbroken run ends.
 import dataclasses
 import math
 import threading
-from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -49,7 +48,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
-from retrieval.training.fit import Plan, fit
+from retrieval.training.fit import Plan, fit, one_ahead
 from retrieval.training.judgement import with_verdicts
 from retrieval.training.step import batch_loss, pair_logits, shuffle_fingers
 
@@ -157,7 +156,7 @@ class Trainer:
             fit(
                 self.optimizer,
                 plan,
-                self._batches(),
+                one_ahead(self._prepare, range(self.step, plan.steps)),
                 self.loss,
                 bar=bar,
                 done=self.step,
@@ -173,14 +172,6 @@ class Trainer:
             raise Interrupted(
                 f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
             )
-
-    def _batches(self) -> Iterator[Loaded]:
-        """Those of the steps to come; each is prepared while the step before it is computed."""
-        upcoming = self._prepare(self.step)
-        for step in range(self.step + 1, self.config.training.iterations):
-            loaded, upcoming = upcoming.result(), self._prepare(step)
-            yield loaded
-        yield upcoming.result()
 
     def _prepare(self, step: int) -> "Future[Loaded]":
         batch = self.sampler.batch(step, self.config.training.touches_per_batch)

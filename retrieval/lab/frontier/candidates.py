@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from indexes import load_kind
 from indexes.kinds.base import VectorIndex
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.points import Panel, Point, Row, missed
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed
 from retrieval.lab.frontier.sample import Array, Sample
 from retrieval.search.measuring import FEWER, FIRST, candidate_steps
 from retrieval.search.operating import TARGET
@@ -33,7 +33,7 @@ def candidates(sample: Sample) -> Row:
 
 
 def _winners(sample: Sample) -> Panel:
-    photos, points, works = sample.catalogue, list[Point](), list[Callable[[], object]]()
+    photos, points, works = sample.catalogue, list[Tradeoff](), list[Callable[[], object]]()
     count, default = len(photos.halves), default_k(sample)
     for name, embeddings in photos.embeddings.items():
         found = ranks(sample.queries[name], embeddings, sample.winners)
@@ -47,7 +47,7 @@ def _winners(sample: Sample) -> Panel:
     return _panel(f"missed winners, {count:,} blended photos", points, len(sample.winners))
 
 
-def _panel(title: str, points: Sequence[Point], queries: int) -> Panel:
+def _panel(title: str, points: Sequence[Tradeoff], queries: int) -> Panel:
     return Panel(
         title=title,
         time="search and rerank of one query, one thread",
@@ -102,7 +102,7 @@ def _first_guesses(sample: Sample) -> Panel:
     """On real photos only: a blend is of no object."""
     rows = sample.touch_rows[: sample.scale.queries]
     asked, halves, count = sample.touch_codes(rows), sample.own["half"], len(sample.photo_rows)
-    points, works = list[Point](), list[Callable[[], object]]()
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
     table = np.array([sample.logits(half, halves) for half in asked["half"]])
     whole = _wrong(sample, table, rows)
     for name in (name for name in asked if name != "half"):

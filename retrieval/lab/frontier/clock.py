@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 
-from retrieval.lab.frontier.points import Point
+from retrieval.lab.frontier.points import Tradeoff
 from retrieval.model.encode import one_thread
 
 LEAST_S = 0.005
 
 
-def timed(points: Sequence[Point], works: Sequence[Callable[[], object]], repeats: int) -> tuple[Point, ...]:
+def timed(points: Sequence[Tradeoff], works: Sequence[Callable[[], object]], repeats: int) -> tuple[Tradeoff, ...]:
     """The points, each with the median seconds of its work: all take turns, so that a busy moment slows all of them.
 
     Every work is run once before, which is not counted; short work is timed several runs together. All on one thread.

@@ -9,7 +9,7 @@ import numpy as np
 from retrieval.lab.contact.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
 from retrieval.lab.contact.closing_jaws import Jaws, LinearLaw, Motion, close
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.points import Panel, Point, Row, smallest
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, smallest
 from retrieval.lab.frontier.sample import Sample
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Contact, Layer, press
@@ -57,7 +57,7 @@ def contact_panels(
 
 def _half_space(repeats: int, rows: Sequence[int], tolerances: Sequence[float], force_n: float = 0.5) -> Panel:
     depth = hertz(force_n, BALL_MM, HALF_SPACE.plane_modulus_mpa)[1]
-    points, works = list[Point](), list[Callable[[], Contact]]()
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
     for grid in map(Grid.of_field, rows):
         for tolerance in tolerances:
             works.append(partial(pressed_ball, grid, HALF_SPACE, force_n, tolerance))
@@ -67,7 +67,7 @@ def _half_space(repeats: int, rows: Sequence[int], tolerances: Sequence[float], 
 
 def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
     fine = pressed_ball(Grid.of_field(reference_rows), LAYER, 1.0, 1e-6)
-    points, works = list[Point](), list[Callable[[], Contact]]()
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
     for grid in map(Grid.of_field, rows):
         exact = _at_centres(fine.displacement_mm, reference_rows // grid.rows)
         for padded in (False, True):
@@ -82,7 +82,7 @@ def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], refer
 def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
     """What the camera sees of ridges: the error that matters to who looks at gel images."""
     exact = _picture(_pressed_ridges(_of_gel(reference_rows), 1e-6))
-    points, works = list[Point](), list[Callable[[], Contact]]()
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
     for grid in map(_of_gel, rows):
         for tolerance in tolerances:
             works.append(partial(_pressed_ridges, grid, tolerance))
@@ -92,11 +92,11 @@ def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], r
     return _panel("gel image of ridges", "grey levels rms", reference, CAMERA_NOISE, points, works, repeats)
 
 
-def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Point:
+def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Tradeoff:
     """One setting of the solver; the default is what the gripper's contacts are solved with."""
     hand, series = Hand(), f"{grid}" if padded else f"{grid} periodic"
     is_default = padded and ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
-    return Point(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
+    return Tradeoff(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
 
 
 def _panel(
@@ -104,7 +104,7 @@ def _panel(
     unit: str,
     reference: str,
     tolerance: float,
-    points: Sequence[Point],
+    points: Sequence[Tradeoff],
     works: Sequence[Callable[[], object]],
     repeats: int,
 ) -> Panel:
@@ -156,12 +156,12 @@ def closing_panel(repeats: int, steps_s: Sequence[float] = (2e-3, 1e-3, 5e-4, 2e
     """Force over 50 ms against the oscillator's closed form, 1e5 N/m and 20 N."""
     stiffness, force = 100.0, 20.0
     motion = Motion(Jaws(force), (LinearLaw(stiffness), LinearLaw(stiffness)))
-    points, works = list[Point](), [partial(close, motion, 0.05, step) for step in steps_s]
+    points, works = list[Tradeoff](), [partial(close, motion, 0.05, step) for step in steps_s]
     for step, work in zip(steps_s, works, strict=True):
         times, states = work()
         travel = spring_closing(motion.jaws, stiffness, times)
         error = 100.0 * stiffness / force * float(np.abs(states[:, 0] - travel).max())
-        points.append(Point("", f"{step:g} s", error))
+        points.append(Tradeoff("", f"{step:g} s", error))
     made = timed(points, works, repeats)
     reference = "closed form of a spring"
     return Panel("closing step", "50 ms of motion", "% of force", reference, 1.0, made, smallest(made))

@@ -1,4 +1,4 @@
-"""Canonical correlations: how they are reckoned, and how many components a score keeps."""
+"""Canonical correlations: how they are computed, and how many components a score keeps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.pixels import SLACK
-from retrieval.lab.frontier.points import Panel, Point, Row, missed, smallest
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed, smallest
 from retrieval.lab.frontier.sample import Sample
 from retrieval.methods.base import Setting
 from retrieval.methods.cca import Cca, admissible, canonical, cosine, decompose, unit_rows
@@ -52,7 +52,7 @@ def cca_solver(sample: Sample) -> Row:
     size = (200, 12) if sample.scale.quick else (2000, 64)
     problem = known_problem(*size, spread=1e6)
     solvers: dict[str, Solver] = {
-        OURS: _ours,
+        OURS: _by_svd,
         "eigenvalues of X'X, float64": partial(_by_covariance, np.float64),
         "eigenvalues of X'X, float32": partial(_by_covariance, np.float32),
         "scikit-learn's NIPALS, first 8": _by_sklearn,
@@ -79,12 +79,12 @@ def cca_solver(sample: Sample) -> Row:
     )
 
 
-def _point(problem: Problem, name: str, solve: Solver) -> Point:
+def _point(problem: Problem, name: str, solve: Solver) -> Tradeoff:
     found = solve(problem)
-    return Point(name, "", float(np.abs(found - problem.rho[: len(found)]).max()), is_default=name == OURS)
+    return Tradeoff(name, "", float(np.abs(found - problem.rho[: len(found)]).max()), is_default=name == OURS)
 
 
-def _ours(problem: Problem) -> Matrix:
+def _by_svd(problem: Problem) -> Matrix:
     views = decompose(problem.x), decompose(problem.y)
     return _padded(canonical(*views, np.arange(len(problem.x))).correlations, len(problem.rho))
 
@@ -135,7 +135,7 @@ def cca_components(sample: Sample) -> Row:
     weights = found.correlations ** method.chosen["power"]
     touch = views[0].standardise(test.touch) @ found.touch_weights * weights
     photo = views[1].standardise(test.photo) @ found.photo_weights * weights
-    points, works = list[Point](), list[Callable[[], object]]()
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
     many = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
     for count in sorted({*admissible(SIZES, len(weights)), method.chosen["components"]}):
         codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])

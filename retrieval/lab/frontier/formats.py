@@ -16,7 +16,7 @@ from torch import Tensor
 
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.pixels import load_touch
-from retrieval.lab.frontier.points import Panel, Point, Row, missed, smallest
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed, smallest
 from retrieval.lab.frontier.sample import Array, Sample
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import for_inference, has_fast_bfloat16, touch_batch
@@ -42,10 +42,10 @@ def towers(sample: Sample) -> Row:
     photos = sample.own["half"]
     whole = copy.deepcopy(sample.checkpoint.matcher).double()
     exact = _logits(sample, np.concatenate([_halves(whole, part) for part in _parts(images)]), photos)
-    errors, flips, works = list[Point](), list[Point](), list[Callable[[], object]]()
+    errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
         logits = _logits(sample, np.concatenate([encode(part) for part in _parts(images)]), photos)
-        errors.append(Point(name, "", float(np.abs(logits - exact).max()), is_default=is_default))
+        errors.append(Tradeoff(name, "", float(np.abs(logits - exact).max()), is_default=is_default))
         flips.append(missed(name, "", logits.argmax(1) != exact.argmax(1), is_default))
         works.append(partial(encode, images[:1]))
     return Row(
@@ -60,8 +60,8 @@ def towers(sample: Sample) -> Row:
 
 def _panels(
     sample: Sample,
-    errors: list[Point],
-    flips: list[Point],
+    errors: list[Tradeoff],
+    flips: list[Tradeoff],
     works: list[Callable[[], object]],
     queries: int,
     words: tuple[str, str],
@@ -135,11 +135,11 @@ def halves(sample: Sample) -> Row:
     whole = sample.own["half"]
     exact = _logits(sample, asked, whole)
     many = np.tile(whole, (1 + 1000 // len(whole), 1))[:1000]
-    errors, flips, works = list[Point](), list[Point](), list[Callable[[], object]]()
+    errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
     for name, store, read, is_default in FORMATS:
         logits = _logits(sample, asked, read(store(whole)))
         setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
-        errors.append(Point(name, setting, float(np.abs(logits - exact).max()), is_default=is_default))
+        errors.append(Tradeoff(name, setting, float(np.abs(logits - exact).max()), is_default=is_default))
         flips.append(missed(name, setting, logits.argmax(1) != exact.argmax(1), is_default))
         works.append(partial(_judge, sample, asked[0], store(many), read))
     return Row(

@@ -11,14 +11,14 @@ from indexes.kinds.base import VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.lab.frontier.candidates import default_k, is_used
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.points import Panel, Point, Row, missed, smallest
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed, smallest
 from retrieval.lab.frontier.sample import Array, Sample
 
 NEIGHBOURS = 10
 TOLERANCE = 1.0
 DEFAULT = "flat"
 """What `build-index` takes unless it is given a budget that exact search breaks."""
-Measured = tuple[Point, Callable[[], object]]
+Measured = tuple[Tradeoff, Callable[[], object]]
 
 
 def index_kinds(sample: Sample) -> Row:
@@ -38,7 +38,9 @@ def index_kinds(sample: Sample) -> Row:
                 lost = ~(index.search(queries, k)[1] == sample.winners[:, None]).any(1)
                 far.append((missed(series, setting, lost, is_default), _asking(index, queries, k)))
             lacking = 100 * float(np.mean(index.search(queries, NEIGHBOURS)[0] < truth[:, -1:]))
-            near.append((Point(series, setting, lacking, is_default=is_default), _asking(index, queries, NEIGHBOURS)))
+            near.append(
+                (Tradeoff(series, setting, lacking, is_default=is_default), _asking(index, queries, NEIGHBOURS))
+            )
             bar.advance()
     of_winners, of_neighbours = (_timed(sample, each) for each in (far, near))
     return Row(
@@ -56,12 +58,12 @@ def index_kinds(sample: Sample) -> Row:
     )
 
 
-def _timed(sample: Sample, measured: list[Measured]) -> tuple[Point, ...]:
+def _timed(sample: Sample, measured: list[Measured]) -> tuple[Tradeoff, ...]:
     points, works = zip(*measured, strict=True)
     return timed(points, works, sample.scale.repeats)
 
 
-def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[Point, ...]) -> Panel:
+def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[Tradeoff, ...]) -> Panel:
     unit = "% of neighbours" if reference == "exact search" else "% of queries"
     time = f"search of one query for k = {k:,}, one thread"
     return Panel(title, time, unit, reference, TOLERANCE, points, resolution)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.points import Panel, Point, Row, smallest
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, smallest
 from retrieval.lab.frontier.sample import Sample
 from retrieval.lab.optics.photometric import DEGREES, by_degree
 from robot.sim.gel.fitted_optics import FittedOptics, feature_count, fitted_document, load_fitted
@@ -31,7 +31,7 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
     x, y = Field().unit_positions()
     surface = Surface(np.maximum(0, 0.5 - x * x - y * y), Field())
     points = [
-        Point(
+        Tradeoff(
             series=name,
             setting=f"degree {degree}",
             error=math.sqrt(figures[by_degree(degree)]["mse"]["mean"]),

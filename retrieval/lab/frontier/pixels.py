@@ -11,7 +11,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.points import Panel, Point, Row, missed
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed
 from retrieval.lab.frontier.sample import Array, Sample
 from retrieval.model.encode import encode_photos, encode_touches
 
@@ -45,7 +45,7 @@ def _panel(
     encode_one: Callable[[int], object],
 ) -> Panel:
     sizes = sorted({16 * round(share * trained / 16) for share in _shares(sample)} | {trained})
-    points, works = list[Point](), list[Callable[[], object]]()
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
     with Bar(f"sizes of {what}", len(sizes), "sizes", quiet=sample.quiet) as bar:
         for px in sizes:
             touches, photos = halves(px)

@@ -12,7 +12,7 @@ from retrieval.metrics.binomial import binomial_interval
 
 
 @dataclass(frozen=True)
-class Point:
+class Tradeoff:
     """One setting: what it costs in seconds and how far it is from the reference, in the panel's unit.
 
     series: points that differ in one number only, joined by colour. low, high: 95 % interval of the error where it is
@@ -47,11 +47,11 @@ class Panel:
     unit: str
     reference: str
     tolerance: float
-    points: tuple[Point, ...]
+    points: tuple[Tradeoff, ...]
     resolution: float
 
     @property
-    def recommended(self) -> Point:
+    def recommended(self) -> Tradeoff:
         """The cheapest point within the tolerance; where there is none, the one of the least error."""
         within = [point for point in self.points if point.error <= self.tolerance]
         if within:
@@ -59,13 +59,13 @@ class Panel:
         return min(self.points, key=lambda point: (point.error, point.seconds))
 
     @property
-    def default(self) -> Point | None:
+    def default(self) -> Tradeoff | None:
         """The point in use, None where the caller always says."""
         return next((point for point in self.points if point.is_default), None)
 
-    def pareto(self) -> list[Point]:
+    def pareto(self) -> list[Tradeoff]:
         """Points that no other one beats in both time and error, fastest first."""
-        front: list[Point] = []
+        front: list[Tradeoff] = []
         for point in sorted(self.points, key=lambda point: (point.seconds, point.error)):
             if not front or point.error < front[-1].error:
                 front.append(point)
@@ -85,7 +85,7 @@ class Panel:
             said.append(f"default {self.said(used)}")
         return "; ".join(said)
 
-    def said(self, point: Point) -> str:
+    def said(self, point: Tradeoff) -> str:
         """One point in words."""
         return f"{point.name}: {number(point.error)} {self.unit}, {duration(point.seconds)}"
 
@@ -103,7 +103,7 @@ class Panel:
         """Inverse of `to_dict`."""
         derived = {"recommended", "pareto"}
         points = tuple(
-            Point(**{key: value for key, value in point.items() if key not in derived}) for point in data["points"]
+            Tradeoff(**{key: value for key, value in point.items() if key not in derived}) for point in data["points"]
         )
         return cls(**{**data, "points": points})
 
@@ -131,15 +131,15 @@ class Row:
         return cls(**{**data, "panels": tuple(Panel.from_dict(panel) for panel in data["panels"])})
 
 
-def missed(series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False) -> Point:
+def missed(series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False) -> Tradeoff:
     """A point whose error is the share of queries that went wrong, in percent, with its exact 95 % interval for
     queries that are independent."""
     count, bad = len(wrong), int(np.count_nonzero(wrong))
     low, high = binomial_interval(bad, count)
-    return Point(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
+    return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
 
 
-def smallest(points: Iterable[Point]) -> float:
+def smallest(points: Iterable[Tradeoff]) -> float:
     """The smallest error above 0, for a panel whose errors are no shares; 1 where all are 0."""
     return min((point.error for point in points if point.error > 0), default=1.0)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from retrieval.console.files import PAGE, text_bytes, write_output
-from retrieval.lab.frontier.points import Panel, Point, Row, duration, number
+from retrieval.lab.frontier.points import Panel, Row, Tradeoff, duration, number
 from retrieval.report.canvas import FAINT, Axes, Figure, canvas, draw
 from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
 from retrieval.report.plots import logarithmic
@@ -96,7 +96,7 @@ def _points(panel: Panel) -> Table:
     return Table(header, rows, (f"Against: {panel.reference}.",), frozenset({4}))
 
 
-def _marks(panel: Panel, point: Point, front: Sequence[Point]) -> tuple[tuple[str, bool], ...]:
+def _marks(panel: Panel, point: Tradeoff, front: Sequence[Tradeoff]) -> tuple[tuple[str, bool], ...]:
     return (
         ("recommended", point == panel.recommended),
         ("default", point.is_default),
@@ -139,7 +139,7 @@ def _floor(panel: Panel) -> float:
     return _FLOOR * min([panel.resolution, *(point.error for point in panel.points if point.error > 0)])
 
 
-def _series(axes: Axes, points: Sequence[Point], place: int, floor: float, name: str) -> None:
+def _series(axes: Axes, points: Sequence[Tradeoff], place: int, floor: float, name: str) -> None:
     colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
     seen = [point for point in points if point.error > 0]
     axes.plot([], [], marker, color=colour, label=name or None, ls="")
@@ -172,5 +172,5 @@ def _every(front: Sequence[Any]) -> int:
     return 1 if len(front) < 8 else 2
 
 
-def _place(point: Point, floor: float) -> tuple[float, float]:
+def _place(point: Tradeoff, floor: float) -> tuple[float, float]:
     return 1e3 * point.seconds, max(point.error, floor)

@@ -119,7 +119,7 @@ def _naive(gap: Floats, layer: Layer, force_n: float) -> tuple[str, bool]:
     return f"{'finite' if finite else 'NaN'} after {iterations} iterations", finite and iterations < _NAIVE_CAP
 
 
-def _ours(contact: Contact) -> str:
+def _outcome(contact: Contact) -> str:
     end = "converged" if contact.converged else "not converged"
     return f"{end} after {contact.iterations} iterations, flags {', '.join(contact.flags) or 'none'}"
 
@@ -142,7 +142,7 @@ def _one_pixel() -> HardCase:
     holds = _solved(contact, force) and "unresolved" in contact.flags
     naive, naive_holds = _naive(gap, layer, force)
     case, wanted = "ball touching one pixel, nu = .5", "solved, said unresolved"
-    return HardCase(_CONTACT, case, wanted, naive, _ours(contact), holds, naive_holds)
+    return HardCase(_CONTACT, case, wanted, naive, _outcome(contact), holds, naive_holds)
 
 
 def _pin_in_a_plate() -> HardCase:
@@ -153,7 +153,7 @@ def _pin_in_a_plate() -> HardCase:
     wanted = "converges: the plate carries its share"
     holds = _solved(contact, force) and contact.area_mm2 > 1.0
     naive, naive_holds = _naive(gap, layer, force)
-    return HardCase(_CONTACT, "pin of one pixel in a plate", wanted, naive, _ours(contact), holds, naive_holds)
+    return HardCase(_CONTACT, "pin of one pixel in a plate", wanted, naive, _outcome(contact), holds, naive_holds)
 
 
 def _wrap_around() -> HardCase:
@@ -175,7 +175,7 @@ def _nothing_there() -> HardCase:
     holds = holds and at_rest.converged and at_rest.force_n == 0.0
     naive, naive_holds = _naive(empty, layer, 1.0)
     wanted = "no pressure, not converged"
-    return HardCase(_CONTACT, "no object, 1 N", wanted, naive, _ours(contact), holds, naive_holds)
+    return HardCase(_CONTACT, "no object, 1 N", wanted, naive, _outcome(contact), holds, naive_holds)
 
 
 def _locked_volume() -> HardCase:
@@ -185,7 +185,7 @@ def _locked_volume() -> HardCase:
     holds = is_finite(contact) and not contact.converged and contact.flags == ("rigid_volume",)
     naive = float(np.divide(0.1, layer_compliance(np.zeros(1), layer.thickness_mm, 0.5)[0]))
     case, said = "plane on a periodic layer, nu = .5, to a depth", f"{naive} E*/mm"
-    return HardCase(_CONTACT, case, "refused", said, _ours(contact), holds, math.isfinite(naive))
+    return HardCase(_CONTACT, case, "refused", said, _outcome(contact), holds, math.isfinite(naive))
 
 
 def _every_scale() -> HardCase:

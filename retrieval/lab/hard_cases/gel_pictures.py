@@ -8,7 +8,7 @@ import numpy as np
 
 from retrieval.lab.hard_cases.case import HardCase, refused
 from retrieval.lab.optics.image_error import compare
-from retrieval.lab.optics.least_squares import Gram, Setting, aligned, change, features, labelled_poses, solve
+from retrieval.lab.optics.least_squares import Gram, OpticsSetting, aligned, change, features, labelled_poses, solve
 from retrieval.lab.optics.real_presses import BallTable, Presses
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Layer
@@ -85,7 +85,7 @@ def _equator() -> HardCase:
     )
 
 
-def naive_step(presses: Presses, pose: Floats, weights: Floats, setting: Setting) -> Floats:
+def naive_step(presses: Presses, pose: Floats, weights: Floats, setting: OpticsSetting) -> Floats:
     """A Gauss-Newton step (3,) of the pose on a picture, without damping. Raises LinAlgError where it shows nothing."""
     seen = [features(presses, 0, pose + move, setting) @ weights for move in (*np.eye(3) * 0.02, np.zeros(3))]
     jacobian = np.stack([(one - seen[3]).ravel() / 0.02 for one in seen[:3]], axis=-1)
@@ -97,7 +97,7 @@ def _press_that_shows_nothing() -> HardCase:
     """Colours that do not depend on the pose: Gauss-Newton's equations say 0 = 0."""
     gel = np.full((200, 200, 3), 100, np.uint8)
     presses = Presses("gelsight", gel, gel[None].copy(), np.array([[100.0, 100.0]]), np.array([40.0]))
-    setting = Setting(degree=1, places=1, reaches_mm=())
+    setting = OpticsSetting(degree=1, places=1, reaches_mm=())
     start = labelled_poses(presses, setting)[0]
     weights = np.zeros((features(presses, 0, start, setting).shape[1], 3))
     try:

@@ -61,7 +61,7 @@ def _tried(work: Callable[[], Matrix]) -> Matrix:
         return np.full(1, np.nan)
 
 
-def _said(values: Matrix) -> str:
+def _text(values: Matrix) -> str:
     """The first three numbers."""
     return ", ".join(f"{value:.6g}" for value in values[:3])
 
@@ -80,7 +80,7 @@ def _fewer_items_than_features() -> HardCase:
     holds = _in_bounds(found.correlations) and bool(np.isfinite(found.touch_weights).all())
     wanted = "correlations within 0..1, finite weights"
     return HardCase(
-        _CCA, "30 items, 50 features", wanted, _said(naive), _said(found.correlations), holds, _in_bounds(naive)
+        _CCA, "30 items, 50 features", wanted, _text(naive), _text(found.correlations), holds, _in_bounds(naive)
     )
 
 
@@ -93,7 +93,7 @@ def _duplicates_and_constants() -> HardCase:
     naive, ours = _tried(lambda: naive_correlations(wide, photo)), _correlations(wide, photo).correlations
     right = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
     case = "columns that are equal, nearly equal, constant"
-    return HardCase(_CCA, case, f"{_said(must)}, as without", _said(naive), _said(ours), right[1], right[0])
+    return HardCase(_CCA, case, f"{_text(must)}, as without", _text(naive), _text(ours), right[1], right[0])
 
 
 def _every_scale() -> HardCase:
@@ -104,8 +104,8 @@ def _every_scale() -> HardCase:
     naive = _tried(lambda: _by_eigenvectors(scaled, photo))
     ours = _correlations(scaled, photo).correlations
     right = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
-    wanted = f"{_said(must)}, as unscaled"
-    return HardCase(_CCA, "features in units of 1e-6 to 1e6", wanted, _said(naive), _said(ours), right[1], right[0])
+    wanted = f"{_text(must)}, as unscaled"
+    return HardCase(_CCA, "features in units of 1e-6 to 1e6", wanted, _text(naive), _text(ours), right[1], right[0])
 
 
 def _by_eigenvectors(touch: Matrix, photo: Matrix) -> Matrix:
@@ -129,7 +129,7 @@ def _more_components_than_rank() -> HardCase:
     found = _correlations(touch, photo).correlations
     holds = len(found) == 3 and _in_bounds(found)
     wanted = "3 correlations within 0..1"
-    words, ours = f"{len(naive)}: {_said(naive)}", f"{len(found)}: {_said(found)}"
+    words, ours = f"{len(naive)}: {_text(naive)}", f"{len(found)}: {_text(found)}"
     naive_holds = len(naive) == 3 and _in_bounds(naive)
     return HardCase(_CCA, "10 components of rank 3", wanted, words, ours, holds, naive_holds)
 
@@ -139,7 +139,7 @@ def _nan_feature() -> HardCase:
     touch[3, 1] = np.nan
     naive = _tried(lambda: naive_correlations(touch, photo))
     ours, holds = refused(lambda: decompose(touch), "NaN")
-    return HardCase(_CCA, "one feature is NaN", "refused", _said(naive), ours, holds, bool(np.isfinite(naive).all()))
+    return HardCase(_CCA, "one feature is NaN", "refused", _text(naive), ours, holds, bool(np.isfinite(naive).all()))
 
 
 def naive_pls(touch: Matrix, photo: Matrix, components: int) -> Matrix:
@@ -173,7 +173,7 @@ def _partial_least_squares() -> HardCase:
     codes, kept = method.encode_touch(touch[:, None]), int(method.chosen["most_components"])
     finite = bool(np.isfinite(codes).all())
     wanted = "1 component, codes that are finite"
-    words = f"4 components: {_said(naive[0])}"
+    words = f"4 components: {_text(naive[0])}"
     said = f"{kept} component, codes {'finite' if finite else 'NaN'}"
     return HardCase(
         "PLS", "4 components of rank 1", wanted, words, said, finite and kept == 1, bool(np.isfinite(naive).all())

@@ -44,7 +44,7 @@ def _with_slope(loss: Callable[[Tensor], Tensor], at: Tensor) -> tuple[float, li
     return value.item(), slope.flatten().tolist()
 
 
-def _said(value: float, slope: list[float]) -> str:
+def _text(value: float, slope: list[float]) -> str:
     return f"{value:.6g}, gradient {', '.join(f'{part:.3g}' for part in slope)}"
 
 
@@ -59,7 +59,7 @@ def _case(
     """A loss and its gradient, which are known."""
     found = [_with_slope(loss, at) for loss in (naive, ours)]
     right = [_near(value, must[0]) and all(map(_near, slope, must[1])) for value, slope in found]
-    return HardCase(kernel, case, _said(*must), _said(*found[0]), _said(*found[1]), right[1], right[0])
+    return HardCase(kernel, case, _text(*must), _text(*found[0]), _text(*found[1]), right[1], right[0])
 
 
 def _near(value: float, must: float) -> bool:
@@ -227,7 +227,7 @@ def _zero_embedding() -> HardCase:
     finite = [all(map(_finite, (value, *slope))) for value, slope in (naive, ours)]
     wanted = "0, and a gradient that is finite"
     holds = finite[1] and ours[0] == 0
-    return HardCase("cosine", "an embedding of zeros", wanted, _said(*naive), _said(*ours), holds, finite[0])
+    return HardCase("cosine", "an embedding of zeros", wanted, _text(*naive), _text(*ours), holds, finite[0])
 
 
 def _finite(value: float) -> bool:

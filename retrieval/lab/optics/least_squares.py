@@ -27,7 +27,7 @@ _FIRST_SHARE = 0.9  # of the ball's radius, at most
 
 
 @dataclass(frozen=True)
-class Setting:
+class OpticsSetting:
     """What a model is made of; the layer's numbers shape the surface, the others its colours."""
 
     degree: int = 3
@@ -46,13 +46,13 @@ class Setting:
         return ball_table(self.ball_mm, self.thickness_mm, self.poisson, self.reaches_mm)
 
 
-def labelled_poses(presses: Presses, setting: Setting) -> Matrix:
+def labelled_poses(presses: Presses, setting: OpticsSetting) -> Matrix:
     """(count, 3): the labels, the radius scaled; no contact reaches the equator."""
     radii = np.minimum(presses.radii * PIXEL_MM * setting.contact_share, _DEEPEST * setting.ball_mm)
     return np.column_stack([presses.centres, radii])
 
 
-def first_pose(presses: Presses, index: int, setting: Setting) -> Matrix:
+def first_pose(presses: Presses, index: int, setting: OpticsSetting) -> Matrix:
     """(3,): where aligning starts, with no use of the label but for the crop."""
     contact = min(_FIRST_CONTACT_MM[presses.name], _FIRST_SHARE * setting.ball_mm)
     return np.array([*seen_centre(presses, index), contact])
@@ -66,7 +66,7 @@ def change(presses: Presses, index: int, stride: int = STRIDE) -> Matrix:
     return np.reshape(pressed - presses.untouched[rows, cols][::stride, ::stride], (-1, 3))
 
 
-def features(presses: Presses, index: int, pose: Matrix, setting: Setting, stride: int = STRIDE) -> Matrix:
+def features(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting, stride: int = STRIDE) -> Matrix:
     """(pixels, features x places) of a press in this pose; the order is that of FittedOptics."""
     rows, cols = presses.crop(index)
     y = np.arange(rows.start, rows.stop, stride, dtype=np.float64)[:, None]
@@ -104,7 +104,7 @@ class Gram:
         return Gram(self.square[np.ix_(columns, columns)], self.cross[columns], self.total, self.values)
 
 
-def gram(presses: Presses, index: int, pose: Matrix, setting: Setting) -> Gram:
+def gram(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting) -> Gram:
     """The Gram matrices of one press."""
     one, wanted = features(presses, index, pose, setting), change(presses, index)
     return Gram(one.T @ one, one.T @ wanted, float(np.sum(wanted**2)), wanted.size)
@@ -119,7 +119,7 @@ def solve(grams: Sequence[Gram], ridge: float) -> Matrix:
     return np.asarray(np.linalg.solve(normal, cross / scale[:, None] / pixels) / scale[:, None])
 
 
-def columns_of(wide: Setting, narrow: Setting) -> NDArray[np.intp]:
+def columns_of(wide: OpticsSetting, narrow: OpticsSetting) -> NDArray[np.intp]:
     """Which columns of a wide model make up a narrower one (lower degree, fewer places, no reaches or the same)."""
     lit, lit_wide = feature_count(narrow.degree, 0), feature_count(wide.degree, 0)
     chosen = [*range(lit), *range(lit_wide, lit_wide + 3 * len(narrow.reaches_mm))]
@@ -129,7 +129,7 @@ def columns_of(wide: Setting, narrow: Setting) -> NDArray[np.intp]:
 # Poses -----------------------------------------------------------------------------------------------------
 
 
-def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: Setting, steps: int) -> Matrix:
+def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: OpticsSetting, steps: int) -> Matrix:
     """The pose after some Gauss-Newton steps on the picture, the colours (`weights`) held fixed."""
     limit = _DEEPEST * setting.ball_mm
     for _ in range(steps):
@@ -145,12 +145,12 @@ def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting
     return pose
 
 
-def _error(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: Setting) -> Matrix:
+def _error(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: OpticsSetting) -> Matrix:
     seen = features(presses, index, pose, setting, _ALIGN_STRIDE) @ weights
     return np.ravel(seen - change(presses, index, _ALIGN_STRIDE))
 
 
-def align_all(presses: Presses, chosen: Sequence[int], setting: Setting, rounds: int = 8) -> Matrix:
+def align_all(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, rounds: int = 8) -> Matrix:
     """Poses (count, 3) of the chosen presses, by turns with their colours; the others stay where aligning starts."""
     poses = np.array([first_pose(presses, index, setting) for index in range(len(presses))])
     for _ in range(rounds):

@@ -16,7 +16,7 @@ from retrieval.lab.optics.image_error import PictureError, compare
 from retrieval.lab.optics.least_squares import (
     Gram,
     Matrix,
-    Setting,
+    OpticsSetting,
     align_all,
     aligned,
     columns_of,
@@ -34,17 +34,17 @@ from robot.sim.gel.fitted_optics import FittedLimits, FittedOptics, place_powers
 SHALLOW = ("gelsight_mini",)
 # The Mini was pressed on three places, ever deeper: a random split holds out a depth, not a place.
 SAME_PLACE = {"gelsight_mini": (range(13), range(13, 18), range(18, 24))}
-ALIGNING = Setting(degree=3, places=3, reaches_mm=())  # small, so that poses are not explained away by colours
+ALIGNING = OpticsSetting(degree=3, places=3, reaches_mm=())  # small, so that poses are not explained away by colours
 _ALIGN_STEPS = 10
 _FLAT_DEGREE = 6
-_WIDE = Setting(degree=4, places=6)
+_WIDE = OpticsSetting(degree=4, places=6)
 _BLURS_PX = (0.0, 1.0, 2.0, 4.0, 8.0)
 _THICKNESSES_MM = (2.0, 4.0, 6.0)
 _SHARES = (1.0, 0.5)
 _RIDGES = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
-def candidates(wide: Setting, *, careful: bool = False) -> Iterator[Setting]:
+def candidates(wide: OpticsSetting, *, careful: bool = False) -> Iterator[OpticsSetting]:
     """What to choose from, for one shape of the surface; `careful`: no degree 4, no places, no neighbourhood."""
     reaches = ((),) if careful else ((), wide.reaches_mm)
     degrees, places_known = ((2, 3), (1,)) if careful else ((2, 3, 4), (1, 3, 6))
@@ -56,14 +56,14 @@ def candidates(wide: Setting, *, careful: bool = False) -> Iterator[Setting]:
 class Fit:
     """A setting, its weights, the poses (count, 3) of the fitted presses, and how the unpressed picture is blurred."""
 
-    setting: Setting
+    setting: OpticsSetting
     weights: Matrix
     poses: Matrix
     align: bool
     blur_px: float = 0.0
 
 
-def fit(presses: Presses, chosen: Sequence[int], setting: Setting, *, align: bool) -> Fit:
+def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, align: bool) -> Fit:
     """Weights of one setting on the chosen presses, and the blur that suits them best."""
     poses = _poses(presses, chosen, setting, align=align)
     weights = solve([gram(presses, one, poses[one], setting) for one in chosen], setting.ridge)
@@ -76,14 +76,14 @@ def fit(presses: Presses, chosen: Sequence[int], setting: Setting, *, align: boo
     return replace(fitted, blur_px=min(losses)[1])
 
 
-def select(presses: Presses, chosen: Sequence[int], *, align: bool, ship: bool = False) -> Setting:
+def select(presses: Presses, chosen: Sequence[int], *, align: bool, ship: bool = False) -> OpticsSetting:
     """The setting with the least squared error over inner folds of the chosen presses.
 
     To `ship`, a fold is a place where presses share places, and the choice is careful where every press was shallow
     (see SHALLOW): the model is to hold elsewhere and for other objects, not on these presses alone.
     """
     folds = _place_folds(presses, chosen) if ship else [list(range(first, len(chosen), 3)) for first in range(3)]
-    losses: list[tuple[float, Setting]] = []
+    losses: list[tuple[float, OpticsSetting]] = []
     shares = (1.0,) if align else _SHARES
     for thickness, ball, share in itertools.product(_THICKNESSES_MM, BALLS_MM[presses.name], shares):
         wide = replace(_WIDE, thickness_mm=thickness, ball_mm=ball, contact_share=share)
@@ -101,7 +101,7 @@ def _place_folds(presses: Presses, chosen: Sequence[int]) -> list[list[int]]:
     return [fold for fold in folds if fold]
 
 
-def _poses(presses: Presses, chosen: Sequence[int], setting: Setting, *, align: bool) -> Matrix:
+def _poses(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, align: bool) -> Matrix:
     if not align:
         return labelled_poses(presses, setting)
     return align_all(presses, chosen, replace(ALIGNING, thickness_mm=setting.thickness_mm, ball_mm=setting.ball_mm))

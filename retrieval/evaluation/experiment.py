@@ -26,11 +26,11 @@ SEEDLESS = frozenset({"cca", "plsca", "constant"})
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class Experiment:
     """What methods are fitted on and asked, and the folder where fits and predictions lie.
 
     checkpoint: a whole model, which late fusion and what shares its weights then are; None: they are fitted.
-    shuffled: touches are dealt anew among the objects of each part before fitting, so that nothing can be learned.
+    shuffled: touches are permuted among the objects of each part before fitting, so that nothing can be learned.
     """
 
     folder: Path
@@ -84,7 +84,7 @@ class Bench:
         return self.checkpoint is not None and isinstance(build_method(name, Setting(self.config)), LateFusion)
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
-        config = self.config.without_pruner() if self.shuffled else self.config  # no order is there to be taught
+        config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn
         method = build_method(name, Setting(config, seed, self.folder / "fits", self.quiet))
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
