@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
-from robot.readings import RGBD, Box, Frame, GripperState, Pose
+from robot.readings import RGBD, Frame, GripperState, Pose, Region
 from robot.settings import TypedSettings
 
 MAX_AGE_S = 0.5
@@ -190,7 +190,7 @@ class Arm(Actuator):
     by_hand: ClassVar[bool] = False
 
     def __init__(
-        self, name: str, workspace: Box, *, max_speed_mm_s: float = 1000.0, clock: Clock = time.monotonic
+        self, name: str, workspace: Region, *, max_speed_mm_s: float = 1000.0, clock: Clock = time.monotonic
     ) -> None:
         super().__init__(name, max_speed_mm_s=max_speed_mm_s, clock=clock)
         self.workspace = workspace

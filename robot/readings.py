@@ -36,7 +36,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Box:
+class Region:
     """An upright box (mm) in the rig's frame, its faces included."""
 
     lower: tuple[float, float, float]
@@ -46,7 +46,7 @@ class Box:
         """Raises RobotConfigError unless lower < upper, all finite."""
         numbers = [*self.lower, *self.upper]
         if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not np.less(self.lower, self.upper).all():
-            raise RobotConfigError(f"a box must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
+            raise RobotConfigError(f"a region must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
 
     def contains(self, pose: Pose, margin_mm: float = 0.0) -> bool:
         """Whether the point of the pose lies in the box, or at most so far beyond each face."""

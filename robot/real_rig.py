@@ -54,7 +54,7 @@ from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
 from robot.grasping.settings import AttemptSettings, GraspSettings, attempt_of
-from robot.readings import Box
+from robot.readings import Region
 from robot.rig import Rig, ask_on_terminal
 from robot.settings import TypedSettings, build, check_type, limited
 from robot.sight import hand_eye
@@ -145,7 +145,7 @@ class RealRig(Rig):
         ceilings = build(Limits, limits, where="[limits]")
         state_age = {"max_state_age_s": ceilings.state_age_s}
         moving: dict[str, Any] = {
-            "workspace": Box(ceilings.workspace_lower_mm, ceilings.workspace_upper_mm),
+            "workspace": Region(ceilings.workspace_lower_mm, ceilings.workspace_upper_mm),
             "max_speed_mm_s": ceilings.arm_speed_mm_s,
             "ask": ask_on_terminal,
         }

@@ -33,19 +33,19 @@ from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
 from robot.grasping.settings import AttemptSettings, GraspSettings
-from robot.readings import RGBD, Box, Intrinsics, Pose
+from robot.readings import RGBD, Intrinsics, Pose, Region
 from robot.recording.folder import read_recording
 from robot.rig import Rig
 from tests import views
 from tests.fake_video import FakeCamera
 
-WORKSPACE = Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
+WORKSPACE = Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
 LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
 HOLDING = 4
 SPEED_UP = 50.0
 FRAMES = 4
 """Frames on the line for an operation of the gripper: command, pending, state, result. Each may meet a fault."""
-LOW_WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+LOW_WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 """Where the emulated Sawyer reaches."""
 QUICK = AttemptSettings(
     GraspSettings(lift_mm=100.0), settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4

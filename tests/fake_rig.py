@@ -11,11 +11,11 @@ import numpy as np
 
 from robot.devices import Arm, Camera, Gripper, TactileSensor
 from robot.errors import DeviceError
-from robot.readings import Box, Frame, GripperState, Intrinsics, Pose
+from robot.readings import Frame, GripperState, Intrinsics, Pose, Region
 from robot.rig import Rig
 from tests import views
 
-WORKSPACE = Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
+WORKSPACE = Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
 LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
 STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
 

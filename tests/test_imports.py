@@ -130,8 +130,8 @@ def test_a_driver_without_its_package_says_what_to_install(role, table, said):
 import numpy as np
 from robot.errors import DeviceError
 from robot.real_rig import load_driver
-from robot.readings import Box
-given = {{"workspace": Box((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
+from robot.readings import Region
+given = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
 device = load_driver({role!r}, {table!r}, "table", **given)
 try:
     device.connect()

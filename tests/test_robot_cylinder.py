@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from robot.errors import PlanError, RobotConfigError
-from robot.readings import RGBD, Box
+from robot.readings import RGBD, Region
 from robot.sight.cloud import Rays
 from robot.sight.cylinder import CylinderFit, fit_cylinder
 from robot.sight.solids import fit_circle
@@ -236,7 +236,7 @@ def test_an_object_at_the_border_is_noted_or_refused():
 
 
 def test_what_stands_outside_the_region_is_not_looked_at():
-    region = Box((-100.0, -100.0, 0.0), (100.0, 100.0, 500.0))
+    region = Region((-100.0, -100.0, 0.0), (100.0, 100.0, 500.0))
     image = view(Upright(20, 80, X, Y), Upright(45, 200, 250, 0))
     assert off_centre(fit_cylinder(image, views.camera_pose(), region)) < 1.0
     assert fit_cylinder(image, views.camera_pose()).x_mm == pytest.approx(250, abs=2)

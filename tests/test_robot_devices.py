@@ -7,7 +7,7 @@ import pytest
 
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import DeviceError, RobotConfigError
-from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
+from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, World
 
 
@@ -196,11 +196,11 @@ def test_a_gripper_says_only_what_the_contract_knows():
 @pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0), (1, 1))])
 def test_a_box_has_a_volume(corners):
     with pytest.raises(RobotConfigError, match="lower < upper"):
-        Box(*corners)
+        Region(*corners)
 
 
 def test_the_workspace_of_the_fake_arm_is_what_these_tests_think():
-    assert Box((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0)) == WORKSPACE
+    assert Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0)) == WORKSPACE
 
 
 # Frames -----------------------------------------------------------------------------------------------------

@@ -6,9 +6,9 @@ import pytest
 
 from robot.drivers.manual_arm import ManualArm
 from robot.errors import DeviceError, RobotConfigError
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 
-WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 400.0))
+WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 400.0))
 
 
 def connected(ask):

@@ -24,10 +24,10 @@ from robot.drivers.sawyer.straight_line import Schedule, way_points
 from robot.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
 from robot.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
 from robot.errors import DeviceError, RobotConfigError
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 from tests.waiting import running, until
 
-WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 MOUNT = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
 HOME = Pose(0.0, 0.0, 60.0, 0.0)
 FAR = Pose(0.0, 0.0, 260.0, 0.0)
@@ -514,9 +514,9 @@ def test_ctrl_c_leaves_the_arm_standing():
 
 PROGRAM = """
 from robot.drivers.sawyer.driver import Sawyer
-from robot.readings import Box, Pose
+from robot.readings import Region, Pose
 from tests.waiting import until
-box = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+box = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
 with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
     arm.move_to(Pose(0.0, 0.0, 260.0, 0.0), 20.0)

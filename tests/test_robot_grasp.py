@@ -10,7 +10,7 @@ import pytest
 from robot.errors import PlanError, RobotConfigError
 from robot.grasping.plan import plan_grasp
 from robot.grasping.settings import GraspSettings
-from robot.readings import Box
+from robot.readings import Region
 from robot.settings import build
 from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
@@ -86,7 +86,7 @@ def test_a_low_object_is_grasped_at_the_floor(height, expected):
 
 
 def test_the_floor_of_the_workspace_counts_as_well():
-    workspace = Box((-150.0, -150.0, 30.0), (150.0, 150.0, 500.0))
+    workspace = Region((-150.0, -150.0, 30.0), (150.0, 150.0, 500.0))
     assert min(p.pose.z_mm for p in plans(200, workspace=workspace)) >= 30
 
 

@@ -127,7 +127,7 @@ BAD = {
     "a limit too few": ({"limits": "force_n = 3"}, r"\[limits\] must say 'workspace_lower_mm'"),
     "a workspace inside out": (
         {"limits": "workspace_lower_mm = [0, 0, 9]\nworkspace_upper_mm = [1, 1, 1]"},
-        "a box must have lower < upper",
+        "a region must have lower < upper",
     ),
     "a flat workspace": (
         {"limits": "workspace_lower_mm = [0, 0]\nworkspace_upper_mm = [1, 1]"},

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from robot.devices import Arm, Clock
 from robot.errors import DeviceError, RobotConfigError
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 
 NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
 """Poses this near to each other are one to a person's hand: it is not asked again."""
@@ -20,7 +20,7 @@ class ManualArm(Arm):
     def __init__(
         self,
         *,
-        workspace: Box,
+        workspace: Region,
         max_speed_mm_s: float = 1000.0,
         ask: Callable[[str], object] = input,
         clock: Clock = time.monotonic,

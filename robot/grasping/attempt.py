@@ -19,7 +19,7 @@ from robot.devices import MAX_AGE_S, read_together
 from robot.errors import DeviceError, PlanError
 from robot.grasping.plan import GraspPlan, plan_grasp
 from robot.grasping.settings import AttemptSettings
-from robot.readings import RGBD, Box, Pose
+from robot.readings import RGBD, Pose, Region
 from robot.rig import Rig, check_seed
 from robot.sight.cylinder import fit_cylinder
 from robot.storage import file_content
@@ -56,7 +56,7 @@ class Attempter:
         settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
         lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper
-        self._sight = Box(
+        self._sight = Region(
             (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
         )
 

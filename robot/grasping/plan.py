@@ -13,7 +13,7 @@ import numpy as np
 
 from robot.errors import PlanError
 from robot.grasping.settings import GraspSettings
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 from robot.sight.cylinder import CylinderFit
 
 
@@ -28,7 +28,7 @@ class GraspPlan:
 
 
 def plan_grasp(
-    fit: CylinderFit, settings: GraspSettings, workspace: Box, stroke_mm: float, rng: np.random.Generator
+    fit: CylinderFit, settings: GraspSettings, workspace: Region, stroke_mm: float, rng: np.random.Generator
 ) -> GraspPlan:
     """Draw one grasp. Raises PlanError, with the reason, for one that this rig cannot do."""
     dx, dy = rng.uniform(-settings.jitter_mm, settings.jitter_mm, 2)
@@ -53,7 +53,7 @@ def plan_grasp(
     return GraspPlan(pose, _above(pose, fit, settings, workspace), stroke_mm, force)
 
 
-def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Box) -> Pose:
+def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Region) -> Pose:
     """Where the descent begins: inside the workspace, and the fingers clear of the object."""
     above = Pose(pose.x_mm, pose.y_mm, min(pose.z_mm + settings.lift_mm, workspace.upper[2]), pose.yaw_rad)
     if not (workspace.contains(pose) and workspace.contains(above)):

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import PlanError
-from robot.readings import RGBD, Box
+from robot.readings import RGBD, Region
 
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
@@ -139,7 +139,7 @@ def _heights(plane: Array, points: Array) -> Array:
     return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
 
 
-def find_thing(depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None = None) -> Thing:
+def find_thing(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None) -> Thing:
     """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
     above = height_above(depth_mm, rays, table)
     least = max(_LEAST_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
@@ -168,7 +168,7 @@ def height_above(depth_mm: Depth, rays: Rays, table: TablePlane) -> Depth:
     return np.asarray(depth_mm * rays.along(normal) + np.float32(start))
 
 
-def _inside(depth_mm: Depth, rays: Rays, region: Box) -> Mask:
+def _inside(depth_mm: Depth, rays: Rays, region: Region) -> Mask:
     inside = np.ones(depth_mm.shape, bool)
     for axis in (0, 1):
         unit = np.eye(3)[axis]

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import PlanError, RobotConfigError
-from robot.readings import RGBD, Box
+from robot.readings import RGBD, Region
 from robot.sight.cloud import Depth, Rays, TablePlane, Thing, find_table, find_thing
 from robot.sight.silhouette import fit_silhouette
 from robot.sight.solids import (
@@ -98,7 +98,7 @@ class CylinderFit:
         return {name: round(getattr(self, name), 3) for name in sizes} | {"method": self.method}
 
 
-def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = None) -> CylinderFit:
+def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None = None) -> CylinderFit:
     """Fit the cylinder of the largest thing on the table, inside `region` of the rig's frame where given.
 
     extrinsics (4, 4): camera frame to rig frame, mm. Raises PlanError where nothing is seen, or too little to say,
@@ -124,7 +124,7 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Box | None = No
     return _fit(thing, rays)
 
 
-def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None) -> CylinderFit:
+def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None) -> CylinderFit:
     """See robot.sight.silhouette."""
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
     notes = (*table.notes, "depth shows nothing here: fitted to the outline in the colour picture")

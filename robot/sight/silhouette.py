@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import PlanError
-from robot.readings import Box
+from robot.readings import Region
 from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, TablePlane, height_above, largest_patch
 from robot.sight.solids import Upright
 
@@ -22,7 +22,7 @@ _LEAST_PX = 60
 
 
 def fit_silhouette(
-    colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane, region: Box | None = None
+    colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None
 ) -> Upright:
     """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
     patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
@@ -55,7 +55,7 @@ def _patch(candidates: Mask) -> Patch:
     return patch
 
 
-def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Box | None) -> Upright:
+def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Region | None) -> Upright:
     """Closed form, see the top of the file. directions: (N, 3) of sight; eye: (3,) above the table's plane."""
     turn = np.arctan2(directions[:, 1], directions[:, 0])
     middle = math.atan2(float(np.sin(turn).mean()), float(np.cos(turn).mean()))

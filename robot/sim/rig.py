@@ -16,7 +16,7 @@ from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
 from robot.grasping.settings import attempt_of
-from robot.readings import RGBD, Box, Frame, GripperState, Intrinsics, Pose
+from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.settings import TypedSettings, limited
@@ -34,7 +34,7 @@ FORCE_N = (5.0, 80.0)
 
 _ATTEMPT_S = 40.0
 _MOST_OBJECTS = 100_000
-_WORKSPACE = Box((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
+_WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
 _TABLE_MM = 15.0
 """Objects stand at most this far from the centre of the workspace in x and y."""
 

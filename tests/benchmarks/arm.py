@@ -9,10 +9,10 @@ from robot.drivers.sawyer import messages
 from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.sawyer.straight_line import way_points
 from robot.emulators.sawyer.server import EmulatedSawyer, serve
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 from tests.benchmarks.common import Line, duration
 
-WORKSPACE = Box((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 LOW, HIGH = Pose(0.0, 0.0, 40.0, 0.0), Pose(0.0, 0.0, 220.0, 0.0)
 
 

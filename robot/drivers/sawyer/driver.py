@@ -29,7 +29,7 @@ from robot.drivers.sawyer.messages import Joints, Mount, newest_joints, stands
 from robot.drivers.sawyer.rosbridge import Arrival, RosbridgeLink
 from robot.drivers.sawyer.straight_line import Schedule, way_points
 from robot.errors import DeviceError
-from robot.readings import Box, Pose
+from robot.readings import Pose, Region
 from robot.settings import TypedSettings, check_range, limited
 
 _LOG = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class Sawyer(Arm):
 
     Settings = SawyerSettings
 
-    def __init__(self, *, workspace: Box, clock: Clock = time.monotonic, **settings: Any) -> None:
+    def __init__(self, *, workspace: Region, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range."""
         asked = self._asked = SawyerSettings(**settings)
         super().__init__("sawyer", workspace, max_speed_mm_s=asked.max_speed_mm_s, clock=clock)

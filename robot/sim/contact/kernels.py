@@ -132,14 +132,10 @@ def _sampled_influence(shape: Quadrant, thickness: float, poisson: float) -> Flo
 
 
 def periodic_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """(rows, cols) displacement of a periodic surface by unit pressure on pixel (0, 0)."""
-    return np.asarray(scipy.fft.irfft2(periodic_compliance(shape, thickness, poisson), shape))
-
-
-def periodic_compliance(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """(rows, cols // 2 + 1) closed form at the wave numbers of scipy.fft.rfft2 over `shape` pixels."""
+    """(rows, cols) displacement of a periodic surface by unit pressure on pixel (0, 0): the closed form at the wave
+    numbers of scipy.fft.rfft2."""
     q = 2.0 * np.pi * np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
-    return layer_compliance(q, thickness, poisson)
+    return np.asarray(scipy.fft.irfft2(layer_compliance(q, thickness, poisson), shape))
 
 
 class Operator:
