@@ -1,6 +1,6 @@
 """Identify objects by touch: from the gel images of a grasp, find the catalogue photo of the object in the hand.
 
-The stages run one way: images, dataset -> towers -> fusion -> train -> search -> report -> cli.
+The layers run one way: data -> model -> training, search -> methods -> evaluation -> report -> lab -> commands.
 Public names are imported when they are used, so `import retrieval` costs nothing.
 
 >>> import retrieval

@@ -82,6 +82,10 @@ class Progress:
         """Share of the attempts that gave an accepted grasp."""
         return self.accepted / self.attempts if self.attempts else 0.0
 
+    def __str__(self) -> str:
+        done = f"{self.objects_done} of {self.objects} objects"
+        return f"{done}, {self.accept_rate:.0%} of {self.attempts} attempts accepted"
+
 
 def collect(
     make_rig: RigMaker,

@@ -175,6 +175,7 @@ def test_progress_is_told_after_every_attempt(tmp_path):
     last = told[-1]
     assert (last.objects, last.objects_done, last.wanted, last.settled, last.accepted) == (2, 2, 4, 4, 2)
     assert last.accept_rate == 2 / last.attempts
+    assert str(last) == f"2 of 2 objects, {2 / last.attempts:.0%} of {last.attempts} attempts accepted"
     assert last.seconds_left == 0.0
 
 

@@ -61,20 +61,12 @@ class Bar:
 
 
 class Collected(Protocol):
-    """What `CollectBar` asks of robot.collect.Progress."""
+    """What `CollectBar` asks of robot.collect.Progress, whose text says the rest."""
 
     @property
     def settled(self) -> int: ...
     @property
     def wanted(self) -> int: ...
-    @property
-    def attempts(self) -> int: ...
-    @property
-    def objects(self) -> int: ...
-    @property
-    def objects_done(self) -> int: ...
-    @property
-    def accept_rate(self) -> float: ...
 
 
 class CollectBar:
@@ -86,8 +78,7 @@ class CollectBar:
     def __call__(self, now: Collected) -> None:
         if self._bar is None:
             self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
-        note = f"{now.objects_done} of {now.objects} objects, {now.accept_rate:.0%} of {now.attempts} attempts accepted"
-        self._bar.advance(now.settled - self._bar.done, note)
+        self._bar.advance(now.settled - self._bar.done, str(now))
 
     def __enter__(self) -> "CollectBar":
         return self
