@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from retrieval.errors import BadInput, RetrievalError
@@ -63,6 +63,12 @@ def printable(text: str) -> str:
         else character.encode("unicode_escape").decode()
         for character in text
     )
+
+
+def some(names: Sequence[str], shown: int = 5) -> str:
+    """The first of many names, and how many there are beside them."""
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(names[:shown]) + more
 
 
 class PrintableFormatter(logging.Formatter):

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
 
+from retrieval.console.output import some
 from retrieval.errors import BadInput
 
 FOLDER, STEM = "folder", "stem"
@@ -90,7 +91,7 @@ def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
     names, found = sorted(photos), []
     if strange := [name for name in names if name.casefold() in NOT_OBJECTS]:
         found.append(
-            f"{_some(strange)} {'is' if len(strange) == 1 else 'are'} taken for the name of an object, with "
+            f"{some(strange, _SHOWN)} {'is' if len(strange) == 1 else 'are'} taken for the name of an object, with "
             f"{sum(photos[name] for name in strange)} photo(s): if the objects' folders lie below it, say "
             f"--objects-from '{{split}}/{{object}}/{{photo}}'"
         )
@@ -103,7 +104,7 @@ def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
         what = "every object has one photo, and " if single else ""
         found.append(
             f"{what}{len(alike)} of {len(names)} objects have names that differ from another's by a number only: "
-            f"{_some(alike)}; if these show one object, say --objects-from stem, or a pattern"
+            f"{some(alike, _SHOWN)}; if these show one object, say --objects-from stem, or a pattern"
         )
     return found
 
@@ -111,8 +112,3 @@ def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
 def per_object(counts: Sequence[int]) -> dict[str, float]:
     """Least, median and largest number of photos of an object."""
     return {"min": min(counts), "median": statistics.median(counts), "max": max(counts)}
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

@@ -170,7 +170,10 @@ class _Job:
         """Write the parts as they come."""
         checkpoint = self.made.checkpoint
         return self.store.write_blocks(
-            (_block(part) for part in parts),
+            (
+                Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
+                for part in parts
+            ),
             {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
             fingerprint=fingerprint(checkpoint),
             about=self.about,
@@ -186,10 +189,6 @@ class _Job:
         self.settling_s = time.perf_counter() - start
         about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
         return Chosen(settled.kind, settled.parameters, about)
-
-
-def _block(part: Part) -> Block:
-    return Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
 
 
 def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, str]:

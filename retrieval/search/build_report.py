@@ -83,8 +83,15 @@ class BuildReport:
         )
         if not self.written:
             yield "nothing changed, by the content of every file: the index stays as it is"
-        yield from self._understood()
-        yield f"candidate search: {self.kind}. {self.reason}{self._measured()}"
+        each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
+        yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
+        yield from (f"  {name} <- {photo}" for name, photo in self.examples)
+        yield from (f"warning: {doubt}" for doubt in self.doubts)
+        measured = ""
+        if self.recall["queries"]:  # else exact by construction
+            at, recall = self.recall["at"], self.recall["value"]
+            measured = f" Recall@{at} against exact search: {recall:.3f}, measured on this index."
+        yield f"candidate search: {self.kind}. {self.reason}{measured}"
         yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
         yield from _some("remark(s)", self.notes)
         if self.left_out:
@@ -94,17 +101,6 @@ class BuildReport:
         yield from _some("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
         if self.without_photo:
             yield f"warning: {self.missing()}"
-
-    def _understood(self) -> Iterator[str]:
-        each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
-        yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
-        yield from (f"  {name} <- {photo}" for name, photo in self.examples)
-        yield from (f"warning: {doubt}" for doubt in self.doubts)
-
-    def _measured(self) -> str:
-        if not self.recall["queries"]:
-            return ""  # exact by construction
-        return f" Recall@{self.recall['at']} against exact search: {self.recall['value']:.3f}, measured on this index."
 
     def missing(self) -> str:
         """A sentence that counts and names the objects without a photo."""

@@ -5,7 +5,7 @@ the towers, as PyTorch's default is, waits for those of its members whose core i
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -119,7 +119,22 @@ class Embedder:
         if self.parent is not None:
             known.update(self.parent.reusable({item.photo.path: item.digest for item in read}))
         codes = self._made_before([item.digest for item in read if item.photo.path not in known])
-        return [item if isinstance(item, SkippedPhoto) else _found(item, known, codes) for item in items]
+        found: list[_Found | SkippedPhoto] = []
+        for item in items:
+            if isinstance(item, SkippedPhoto):
+                found.append(item)
+                continue
+            photo = item.photo
+            row = {
+                "id": photo.path,
+                "object_id": photo.object_id,
+                "path": photo.path,
+                "digest": item.digest,
+                "metadata": photo.metadata,
+            }
+            code = None if photo.path in known else codes.get(item.digest)
+            found.append(_Found(row, item if code is None and photo.path not in known else None, code))
+        return found
 
     def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
         """Codes of these contents, of the parent under other names, or of a build that was cut off."""
@@ -176,7 +191,13 @@ class Embedder:
         with one_thread():
             code = encode_photos(self.checkpoint.matcher, images, BATCH)
         halves, embeddings, names = code.half.numpy(), code.embedding.numpy(), [row["id"] for row in rows]
-        stored = _as_float16(halves, names)
+        largest = np.abs(halves).max(axis=1)
+        if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
+            raise NumericalError(
+                f"halves are stored as float16 and must stay within 65504; {names[bad[0]]} gives {largest[bad[0]]}; "
+                "the model has diverged, train again with a lower learning rate"
+            )
+        stored = halves.astype(np.float16)
         errors = np.abs(stored - halves).max(axis=1)
         self.unfinished.keep(
             [row["digest"] for row in rows], {"embedding": embeddings, "halves": stored, "half_error": errors}
@@ -224,13 +245,6 @@ def layouts(checkpoint: Checkpoint) -> Layouts:
     }
 
 
-def _found(item: PhotoBytes, known: Container[str], codes: Mapping[str, _Code]) -> _Found:
-    if item.photo.path in known:
-        return _Found(_row(item))
-    code = codes.get(item.digest)
-    return _Found(_row(item), item if code is None else None, code)
-
-
 def _full(found: Iterable[_Found | SkippedPhoto]) -> Iterator[list[_Found | SkippedPhoto]]:
     """Parts with a whole batch of photos to encode in each but the last."""
     part: list[_Found | SkippedPhoto] = []
@@ -244,25 +258,3 @@ def _full(found: Iterable[_Found | SkippedPhoto]) -> Iterator[list[_Found | Skip
             part, new, held = [], 0, 0
     if part:
         yield part
-
-
-def _row(item: PhotoBytes) -> dict[str, Any]:
-    photo = item.photo
-    return {
-        "id": photo.path,
-        "object_id": photo.object_id,
-        "path": photo.path,
-        "digest": item.digest,
-        "metadata": photo.metadata,
-    }
-
-
-def _as_float16(halves: NDArray[np.float32], names: list[str]) -> NDArray[np.float16]:
-    largest = np.abs(halves).max(axis=1)
-    bad = np.flatnonzero(~(largest <= np.finfo(np.float16).max))
-    if len(bad):
-        raise NumericalError(
-            f"halves are stored as float16 and must stay within 65504; {names[bad[0]]} gives {largest[bad[0]]}; "
-            "the model has diverged, train again with a lower learning rate"
-        )
-    return halves.astype(np.float16)

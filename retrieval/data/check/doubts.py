@@ -13,8 +13,9 @@ from string import ascii_lowercase
 
 import numpy as np
 
+from retrieval.console.output import some
 from retrieval.data.check.copies import PictureSet, Thumbnail, is_copy
-from retrieval.data.check.findings import Files, Finding, named, some
+from retrieval.data.check.findings import Files, Finding, named
 from retrieval.data.check.looks import Looks, distance, exchanged_photos, named_by, swapped_fingers, swapped_moments
 from retrieval.data.dataset import Grasp
 

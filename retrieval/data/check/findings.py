@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.console.output import some
 from retrieval.data.check.copies import Thumbnail
 from retrieval.data.dataset import Grasp
-
-_SHOWN = 5
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,3 @@ def named(severity: str, kind: str, what: str, names: Sequence[str], grasps: Seq
     if names:
         where = f"in {len(names)} of {len(grasps)} grasps: {some(names)}"
         yield Finding(severity, kind, f"{what} {where}", tuple(names))
-
-
-def some(names: Sequence[str]) -> str:
-    """The first of many names."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

@@ -10,10 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 
+from retrieval.console.output import some
 from retrieval.console.progress import Bar
 from retrieval.data.check import doubts
 from retrieval.data.check.copies import thumbnail
-from retrieval.data.check.findings import Files, Finding, Seen, named, some
+from retrieval.data.check.findings import Files, Finding, Seen, named
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all, require_accepted
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import resize
