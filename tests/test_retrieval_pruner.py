@@ -30,7 +30,7 @@ def test_a_pruner_that_learned_from_scaled_halves_reads_them_as_they_are_once_it
     spreads = Spread.of(touches), Spread.of(photos)
     taught = pruner.scores(spreads[0](touches), spreads[1](photos))
     assert not torch.allclose(pruner.scores(touches, photos), taught, atol=1e-2)  # as they are, too early
-    pruner.take_in(*spreads)
+    pruner.absorb(*spreads)
     torch.testing.assert_close(pruner.scores(touches, photos), taught, rtol=1e-4, atol=1e-5)
 
 

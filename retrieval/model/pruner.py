@@ -37,7 +37,7 @@ class Pruner(nn.Module):
         return touches @ self.photo(photo_halves).T
 
     @torch.no_grad()
-    def take_in(self, touch: "Spread", photo: "Spread") -> None:
+    def absorb(self, touch: "Spread", photo: "Spread") -> None:
         """Change the first layers to read halves as they are, where so far they read them centred and scaled."""
         for student, spread in ((self._touch, touch), (self._photo, photo)):
             first = student[0]

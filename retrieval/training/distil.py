@@ -74,7 +74,7 @@ def distil(
     with Bar("teach pruner", steps, "steps", quiet=quiet) as bar:
         if fit(optimizer, plan, range(steps), loss, bar=bar, stopped=stopped) < steps:
             raise Interrupted("stopped before the pruner was taught")
-    pruner.take_in(touch_spread, photo_spread)
+    pruner.absorb(touch_spread, photo_spread)
     matcher.config, matcher.pruner = config, pruner.eval()
 
 

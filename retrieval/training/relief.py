@@ -176,19 +176,19 @@ class ReliefTraining:
                 module.eval()  # the published statistics hold; a batch of 32 is too few for new ones
         self.head.train()
         torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
-        said = self._said(images)
+        readings = self._readings(images)
         family = torch.tensor([self.families.index(each.relief) for each in pictures], device=self.device)
         worn = torch.tensor([each.amplitude_mm > 0 for each in pictures], device=self.device)
-        error = (said[:, -2:] - self._wanted(pictures)).square().mean(1)
-        loss = functional.cross_entropy(said[:, :-2], family, label_smoothing=SMOOTHING)
+        error = (readings[:, -2:] - self._wanted(pictures)).square().mean(1)
+        loss = functional.cross_entropy(readings[:, :-2], family, label_smoothing=SMOOTHING)
         return loss + (error * worn).mean()
 
-    def _said(self, images: Tensor) -> Tensor:
+    def _readings(self, images: Tensor) -> Tensor:
         """(B, families + 2): logits of the families, then the standardised logarithms of pitch and amplitude."""
         with autocast(self.device, self.config.training.precision):
             features = self.tower(images.to(self.device, memory_format=torch.channels_last))
-        said: Tensor = self.head(features.float())
-        return said
+        readings: Tensor = self.head(features.float())
+        return readings
 
     def _wanted(self, pictures: Sequence[LabelledPicture]) -> Tensor:
         sizes = (np.array([_sizes(each) for each in pictures]) - self.mean) / self.deviation
@@ -200,12 +200,12 @@ class ReliefTraining:
         self.tower.eval()
         self.head.eval()
         parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
-        said = torch.cat([self._said(centred(self._images(part), self.kind)) for part in parts]).cpu().numpy()
-        named = np.array(self.families)[said[:, :-2].argmax(1)]
+        readings = torch.cat([self._readings(centred(self._images(part), self.kind)) for part in parts]).cpu().numpy()
+        named = np.array(self.families)[readings[:, :-2].argmax(1)]
         families = np.array([each.relief for each in self.validation])
         worn = np.array([each.amplitude_mm > 0 for each in self.validation])
         wanted = self._wanted(self.validation).cpu().numpy()
-        pitch, amplitude = (_correlation(said[worn, -2 + place], wanted[worn, place]) for place in (0, 1))
+        pitch, amplitude = (_correlation(readings[worn, -2 + place], wanted[worn, place]) for place in (0, 1))
         everything = [*self.pictures, *self.validation]
         return ReliefReport(
             kind=self.kind,
@@ -299,11 +299,11 @@ def _sizes(picture: LabelledPicture) -> tuple[float, float]:
     return float(np.log(picture.pitch_mm)), float(np.log(max(picture.amplitude_mm, LEAST_MM)))
 
 
-def _correlation(said: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
+def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
     """Of Pearson; 0 where one of them does not vary."""
-    if len(said) < 2 or said.std() == 0 or wanted.std() == 0:
+    if len(readings) < 2 or readings.std() == 0 or wanted.std() == 0:
         return 0.0
-    return float(np.corrcoef(said, wanted)[0, 1])
+    return float(np.corrcoef(readings, wanted)[0, 1])
 
 
 def _contiguous(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -144,7 +144,7 @@ def halves(sample: Sample) -> Row:
         works.append(partial(_judge, sample, asked[0], store(many), read))
     return Row(
         "Number format of stored halves",
-        f"{len(asked)} touches, each with {len(whole)} photos. All are reckoned with in float32, so a small one "
+        f"{len(asked)} touches, each with {len(whole)} photos. All are computed with in float32, so a small one "
         "saves memory and no time: an index keeps float16, half the bytes of float32, as long as no answer changes.",
         _panels(sample, errors, flips, works, len(asked), ("halves in float32", "judging 1,000 photos, one thread")),
     )
