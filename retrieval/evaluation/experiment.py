@@ -44,7 +44,9 @@ class Experiment:
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
         """The seeds that make a difference to a method."""
-        return seeds[:1] if name in SEEDLESS or self._comes_fitted(name) else seeds
+        method = build_method(name, Setting(self.config))
+        comes_fitted = self.checkpoint is not None and isinstance(method, LateFusion)
+        return seeds[:1] if name in SEEDLESS or comes_fitted else seeds
 
     def predict(self, name: str, seed: int) -> None:
         """Fit a method and write its predictions; nothing where these lie there already."""
@@ -79,9 +81,6 @@ class Experiment:
             "shuffled": self.shuffled,
             "software": __version__,
         }
-
-    def _comes_fitted(self, name: str) -> bool:
-        return self.checkpoint is not None and isinstance(build_method(name, Setting(self.config)), LateFusion)
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
         config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn

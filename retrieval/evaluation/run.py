@@ -63,17 +63,20 @@ def evaluate(
         raise BadInput(f"give one method and one seed at least; got {len(methods)} and {seeds}")
     out.mkdir(parents=True, exist_ok=True)
     seed = config.training.seed
+    wanted = list(range(seed, seed + seeds))
     try:
         material = prepare(recording, out, config, model=model, split=split, quiet=quiet)
         experiment, controls = _experiments(material, out, cache or out / "features", seed, quiet)
-        jobs = {
-            name: experiment.seeds_of(name, [seed + turn for turn in range(seeds)]) for name in dict.fromkeys(methods)
-        }
-        _predict(experiment, controls, jobs, seed)
+        jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(methods)}
+        for name, some in jobs.items():
+            for one in some:
+                experiment.predict(name, one)
+        for control in controls.values():
+            control.predict(METHOD, seed)
     except Interrupted as error:
         raise Interrupted(f"stopped; what was made is kept in {out}, and the same command goes on with it") from error
     results = {
-        **_about(material, experiment, preset, [seed + turn for turn in range(seeds)]),
+        **_about(material, experiment, preset, wanted),
         "audit": _audited(material, out, quiet),
         **_scored(experiment, jobs, seed, quiet),
         "controls": {
@@ -100,14 +103,6 @@ def _experiments(
         quiet=quiet,
     )
     return experiment, control_experiments(experiment, material, cache, seed)
-
-
-def _predict(experiment: Experiment, controls: Mapping[str, Experiment], jobs: Jobs, seed: int) -> None:
-    for name, seeds in jobs.items():
-        for one in seeds:
-            experiment.predict(name, one)
-    for control in controls.values():
-        control.predict(METHOD, seed)
 
 
 def _about(material: Material, experiment: Experiment, preset: str, seeds: list[int]) -> dict[str, Any]:

@@ -174,7 +174,9 @@ def _photos(
     """(G, F): the features of each grasp's photo."""
     made_by = ("photo", _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
     files = list(dict.fromkeys(grasp.photo for grasp in grasps))
-    encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), _itself, quiet).rows(files)
+    encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), lambda file: (file,), quiet).rows(
+        files
+    )
     row_of = {path: row for row, path in enumerate(files)}
     return np.asarray(encoded[[row_of[grasp.photo] for grasp in grasps]])
 
@@ -197,10 +199,6 @@ def _as_shown(grasp: Grasp, variant: str) -> Grasp:
             f"{len(grasp.touches)}; record them, or leave this control out"
         )
     return dataclasses.replace(grasp, touches=grasp.backgrounds)
-
-
-def _itself(path: Path) -> tuple[Path, ...]:
-    return (path,)
 
 
 def _digest_of(tower: nn.Module) -> str:

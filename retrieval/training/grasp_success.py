@@ -119,7 +119,10 @@ def train_gate(
     _require_frames(attempts, settings.frame)
     _require_both(attempts, f"{recording} must hold")
     split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
-    train, validation = (_select(attempts, objects) for objects in (split.train, split.validation))
+    train, validation = (
+        [attempt for attempt in attempts if attempt.grasp.object_id in objects]
+        for objects in (split.train, split.validation)
+    )
     _require_both(train, f"the training objects of seed {seed} must have")
     with _Differences(settings) as differences, one_thread():
         gate = Gate(_trained(train, differences, iterations, seed, quiet), settings)
@@ -128,10 +131,6 @@ def train_gate(
     report = _report(out, settings.frame, train, validation, logits)
     _save(out, gate, split, attempts, recording, report, {"iterations": iterations, "seed": seed})
     return report
-
-
-def _select(attempts: Sequence[Attempt], objects: Sequence[str]) -> list[Attempt]:
-    return [attempt for attempt in attempts if attempt.grasp.object_id in objects]
 
 
 def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:

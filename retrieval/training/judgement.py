@@ -134,7 +134,7 @@ class Pictures:
         frames = list(_untouched(settings, grasps, fingers))
         some = [grasps[row] for row in np.linspace(0, len(grasps) - 1, min(_PIECES, len(grasps))).round().astype(int)]
         photos = [settings.load_photo(grasp.photo) for grasp in some]
-        gels = [settings.touch(read_rgb(grasp.touches[0]), _reference(settings, grasp)) for grasp in some]
+        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in some]
         names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
         shape = (-1, fingers, touches.shape[1] // fingers)
         return cls(
@@ -144,10 +144,6 @@ class Pictures:
             touch_features(matcher, [[picture] * fingers for picture in drawn]).cpu().reshape(shape)[:, 0],
             np.array([name != "false colours" for name in names]),
         )
-
-
-def _reference(settings: Preprocessing, grasp: Grasp) -> Image | None:
-    return read_rgb(grasp.backgrounds[0]) if settings.background != "none" else None
 
 
 def _untouched(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> Iterator[list[Image]]:

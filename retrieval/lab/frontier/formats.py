@@ -19,7 +19,7 @@ from retrieval.lab.frontier.pixels import load_touch
 from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed, smallest
 from retrieval.lab.frontier.sample import Array, Sample
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import for_inference, has_fast_bfloat16, touch_batch
+from retrieval.model.encode import batches, for_inference, has_fast_bfloat16, touch_batch
 from retrieval.model.export import graph_of
 from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, sealed
@@ -41,10 +41,10 @@ def towers(sample: Sample) -> Row:
     images = [load_touch(settings, sample.grasps[row]) for row in asked]
     photos = sample.own["half"]
     whole = copy.deepcopy(sample.checkpoint.matcher).double()
-    exact = _logits(sample, np.concatenate([_halves(whole, part) for part in _parts(images)]), photos)
+    exact = _logits(sample, np.concatenate([_halves(whole, part) for part in batches(images, _BATCH)]), photos)
     errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
-        logits = _logits(sample, np.concatenate([encode(part) for part in _parts(images)]), photos)
+        logits = _logits(sample, np.concatenate([encode(part) for part in batches(images, _BATCH)]), photos)
         errors.append(Tradeoff(name, "", float(np.abs(logits - exact).max()), is_default=is_default))
         flips.append(missed(name, "", logits.argmax(1) != exact.argmax(1), is_default))
         works.append(partial(encode, images[:1]))
@@ -117,11 +117,6 @@ def _bfloat16(matcher: Matcher, images: list[Any]) -> Array:
     return matcher.touch_code(features.float().reshape(len(images), -1)).half.numpy()
 
 
-def _parts(images: list[Any]) -> Iterator[list[Any]]:
-    for start in range(0, len(images), _BATCH):
-        yield images[start : start + _BATCH]
-
-
 def _logits(sample: Sample, halves: Array, photos: NDArray[Any]) -> Array:
     return np.array([sample.logits(half, photos) for half in halves])
 
@@ -141,7 +136,7 @@ def halves(sample: Sample) -> Row:
         setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
         errors.append(Tradeoff(name, setting, float(np.abs(logits - exact).max()), is_default=is_default))
         flips.append(missed(name, setting, logits.argmax(1) != exact.argmax(1), is_default))
-        works.append(partial(_judge, sample, asked[0], store(many), read))
+        works.append(partial(lambda read, kept: sample.logits(asked[0], read(kept)), read, store(many)))
     return Row(
         "Number format of stored halves",
         f"{len(asked)} touches, each with {len(whole)} photos. All are computed with in float32, so a small one "
@@ -151,10 +146,6 @@ def halves(sample: Sample) -> Row:
 
 
 Stored = tuple[NDArray[Any], ...]
-
-
-def _judge(sample: Sample, half: Array, kept: Stored, read: Callable[[Stored], NDArray[Any]]) -> Array:
-    return sample.logits(half, read(kept))
 
 
 def _as_float(kind: type[np.floating[Any]]) -> Callable[[Array], Stored]:
@@ -167,17 +158,9 @@ def _as_int8(whole: Array) -> Stored:
     return np.rint(whole / np.where(scale > 0, scale, 1)).astype(np.int8), scale.astype(np.float32)
 
 
-def _first(stored: Stored) -> NDArray[Any]:
-    return stored[0]
-
-
-def _scaled(stored: Stored) -> NDArray[Any]:
-    return np.asarray(stored[0] * stored[1])
-
-
 FORMATS: tuple[tuple[str, Callable[[Array], Stored], Callable[[Stored], NDArray[Any]], bool], ...] = (
-    ("float32", _as_float(np.float32), _first, False),
-    ("float16", _as_float(np.float16), _first, True),
-    ("int8, a scale for each photo", _as_int8, _scaled, False),
+    ("float32", _as_float(np.float32), lambda kept: kept[0], False),
+    ("float16", _as_float(np.float16), lambda kept: kept[0], True),
+    ("int8, a scale for each photo", _as_int8, lambda kept: kept[0] * kept[1], False),
 )
 """(name, how halves are stored, how they are read again, whether an index keeps them so)."""

@@ -23,7 +23,9 @@ def grasps(sample: Sample) -> Row:
     table = np.array([sample.logits(half, sample.own["half"]) for half in codes])
     counts = [count for count in COUNTS if count <= most]
     points = [
-        missed("", _words(count), _wrong(sample, table, neighbours(owner, count), owner), count == 1)
+        missed(
+            "", f"{count} grasp{'s' * (count > 1)}", _wrong(sample, table, neighbours(owner, count), owner), count == 1
+        )
         for count in counts
     ]
     points = list(timed(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
@@ -48,10 +50,6 @@ def _wrong(sample: Sample, table: Array, sets: NDArray[np.int64], owner: NDArray
     photo_owner = sample.owner[sample.photo_rows]
     summed = table[sets].sum(1, dtype=np.float64)
     return np.asarray(photo_owner[summed.argmax(1)] != owner)
-
-
-def _words(count: int) -> str:
-    return "1 grasp" if count == 1 else f"{count} grasps"
 
 
 def _query(sample: Sample, count: int) -> Array:

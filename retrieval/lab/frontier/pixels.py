@@ -23,16 +23,25 @@ SLACK = 2.0
 
 def image_size(sample: Sample) -> Row:
     """The towers take images of any size, and were trained with one."""
-    settings = sample.checkpoint.config.preprocessing
+    settings, asked = sample.checkpoint.config.preprocessing, sample.touch_rows[: sample.scale.touches]
+    felt, shown = ([sample.grasps[row] for row in rows] for rows in (asked, sample.photo_rows))
+    touches, photos = partial(_encode_touches, sample), partial(_encode_photos, sample)
+    kept = sample.touch_codes(asked)["half"]
     return Row(
         "Image size",
         "Gel images, and photos, made smaller or larger before the tower sees them; the other modality keeps the size "
         "that the model was trained with. One touch picks a photo of its object among those of all unseen objects.",
         (
             _panel(
-                sample, "gel images", settings.touch_px, partial(_touch_halves, sample), partial(_one_touch, sample)
+                sample,
+                "gel images",
+                settings.touch_px,
+                lambda px: (touches(felt, px), sample.own["half"]),
+                partial(touches, felt[:1]),
             ),
-            _panel(sample, "photos", settings.photo_px, partial(_photo_halves, sample), partial(_one_photo, sample)),
+            _panel(
+                sample, "photos", settings.photo_px, lambda px: (kept, photos(shown, px)), partial(photos, shown[:1])
+            ),
         ),
     )
 
@@ -44,7 +53,9 @@ def _panel(
     halves: Callable[[int], tuple[Array, Array]],
     encode_one: Callable[[int], object],
 ) -> Panel:
-    sizes = sorted({16 * round(share * trained / 16) for share in _shares(sample)} | {trained})
+    sizes = sorted(
+        {16 * round(share * trained / 16) for share in ((0.5, 1.0) if sample.scale.quick else SHARES)} | {trained}
+    )
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     with Bar(f"sizes of {what}", len(sizes), "sizes", quiet=sample.quiet) as bar:
         for px in sizes:
@@ -61,31 +72,13 @@ def _panel(
         reference=f"the object in the hand, one of {len(np.unique(sample.owner))}",
         tolerance=round(at_trained + SLACK, 1),
         points=tuple(points),
-        resolution=100 / len(_asked(sample)),
+        resolution=100 / len(touches),
     )
-
-
-def _shares(sample: Sample) -> tuple[float, ...]:
-    return (0.5, 1.0) if sample.scale.quick else SHARES
-
-
-def _asked(sample: Sample) -> NDArray[np.int64]:
-    return sample.touch_rows[: sample.scale.touches]
 
 
 def _wrong(sample: Sample, touches: Array, photos: Array) -> NDArray[np.bool_]:
     best = np.array([int(sample.logits(half, photos).argmax()) for half in touches])
-    return np.asarray(sample.owner[sample.photo_rows][best] != sample.owner[_asked(sample)])
-
-
-def _touch_halves(sample: Sample, px: int) -> tuple[Array, Array]:
-    grasps = [sample.grasps[row] for row in _asked(sample)]
-    return _encode_touches(sample, grasps, px), sample.own["half"]
-
-
-def _photo_halves(sample: Sample, px: int) -> tuple[Array, Array]:
-    grasps = [sample.grasps[row] for row in sample.photo_rows]
-    return sample.touch_codes(_asked(sample))["half"], _encode_photos(sample, grasps, px)
+    return np.asarray(sample.owner[sample.photo_rows][best] != sample.owner[sample.touch_rows[: len(best)]])
 
 
 def _encode_touches(sample: Sample, grasps: Sequence[Grasp], px: int) -> Array:
@@ -105,11 +98,3 @@ def _encode_photos(sample: Sample, grasps: Sequence[Grasp], px: int) -> Array:
     settings = dataclasses.replace(sample.checkpoint.config.preprocessing, photo_px=px)
     images = (settings.load_photo(grasp.photo) for grasp in grasps)
     return encode_photos(sample.checkpoint.matcher, images).half.numpy()
-
-
-def _one_touch(sample: Sample, px: int) -> Array:
-    return _encode_touches(sample, [sample.grasps[sample.touch_rows[0]]], px)
-
-
-def _one_photo(sample: Sample, px: int) -> Array:
-    return _encode_photos(sample, [sample.grasps[sample.photo_rows[0]]], px)

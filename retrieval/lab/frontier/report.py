@@ -119,7 +119,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.12, y=0.1)
-    floor = _floor(panel)
+    floor = _FLOOR * min([panel.resolution, *(point.error for point in panel.points if point.error > 0)])
     series = list(dict.fromkeys(point.series for point in panel.points))
     for place, name in enumerate(series):
         _series(axes, [point for point in panel.points if point.series == name], place, floor, name)
@@ -132,11 +132,6 @@ def _draw(axes: Axes, panel: Panel) -> None:
         low, high = axis.get_view_interval()
         logarithmic(axis, (1, 2, 5) if high < 300 * low else (1,))
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
-
-
-def _floor(panel: Panel) -> float:
-    """Where an error of 0 is drawn."""
-    return _FLOOR * min([panel.resolution, *(point.error for point in panel.points if point.error > 0)])
 
 
 def _series(axes: Axes, points: Sequence[Tradeoff], place: int, floor: float, name: str) -> None:
@@ -162,14 +157,10 @@ def _front(axes: Axes, panel: Panel, floor: float) -> None:
     axes.plot(
         *_place(best, floor), "*", ms=11, color="#c8382e", mec="white", mew=0.6, clip_on=False, label="recommended"
     )
-    for point in {id(one): one for one in (*panel.pareto()[:: _every(front)], best)}.values():
+    step = 1 if len(front) < 8 else 2  # every second point of a long front has its label
+    for point in {id(one): one for one in (*panel.pareto()[::step], best)}.values():
         label = axes.annotate(point.setting or point.series, _place(point, floor), **_LABEL)
         label.set_in_layout(False)
-
-
-def _every(front: Sequence[Any]) -> int:
-    """Label every point of a short front, every second of a long one."""
-    return 1 if len(front) < 8 else 2
 
 
 def _place(point: Tradeoff, floor: float) -> tuple[float, float]:

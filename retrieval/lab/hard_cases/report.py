@@ -38,20 +38,12 @@ def _section(package: str, cases: Sequence[Mapping[str, Any]]) -> Section:
             case["kernel"],
             case["case"],
             case["must_hold"],
-            _judged(case["naive"], case["naive_holds"]),
+            case["naive"] if case["naive_holds"] else f"{case['naive']} (wrong)",
             case["ours"],
-            _word(case),
+            "holds" if case["holds"] else "DOES NOT HOLD",
         )
         for case in cases
     )
     failing = frozenset((number, 5) for number, case in enumerate(cases) if not case["holds"])
     table = Table(_HEADER, rows, words=frozenset({1, 2, 3, 4, 5}), bold=failing)
     return Section(_TITLES.get(package, package), (table,))
-
-
-def _judged(naive: str, holds: bool) -> str:
-    return naive if holds else f"{naive} (wrong)"
-
-
-def _word(case: Mapping[str, Any]) -> str:
-    return "holds" if case["holds"] else "DOES NOT HOLD"
