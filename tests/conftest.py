@@ -5,6 +5,7 @@ import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import faiss
@@ -91,6 +92,43 @@ def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
     train(recording, out, TINY, quiet=True)
     return out
+
+
+@pytest.fixture(scope="session")
+def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.search.build import build_index
+
+    out = tmp_path_factory.mktemp("search") / "index"
+    build_index(catalogue, load_checkpoint(model), out, quiet=True)
+    return out
+
+
+@pytest.fixture(scope="module")
+def searcher(index: Path) -> Iterator[Any]:
+    """The index, opened."""
+    from retrieval.search.searcher import Searcher
+
+    with Searcher.open(index) as opened:
+        yield opened
+
+
+@pytest.fixture
+def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of photos in each batch that went through the photo tower in this process."""
+    from retrieval.model.encode import encode_photos
+    from retrieval.search import embed
+
+    sizes: list[int] = []
+
+    def counted(matcher: Any, photos: Any, batch: int) -> Any:
+        photos = list(photos)
+        sizes.append(len(photos))
+        return encode_photos(matcher, photos, batch)
+
+    monkeypatch.setattr(embed, "encode_photos", counted)
+    return sizes
 
 
 def pytest_configure() -> None:

@@ -18,7 +18,7 @@ from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import encode_photos, for_inference
 from retrieval.model.fusion import Matcher
-from retrieval.search import build, embed, measuring, operating
+from retrieval.search import build, measuring, operating
 from retrieval.search.build import build_index
 from retrieval.search.embed import ahead
 from retrieval.search.measuring import NeighbourBench, WinnerBench
@@ -40,20 +40,6 @@ def index(tmp_path):
 @pytest.fixture
 def checkpoint(model):
     return load_checkpoint(model)
-
-
-@pytest.fixture
-def embedded(monkeypatch):
-    """The number of photos in each batch that went through the photo tower."""
-    sizes = []
-
-    def counted(matcher, photos, batch):
-        photos = list(photos)
-        sizes.append(len(photos))
-        return encode_photos(matcher, photos, batch)
-
-    monkeypatch.setattr(embed, "encode_photos", counted)
-    return sizes
 
 
 def first_photo(own):

@@ -14,7 +14,6 @@ from indexes.store.folder import IndexStore
 from indexes.store.unfinished import FOLDER
 from retrieval.commands.main import main
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.encode import encode_photos
 from retrieval.search import embed
 from retrieval.search.build import build_index
 
@@ -47,20 +46,6 @@ def killed(catalogue, model, index, call):
     arguments = [sys.executable, "-c", KILLED, *map(str, (catalogue, model, index, call, BATCH))]
     done = subprocess.run(arguments, capture_output=True, timeout=300, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
-
-
-@pytest.fixture
-def embedded(monkeypatch):
-    """The number of photos in each batch that went through the photo tower in this process."""
-    sizes = []
-
-    def counted(matcher, photos, batch):
-        photos = list(photos)
-        sizes.append(len(photos))
-        return encode_photos(matcher, photos, batch)
-
-    monkeypatch.setattr(embed, "encode_photos", counted)
-    return sizes
 
 
 @pytest.fixture

@@ -30,19 +30,6 @@ STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
 
 
 @pytest.fixture(scope="module")
-def index(catalogue, model, tmp_path_factory):
-    """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
-    out = tmp_path_factory.mktemp("search") / "index"
-    build_index(catalogue, load_checkpoint(model), out, quiet=True)
-    return out
-
-
-@pytest.fixture(scope="module")
-def searcher(index):
-    return Searcher.open(index)
-
-
-@pytest.fixture(scope="module")
 def matcher(model):
     """The model of the index, in PyTorch."""
     return load_checkpoint(model).matcher

@@ -23,20 +23,6 @@ from tests import synthetic
 
 
 @pytest.fixture(scope="module")
-def index(catalogue, model, tmp_path_factory):
-    """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
-    out = tmp_path_factory.mktemp("searcher") / "index"
-    build_index(catalogue, load_checkpoint(model), out, quiet=True)
-    return out
-
-
-@pytest.fixture(scope="module")
-def searcher(index):
-    with Searcher.open(index) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
 def grasps(tmp_path_factory):
     """Files of three grasps of each of two objects."""
     objects = synthetic.make_objects(2, seed=9)
