@@ -12,7 +12,6 @@ own resolution; `grey` because colour says nothing about what can be felt.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +49,8 @@ def find_object(image: RgbImage) -> Box:
     object differs from it in colour, or is lighter, or darker than a shadow: a shadow is the ground with less light
     and a tint between the lamp's and the sky's. Where depth was recorded it would say better; a catalogue has none.
     """
+    import cv2  # a query of a touch needs none
+
     height, width = image.shape[:2]
     linear = np.clip(resize(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
     lightness = linear.mean(axis=2)
@@ -89,6 +90,8 @@ def _off_the_ground(values: Grey) -> tuple[Grey, float]:
 
 def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
     """Sides of the box around the largest region near the middle, with those a tenth as large; None for too little."""
+    import cv2
+
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     count, labels, about, middles = cv2.connectedComponentsWithStats(mask)
