@@ -246,3 +246,13 @@ def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():
     with one_thread():
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == before
+
+
+def test_a_matcher_of_several_views_is_fitted_on_the_features_of_all(recording, split, tmp_path):
+    seen = dataclasses.replace(FROZEN, preprocessing=dataclasses.replace(FROZEN.preprocessing, views=("whole", "zoom")))
+    torch.manual_seed(0)
+    features = encode_recording(load_grasps(recording), build_matcher(seen), seen, None, quiet=True)
+    both = tuple(features.of_objects(part) for part in (split.train, split.validation, split.test))
+    made = fit(LateFusion, both, tmp_path, seen)
+    touches, photos = codes(made, both[2])
+    assert made.score(touches, photos).shape == (len(both[2]), len(both[2]))

@@ -115,7 +115,7 @@ def _folder(given: Path | None) -> Iterator[Path]:
 
 def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
     """Fingers, features of one finger, features of a photo."""
-    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.photo_tower.feature_count
+    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_half.in_features
 
 
 def _require_fit(matcher: Matcher, features: Features) -> None:
