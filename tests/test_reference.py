@@ -88,6 +88,7 @@ def test_a_public_name_is_no_module_of_its_package():
         assert not modules & set(package.__all__), package
 
 
+@pytest.mark.slow
 def test_type_checkers_see_the_public_names_and_no_others(tmp_path):
     lines = [f"import {package.__name__}" for package in PACKAGES]
     lines += [f"reveal_type({package.__name__}.{name})" for package in PACKAGES for name in package.__all__]

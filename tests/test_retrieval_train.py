@@ -363,13 +363,16 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.training.step import batch_loss
 from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY
+from tests.test_retrieval_train import with_training
 
 torch.set_num_threads(1)
 distributed.start()
 torch.manual_seed(0)
-matcher = build_matcher(TINY)
-set_training_mode(matcher, TINY.training)
-with TrainedFeatures(TINY, torch.device("cpu")) as source:
+# Where hardware multiplies bfloat16, towers in training would round differently in batches of another size.
+config = with_training(TINY, precision="float32")
+matcher = build_matcher(config)
+set_training_mode(matcher, config.training)
+with TrainedFeatures(config, torch.device("cpu")) as source:
     loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
     torch.manual_seed(1)
     if sys.argv[3] == "local":  # the naive way: every rank's loss over its own share of the images
@@ -389,7 +392,7 @@ with TrainedFeatures(TINY, torch.device("cpu")) as source:
             matcher.touch_code(touch).embedding, matcher.photo_code(photo).embedding, *labels, matcher.log_scale
         )
     else:
-        loss, _ = batch_loss(matcher, TINY.training, loaded.batch, *source.train_features(matcher, loaded))
+        loss, _ = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
 loss.backward()
 distributed.average_gradients(matcher)
 if distributed.rank() == 0:
