@@ -73,6 +73,9 @@ def test_pictures_made_otherwise_and_other_folders_are_left_alone(tmp_path):
         with pytest.raises(RecordingError, match="made otherwise"):
             collect_pictures(kind, tmp_path / "p", objects=1, seed=seed)
     assert files(tmp_path / "p") == before
+    (tmp_path / "p" / "metadata.jsonl").write_text("{}\n")
+    with pytest.raises(RecordingError, match="no picture's"):
+        collect_pictures("photo", tmp_path / "p", objects=1, seed=5)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
     with pytest.raises(RecordingError, match="something else"):

@@ -112,7 +112,7 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
                 )
             return _done(folder / METADATA_FILE)
-        if folder.exists() and any(folder.iterdir()):
+        if folder.exists() and {path.name for path in folder.iterdir()} - {IMAGES_FOLDER, METADATA_FILE}:
             raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
         (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
         write_file(folder / METADATA_FILE, b"")
@@ -124,7 +124,10 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
 def _done(path: Path) -> dict[str, int]:
     """Objects whose lines are whole. Half a last line is cut off, and with it the last object, whose it may be."""
     lines = content_of(path, RecordingError).splitlines(keepends=True)
-    names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
+    try:
+        names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{path} has a line that is no picture's ({error!r}); give another folder") from error
     if len(names) < len(lines):
         kept = [name for name in names if name != names[-1]]
         with open(path, "r+b") as file:
