@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,6 +15,7 @@ from PIL import Image
 
 import retrieval
 from retrieval.errors import BadInput, ImageError
+from retrieval.model import touches as model_touches
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import graph_of
 from retrieval.model.onnx_encoder import sealed
@@ -247,6 +249,39 @@ def test_a_fork_answers_as_its_parent_does(searcher, touch):
     expected = ranking(searcher.query(touch))
     torch.ones(1 << 20).add(1)  # by OpenMP's threads, which the fork does not have
     assert in_fork(lambda: ranking(searcher.query(touch))) == repr(expected)
+
+
+@forking
+def test_a_process_forks_when_no_touch_is_being_read_and_threads_that_did_are_gone(searcher, touch):
+    """A thread that Python has joined may still hold a lock of the allocator, which a fork would copy as it is: this
+    once left a child waiting for ever in PyTorch."""
+    expected, found = ranking(searcher.query(touch)), []
+    for _ in range(3):
+        with ThreadPoolExecutor(8) as threads:
+            list(threads.map(searcher.query, [touch] * 24))
+        ended = model_touches._forks._threads - {thread.native_id for thread in threading.enumerate()}
+        assert len(ended) >= 8
+        found.append(in_fork(lambda: ranking(searcher.query(touch))))
+        assert not any(Path(f"/proc/self/task/{one}").exists() for one in ended)
+    assert found == [repr(expected)] * 3
+
+
+@forking
+def test_a_fork_waits_for_the_query_under_way(searcher, touch, monkeypatch):
+    begun, order, encode = threading.Event(), [], type(searcher.encoder).encode
+
+    def slow(self, views):
+        begun.set()
+        time.sleep(0.3)
+        order.append("encoded")
+        return encode(self, views)
+
+    monkeypatch.setattr(type(searcher.encoder), "encode", slow)
+    with ThreadPoolExecutor(1) as threads:
+        answer = threads.submit(searcher.query, touch)
+        assert begun.wait(60)
+        assert in_fork(lambda: len(order)) == "1"
+        assert answer.result().results
 
 
 @forking

@@ -10,6 +10,7 @@ How deep the lists are nested says what is meant, so nothing is guessed:
 """
 
 import os
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -196,6 +197,55 @@ class Stopwatch:
         return {stage: ms / shares for stage, ms in everything.items()}
 
 
+LONGEST_WAIT_S = 10.0
+"""For computations to end before a fork; one that is forked all the same may wait for a lock for ever."""
+
+
+class _Forks:
+    """A fork copies the locks of the libraries that compute as they are, and nobody in it opens one that another thread
+    held. So a process that forks waits until no touch is read or encoded, and until threads that did so are gone: one
+    that Python has joined still gives back its memory for a while, under an allocator's lock."""
+
+    def __init__(self) -> None:
+        self._idle, self._computing, self._threads = threading.Condition(), 0, set[int]()
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Around what a fork must not come between."""
+        with self._idle:
+            self._computing += 1
+            self._threads.add(threading.get_native_id())
+        try:
+            yield
+        finally:
+            with self._idle:
+                self._computing -= 1
+                self._idle.notify_all()
+
+    def before(self) -> None:
+        """Wait, and keep others from beginning until the fork is made."""
+        self._idle.acquire()
+        deadline = time.monotonic() + LONGEST_WAIT_S
+        self._idle.wait_for(lambda: self._computing == 0, LONGEST_WAIT_S)
+        alive = {thread.native_id for thread in threading.enumerate()}
+        for ended in self._threads - alive:
+            while os.path.exists(f"/proc/self/task/{ended}") and time.monotonic() < deadline:
+                time.sleep(1e-3)
+        self._threads &= alive
+
+    def after_in_parent(self) -> None:
+        """Others go on."""
+        self._idle.release()
+
+    def after_in_child(self) -> None:
+        """Nothing is computed here yet."""
+        self._idle, self._computing, self._threads = threading.Condition(), 0, set()
+
+
+_forks = _Forks()
+os.register_at_fork(before=_forks.before, after_in_parent=_forks.after_in_parent, after_in_child=_forks.after_in_child)
+
+
 class TouchReader:
     """Reads and encodes the touches of a model."""
 
@@ -231,7 +281,7 @@ class TouchReader:
             with clock("decode"):
                 views = self._views(grasps[start : start + BATCH], references)
                 levels += [[level for _, level in grasp] for grasp in views]
-            with clock("encode"):
+            with clock("encode"), _forks.computing():
                 parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
         halves, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
         readings = [part.readings for part in parts if part.readings is not None]
@@ -258,9 +308,10 @@ class TouchReader:
                     given.image.load()
 
         def view(given: GivenImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
-            image = given.read()
-            level = 0.0 if reference is None else contact_level(image, reference)
-            return self._preprocessing.touch(image, reference if subtracts else None), level
+            with _forks.computing():
+                image = given.read()
+                level = 0.0 if reference is None else contact_level(image, reference)
+                return self._preprocessing.touch(image, reference if subtracts else None), level
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
