@@ -55,7 +55,7 @@ def of_program(name, *pages):
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
     """Everything that the commands name: catalog/, gel images, recording/, billets/, model.safetensors, rig.toml,
-    mobilenet_v2.pth."""
+    mobilenet_v2.pth, tests/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copy(model, tmp_path / "model.safetensors")
@@ -68,6 +68,8 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    (tmp_path / "tests").mkdir()
+    shutil.copy(ROOT / "tests" / "shipped_rig.toml", tmp_path / "tests")
     (tmp_path / "points.csv").write_text(POINTS)
     torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
     monkeypatch.chdir(tmp_path)
