@@ -18,7 +18,8 @@ from tests.fake_video import own_threads
 from tests.waiting import until
 
 
-@pytest.mark.parametrize("port", ["tcp", pytest.param("pty", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("port", ["tcp", "pty"])
 def test_a_collection_among_faults_holds_whole_grasps_and_never_leaves_the_jaws_closing(tmp_path, port):
     found = collect_among_faults(tmp_path / "r", 10, rate=0.05, seed=2, port=port)
     assert found.grasps == 10
