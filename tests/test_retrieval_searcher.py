@@ -268,15 +268,15 @@ def test_a_process_forks_when_no_touch_is_being_read_and_threads_that_did_are_go
 
 @forking
 def test_a_fork_waits_for_the_query_under_way(searcher, touch, monkeypatch):
-    begun, order, encode = threading.Event(), [], type(searcher.encoder).encode
+    begun, order, encode = threading.Event(), [], searcher.encoder.encode
 
-    def slow(self, views):
+    def slow(views):
         begun.set()
         time.sleep(0.3)
         order.append("encoded")
-        return encode(self, views)
+        return encode(views)
 
-    monkeypatch.setattr(type(searcher.encoder), "encode", slow)
+    monkeypatch.setattr(searcher.encoder, "encode", slow)
     with ThreadPoolExecutor(1) as threads:
         answer = threads.submit(searcher.query, touch)
         assert begun.wait(60)
