@@ -11,21 +11,28 @@ from indexes.store.regular import read_json, read_regular
 from retrieval.errors import DatasetError
 
 KINDS = ("photo", "touch")
+FAMILIES = ("relief", "shape")
+SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
 
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """A photo, or one finger's gel image with the untouched gel, and the relief of what it shows or feels.
+    """A photo, or one finger's gel image with the untouched gel, and what the object that it shows or feels is.
 
-    pitch_mm, amplitude_mm: of the pattern; the amplitude of a smooth object is 0.
+    families: its kind of `FAMILIES`, in their order. sizes: of its relief, `SIZES` in their order; the amplitude of a
+    smooth object is 0.
     """
 
     file: Path
     before: Path | None
     object_id: str
-    relief: str
-    pitch_mm: float
-    amplitude_mm: float
+    families: tuple[str, ...]
+    sizes: tuple[float, ...]
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether it wears no relief; its pitch, aspect and sharpness then mean nothing."""
+        return self.sizes[SIZES.index("amplitude_mm")] == 0
 
 
 def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
@@ -47,13 +54,16 @@ def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
 def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
     try:
         row: dict[str, Any] = json.loads(line)
-        pitch, amplitude = float(row["pitch_mm"]), float(row["amplitude_mm"])
+        sizes = tuple(float(row[name]) for name in SIZES)
         before = folder / row["before_file_name"] if "before_file_name" in row else None
-        found = LabelledPicture(
-            folder / row["file_name"], before, str(row["object_id"]), str(row["relief"]), pitch, amplitude
-        )
+        families = tuple(str(row[name]) for name in FAMILIES)
+        found = LabelledPicture(folder / row["file_name"], before, str(row["object_id"]), families, sizes)
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(f"{folder}/metadata.jsonl, line {number}, is no labelled picture: {error!r}") from error
-    if not (0 < pitch < math.inf and 0 <= amplitude < math.inf):
-        raise DatasetError(f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm")
+    pitch, amplitude, aspect, sharpness = sizes
+    if not (0 < pitch < math.inf and 0 <= amplitude < math.inf and 1 <= aspect < math.inf and 0 <= sharpness <= 1):
+        raise DatasetError(
+            f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm, aspect from 1, "
+            f"sharpness within 0..1; got {sizes}"
+        )
     return found

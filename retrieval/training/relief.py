@@ -1,12 +1,13 @@
 """Teaching one tower what relief looks like, from labelled pictures alone: no touch needs its photo.
 
 A photographed object costs a tenth of a felt one, and what a matcher lacks on the photo's side is objects. The tower
-learns which family of relief an object wears, its pitch and its amplitude; its weights then begin a matcher's
-(`init_photo`, `init_touch`), whose head is trained on felt objects as before.
+learns which relief and shape an object has, how wide, high, drawn out and sharp its relief is; its weights then begin a
+matcher's (`init_photo`, `init_touch`), whose head is trained on felt objects as before.
 """
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from torch.nn import functional
 from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
 from retrieval.data.images import to_float
-from retrieval.data.labelled import LabelledPicture, load_labelled
+from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, load_labelled
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.model.checkpoint import beside, read_tensors, require_writable, write_tensors
@@ -45,24 +46,27 @@ LEAST_MM = 0.05
 
 @dataclass(frozen=True)
 class ReliefReport:
-    """How well the relief of objects that were held out is told: the share of families, chance beside it, and the
-    correlation of the logarithms of pitch and amplitude."""
+    """How well objects that were held out are told.
+
+    families: of `FAMILIES`, the share named right and what chance would name. sizes: of `SIZES`, the correlation of the
+    reading with the truth (of pitch, amplitude and aspect their logarithms).
+    """
 
     kind: str
     pictures: int
     objects: int
     steps: int
-    families: float
-    chance: float
-    pitch: float
-    amplitude: float
+    families: dict[str, tuple[float, float]]
+    sizes: dict[str, float]
 
     def lines(self) -> list[str]:
         """For people."""
         return [
             f"{self.kind}: {self.steps} steps on {self.pictures} pictures of {self.objects} objects",
-            f"objects held out: family of relief {self.families:.3f} (chance {self.chance:.3f}), pitch r = "
-            f"{self.pitch:.2f}, amplitude r = {self.amplitude:.2f}",
+            "objects held out: "
+            + ", ".join(f"{name} {share:.3f} (chance {chance:.3f})" for name, (share, chance) in self.families.items()),
+            "correlations: "
+            + ", ".join(f"{name.removesuffix('_mm')} {value:.2f}" for name, value in self.sizes.items()),
         ]
 
 
@@ -107,16 +111,16 @@ class ReliefTraining:
         chosen = set(np.random.default_rng([seed, 1]).permutation(objects)[:held_out].tolist())
         self.pictures = [picture for picture in pictures if picture.object_id not in chosen]
         self.validation = [picture for picture in pictures if picture.object_id in chosen]
-        self.families = sorted({picture.relief for picture in self.pictures})
-        if len(self.families) < 2:
-            raise DatasetError(f"relief can be learned from two families and more; got {', '.join(self.families)}")
-        sizes = np.array([_sizes(picture) for picture in self.pictures if picture.amplitude_mm > 0])
+        self.families = [sorted({each.families[place] for each in self.pictures}) for place in range(len(FAMILIES))]
+        if len(self.families[0]) < 2:
+            raise DatasetError(f"relief can be learned from two families and more; got {', '.join(self.families[0])}")
+        sizes = np.array([_sizes(each) for each in self.pictures if not each.is_smooth])
         self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
         torch.manual_seed(seed)
         self.tower = build_tower(config.matcher.tower, config.matcher.tower_output)
         initialise_tower(self.tower, config.matcher.tower, config.training.init)
         features = self.tower.feature_count
-        last = nn.Linear(features, len(self.families) + 2)
+        last = nn.Linear(features, sum(map(len, self.families)) + len(SIZES))
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.BatchNorm1d(features, affine=False), nn.Dropout(DROPOUT), last)
@@ -176,19 +180,20 @@ class ReliefTraining:
                 module.eval()  # the published statistics hold; a batch of 32 is too few for new ones
         self.head.train()
         torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
-        readings = self._readings(images)
-        family = torch.tensor([self.families.index(each.relief) for each in pictures], device=self.device)
-        worn = torch.tensor([each.amplitude_mm > 0 for each in pictures], device=self.device)
-        error = (readings[:, -2:] - self._wanted(pictures)).square().mean(1)
-        loss = functional.cross_entropy(readings[:, :-2], family, label_smoothing=SMOOTHING)
-        return loss + (error * worn).mean()
+        *families, sizes = self._readings(images)
+        worn = torch.tensor([not each.is_smooth for each in pictures], device=self.device)
+        loss = ((sizes - self._wanted(pictures)).square().mean(1) * worn).mean()
+        for place, (names, readings) in enumerate(zip(self.families, families, strict=True)):
+            named = torch.tensor([names.index(each.families[place]) for each in pictures], device=self.device)
+            loss = loss + functional.cross_entropy(readings, named, label_smoothing=SMOOTHING)
+        return loss
 
-    def _readings(self, images: Tensor) -> Tensor:
-        """(B, families + 2): logits of the families, then the standardised logarithms of pitch and amplitude."""
+    def _readings(self, images: Tensor) -> tuple[Tensor, ...]:
+        """Of images (B, 3, H, W): logits (B, kinds) for each of FAMILIES, then standardised SIZES (B, sizes)."""
         with autocast(self.device, self.config.training.precision):
             features = self.tower(images.to(self.device, memory_format=torch.channels_last))
         readings: Tensor = self.head(features.float())
-        return readings
+        return torch.split(readings, [*map(len, self.families), len(SIZES)], dim=1)
 
     def _wanted(self, pictures: Sequence[LabelledPicture]) -> Tensor:
         sizes = (np.array([_sizes(each) for each in pictures]) - self.mean) / self.deviation
@@ -200,22 +205,23 @@ class ReliefTraining:
         self.tower.eval()
         self.head.eval()
         parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
-        readings = torch.cat([self._readings(centred(self._images(part), self.kind)) for part in parts]).cpu().numpy()
-        named = np.array(self.families)[readings[:, :-2].argmax(1)]
-        families = np.array([each.relief for each in self.validation])
-        worn = np.array([each.amplitude_mm > 0 for each in self.validation])
+        read = [self._readings(centred(self._images(part), self.kind)) for part in parts]
+        *families, sizes = (torch.cat(part).cpu().numpy() for part in zip(*read, strict=True))
+        told = {}
+        for place, (name, known, readings) in enumerate(zip(FAMILIES, self.families, families, strict=True)):
+            named = np.array(known)[readings.argmax(1)]
+            right = named == np.array([each.families[place] for each in self.validation])
+            told[name] = float(right.mean()), 1 / len(known)
+        worn = np.array([not each.is_smooth for each in self.validation])
         wanted = self._wanted(self.validation).cpu().numpy()
-        pitch, amplitude = (_correlation(readings[worn, -2 + place], wanted[worn, place]) for place in (0, 1))
         everything = [*self.pictures, *self.validation]
         return ReliefReport(
             kind=self.kind,
             pictures=len(everything),
             objects=len({each.object_id for each in everything}),
             steps=self.step,
-            families=float((named == families).mean()),
-            chance=1 / len(self.families),
-            pitch=pitch,
-            amplitude=amplitude,
+            families=told,
+            sizes={name: _correlation(sizes[worn, at], wanted[worn, at]) for at, name in enumerate(SIZES)},
         )
 
     def _identity(self) -> dict[str, Any]:
@@ -295,8 +301,10 @@ def _sampled(images: Tensor, maps: Tensor, shown: float) -> Tensor:
     return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
 
 
-def _sizes(picture: LabelledPicture) -> tuple[float, float]:
-    return float(np.log(picture.pitch_mm)), float(np.log(max(picture.amplitude_mm, LEAST_MM)))
+def _sizes(picture: LabelledPicture) -> tuple[float, ...]:
+    """As they are learnt: what is a ratio of scales by its logarithm."""
+    pitch, amplitude, aspect, sharpness = picture.sizes
+    return math.log(pitch), math.log(max(amplitude, LEAST_MM)), math.log(aspect), sharpness
 
 
 def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
