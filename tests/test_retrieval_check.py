@@ -258,10 +258,11 @@ def test_a_sequence_cut_in_two_is_an_error(broken):
     take = {split.train[0], split.test[0]}
     numbers = [number for number, row in enumerate(broken.rows) if row["object_id"] in take]
     broken.change(numbers, lambda row: row.update(sequence_id="one take"))
-    severity, kind, message = one(broken.findings(split))
-    assert (severity, kind) == ("error", "split-sequences")
-    assert message.startswith("the split cuts 1 sequence(s) in two")
-    assert message.endswith(": one take")
+    cut, share = broken.findings(split)
+    assert (cut.severity, cut.kind) == ("error", "split-sequences")
+    assert cut.message.startswith("the split cuts 1 sequence(s) in two")
+    assert cut.message.endswith(": one take")
+    assert (share.severity, share.kind) == ("error", "sequences-in-training")
     assert broken.findings(good_split(broken.folder)) == []
 
 

@@ -46,7 +46,9 @@ def swapped(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     look = np.median(touches, axis=0)
     closer = distance(photos, look) < distance(touches, look) / 2
     names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
-    yield from named("error", "swapped", "touch and photo look swapped", names, grasps)
+    whole = {one.sequence_id for one in grasps} - {one.sequence_id for one in grasps if one.grasp_id not in set(names)}
+    where = f", throughout the sequence(s) {some(sorted(filter(None, whole)))}," if whole - {None} else ""
+    yield from named("error", "swapped", f"touch and photo look swapped{where}", names, grasps)
 
 
 def fingers(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
@@ -107,14 +109,16 @@ def light(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
         )
         return
     has_before = all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps)
+    # A frame that serves many grasps says once what the light was like.
+    has_before = has_before and len({seen[one.backgrounds[0]].digest for one in grasps}) > len(grasps) / 2
     fingers = range(min(len(grasp.touches) for grasp in grasps))
     for moment, allowed in (("before", _BY_LIGHT), ("touch", _BY_TOUCH)):
         if moment == "before" and not has_before:
             yield Finding(
                 "note",
                 "unchecked-light",
-                "without a frame of the untouched gel in every grasp, light that names the object is found only where "
-                "it is strong",
+                "without a frame of the untouched gel of its own for every grasp, light that names the object is found "
+                "only where it is strong",
             )
             continue
         frames = [_small(seen, [_of(grasp, moment)[finger] for grasp in grasps]) for finger in fingers]

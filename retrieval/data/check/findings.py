@@ -25,10 +25,11 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What is kept of one picture, or why it cannot be read: the digest of its bytes, a small picture (6, 8, 3), of
-    photos a larger one too, and of accepted photos and touches what copies are found by."""
+    """What is kept of one picture, or why it cannot be read: the digest of its bytes, whether it is of one colour, a
+    small picture (6, 8, 3), of photos a larger one too, and of accepted photos and touches what copies are found by."""
 
     digest: str = ""
+    flat: bool = False
     small: NDArray[np.float32] | None = None
     photo: NDArray[np.float32] | None = None
     thumbnail: Thumbnail | None = None

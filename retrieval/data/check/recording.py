@@ -10,9 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
+
 from retrieval.console.output import some
 from retrieval.console.progress import Bar
-from retrieval.data.check import doubts
+from retrieval.data.check import doubts, published
 from retrieval.data.check.copies import thumbnail
 from retrieval.data.check.findings import Files, Finding, Seen, named
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all, require_accepted
@@ -21,6 +23,8 @@ from retrieval.data.resize import resize
 from retrieval.errors import DatasetError, ImageError
 
 _SMALL, _PHOTO = (6, 8), (64, 64)
+_FLAT = 3.5 / 255
+"""What JPEG makes of one colour stays within it."""
 
 _Check = Callable[[Sequence[Grasp], Files], Iterable[Finding]]
 
@@ -50,13 +54,19 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += _duplicates(folder, grasps, seen)
     whole = [one.grasp for one in attempts if all(not seen[path].broken for path in _pictures(one))]
     trained_on = {grasp.grasp_id for grasp in accepted}
-    of_all: tuple[_Check, ...] = (_same_images, doubts.swapped, doubts.fingers, doubts.moments)
-    of_accepted: tuple[_Check, ...] = (doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies)
+    of_all: tuple[_Check, ...] = (_same_images, published.dead, doubts.swapped, doubts.fingers, doubts.moments)
+    of_accepted: tuple[_Check, ...] = (
+        *(published.one_background, published.repeated),
+        *(doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies),
+    )
     for check in of_all + of_accepted:
         known = {name for finding in findings for name in finding.grasps}
         left = [grasp for grasp in whole if grasp.grasp_id not in known]
         findings += check([one for one in left if check in of_all or one.grasp_id in trained_on], seen)
-    findings += check_split(accepted, split) if split else []
+    if split:
+        findings += check_split(accepted, split)
+        looked_at = [grasp for grasp in whole if grasp.grasp_id in trained_on]
+        findings += published.sequences_in_training(looked_at, split, seen)
     return sorted(findings, key=lambda finding: finding.severity == "note")
 
 
@@ -118,6 +128,7 @@ def _look_at_all(attempts: Sequence[Attempt]) -> Files:
             return Seen(broken=error.reason)
         return Seen(
             sha256(data).hexdigest(),
+            bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT),
             resize(image, _SMALL),
             resize(image, _PHOTO) if path in photos else None,
             thumbnail(data, image) if path in copied else None,
