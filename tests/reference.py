@@ -1,5 +1,5 @@
-"""docs/reference.md, from the docstrings of the public names, and docs/commands.md, from the commands' help:
-`python -m tests.reference` writes them anew."""
+"""docs/reference.md, from the docstrings of the public names, docs/commands.md, from the commands' help, and
+docs/datasets.md, from the importers: `python -m tests.reference` writes them anew."""
 
 import argparse
 import ast
@@ -19,10 +19,12 @@ import indexes
 import retrieval
 import robot
 from retrieval.commands.main import app
+from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, title_of
 
 PACKAGES = (retrieval, robot, indexes)
 PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
 COMMANDS = PAGE.with_name("commands.md")
+DATA_SETS = PAGE.with_name("datasets.md")
 MADE_BY_HAND = (robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
 """Classes that a user makes an object of; all others come out of a function."""
 HEAD = """# Reference
@@ -39,6 +41,29 @@ COMMANDS_HEAD = """# Commands
 Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input; `query` adds 3 to 5 for its
 [verdicts](answers.md). With `--json`, stdout holds one JSON document, and everything else goes to stderr. `python -m
 tests.reference` writes this page from each command's `--help`.
+"""
+
+
+DATA_SETS_HEAD = """# Data sets
+
+```sh
+retrieve import                                             # what can be imported, and the options of each
+retrieve import billets billets/ --out billets-recording/
+retrieve check billets-recording/
+```
+
+An importer reads a public data set as it is published, or pictures of your own, and writes a
+[recording](formats.md#recording), to train, evaluate and search with. It takes one grasp at a time, so memory does not
+grow with the pictures; run again it goes on where it stopped. What cannot be read is skipped, counted by reason and
+told; `recording.json` keeps the counts under `skipped`, licence and citation, and under `objects` what the data set
+says of them. Pictures that many grasps share, such as one no-contact frame, are kept once. A published split that parts
+objects stands in `splits/<name>.json`, for `--split`. Some importers need packages of the extra:
+`pip install 'touch-retrieval[importers]'`.
+
+The data sets are not ours: the licence is what their own pages say, and what you do with them is between you and them.
+Where parts of a layout are not verified, the importer was written from the authors' descriptions and from other
+people's readers, and says which parts when it is done.
+
 """
 
 
@@ -132,11 +157,35 @@ def _help(title: str, command: Any) -> Iterator[str]:
         yield from _help(f"{title} {name}", below)
 
 
+def data_sets() -> str:
+    """The whole page of the importers. `python -m tests.reference` writes it."""
+    columns = ("name", "it must hold", "sensor", "fingers", "no-contact frame", "licence", "layout")
+    rows = [columns, ("---",) * len(columns)]
+    for name in sorted(IMPORTERS):
+        facts = data_set_of(name)
+        verified = "parts are not verified" if facts.unverified else "verified on the data"
+        frame = facts.background if facts.background != "none" else ""
+        fingers = str(facts.fingers or "any")
+        rows.append((f"[`{name}`](#{name})", facts.expects, facts.sensor, fingers, frame, facts.licence, verified))
+    table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    return DATA_SETS_HEAD + table + "".join(map(_data_set, sorted(IMPORTERS)))
+
+
+def _data_set(name: str) -> str:
+    facts, options = data_set_of(name), options_of(load_importer(name))
+    below = inspect.cleandoc(sys.modules[load_importer(name).__module__].__doc__ or "").partition("\n")[2]
+    parts = [f"\n## {name}\n", f"{title_of(name)}. {facts.citation}.\n", below.strip("\n") + "\n"]
+    if options:
+        parts.append(f"Options: {', '.join(f'`{option}={default}`' for option, (_, default) in options.items())}.\n")
+    parts += [f"* {note[0].upper()}{note[1:].rstrip('.')}." for note in facts.notes()]
+    return "\n".join(parts).rstrip() + "\n"
+
+
 def main(arguments: list[str]) -> None:
     """Write the pages."""
     argparse.ArgumentParser(prog="python -m tests.reference", description=__doc__).parse_args(arguments)
     PAGE.parent.mkdir(exist_ok=True)
-    for page, text in ((PAGE, reference()), (COMMANDS, commands())):
+    for page, text in ((PAGE, reference()), (COMMANDS, commands()), (DATA_SETS, data_sets())):
         page.write_text(text, "utf-8")
         print(page)
 

@@ -1,24 +1,70 @@
-"""`retrieve import`: a public data set becomes a recording."""
+"""`retrieve import`: a public data set, or pictures of one's own, become a recording."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from retrieval.console.output import say
+from retrieval.commands.options import Values
+from retrieval.console.output import say, show
+from retrieval.console.progress import Bar
+from retrieval.errors import BadInput
 
 
 def import_(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="which data set; an unknown name lists the known ones")],
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="folder with the data set's own files")],
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", help="which data set; without it they are listed", show_default=False),
+    ] = None,
+    source: Annotated[
+        Path | None, typer.Argument(metavar="SRC", help="folder with the data set's own files", show_default=False)
+    ] = None,
     *,
-    out: Annotated[Path, typer.Option(help="recording folder to write")],
+    out: Annotated[Path | None, typer.Option(help="recording folder to write, or to go on with")] = None,
+    option: Annotated[
+        Values | None,
+        typer.Option(parser=Values.read, metavar="NAME=VALUE...", help="options of the data set, as the list has them"),
+    ] = None,
 ) -> None:
-    """Turn a public data set into a recording."""
-    from robot.importers import load_importer
+    """Turn a public data set, or pictures of your own, into a recording."""
+    from robot.importers import IMPORTERS, load_importer, read_options
 
-    recording = load_importer(name)(source, out)
+    if name is None:
+        for line in _list():
+            show(line)
+        return
+    if name not in IMPORTERS:
+        for line in _list():
+            say(line)
+    importer = load_importer(name)
+    options = read_options(importer, option or ())
+    if source is None or out is None:
+        raise BadInput(
+            f"an import needs a folder to read and one to write: retrieve import {name} SRC --out recording/"
+        )
+    bars: list[Bar] = []
+    with ExitStack() as shown:
+
+        def progress(done: int, total: int) -> None:
+            if not bars:
+                bars.append(shown.enter_context(Bar("import", total, "grasps")))
+            bars[0].advance(done - bars[0].done)
+
+        recording = importer(source, out, progress, **options)
     for note in recording.notes:
         say(note)
     objects = len({grasp.object_id for grasp in recording.grasps})
     say(f"{out}: {len(recording.grasps)} grasps of {objects} objects")
+
+
+def _list() -> list[str]:
+    """A line for each data set, with what can be said of it."""
+    from robot.importers import IMPORTERS, load_importer, options_of, title_of
+
+    lines = []
+    width = max(map(len, IMPORTERS)) + 2
+    for name in sorted(IMPORTERS):
+        options = [f"{option}={default}" for option, (_, default) in options_of(load_importer(name)).items()]
+        lines.append(f"{name:{width}}{title_of(name)}" + (f"; --option {' '.join(options)}" if options else ""))
+    return lines

@@ -1,25 +1,33 @@
 """Importers: each turns one public data set into a recording, and is loaded when it is asked for."""
 
-from collections.abc import Callable
+import inspect
+import sys
+import typing
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
-from robot.errors import UnknownName
+from robot.errors import ImporterError, UnknownName
+from robot.importers.base import DataSet, Progress
 from robot.recording.folder import Recording
-
-Progress = Callable[[int, int], None]
-"""Called with (done, total) after each grasp."""
 
 
 class Importer(Protocol):
-    """Reads the data set's own files below `src`, writes or continues the recording `out`."""
+    """Reads the data set's own files below `src`, writes or continues the recording `out`.
 
-    def __call__(self, src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    Its keyword-only parameters after these, each with a default, are its options (`options_of`). Its module's docstring
+    begins with a line on the data set, and holds `DATA_SET`, its facts.
+    """
+
+    def __call__(self, src: Path, out: Path, progress: Progress | None = None, **options: Any) -> Recording:
         """Raises ImporterError where `src` is not this data set, RecordingError, StorageError."""
 
 
-IMPORTERS = {"billets": "robot.importers.billets:import_billets"}
+IMPORTERS = {
+    "billets": "robot.importers.billets:import_billets",
+    "vt60": "robot.importers.vt60:import_vt60",
+}
 
 
 def load_importer(name: str) -> Importer:
@@ -32,3 +40,52 @@ def load_importer(name: str) -> Importer:
         raise UnknownName(f"no importer is called {name!r}; known: {', '.join(sorted(IMPORTERS))}")
     module, function = IMPORTERS[name].split(":")
     return cast(Importer, getattr(import_module(module), function))
+
+
+def title_of(name: str) -> str:
+    """A line on the data set that the importer called `name` reads. Raises UnknownName."""
+    module = sys.modules[load_importer(name).__module__]
+    return (module.__doc__ or "").strip().split("\n")[0].rstrip(".")
+
+
+def data_set_of(name: str) -> DataSet:
+    """The facts of the data set that the importer called `name` reads. Raises UnknownName."""
+    return cast(DataSet, sys.modules[load_importer(name).__module__].DATA_SET)
+
+
+# Options ---------------------------------------------------------------------------------------------------
+
+_Value = str | int | float | bool
+_READERS: Mapping[Any, Callable[[str], _Value]] = {
+    str: str,
+    int: int,
+    float: float,
+    bool: {"true": True, "false": False}.__getitem__,
+}
+
+
+def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
+    """The options of an importer: name -> (str, int, float or bool; the default)."""
+    hints = typing.get_type_hints(importer)
+    return {
+        name: (hints[name], parameter.default)
+        for name, parameter in inspect.signature(importer).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    }
+
+
+def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
+    """Options as a command line gives them, "name=value" each. Raises ImporterError."""
+    known = options_of(importer)
+    found: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name not in known or not equals:
+            names = ", ".join(f"{each}=..." for each in known)
+            raise ImporterError(f"options are name=value, got {word!r}; this importer takes {names or 'none'}")
+        kind = known[name][0]
+        try:
+            found[name] = _READERS[kind](value)
+        except (KeyError, ValueError) as error:
+            raise ImporterError(f"the option {name} must be of the kind {kind.__name__}, got {value!r}") from error
+    return found

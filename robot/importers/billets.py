@@ -1,87 +1,55 @@
 """Steel billets: GelSight Mini touches and phone photos of the same places.
 
-Source: github.com/rumilog/gelsight-contrastive-learning, GPL-3.0.
+Of every place there is one touch and one photo:
 
     <billet>/<place>_touch.png     one finger
     <billet>/<place>_photo.jpg
 
-A place is an object (it is what a photo can name) with one grasp; its billet is the sequence, for the places
-of a billet were captured in one go. Files are copied byte for byte.
+A place is an object (it is what a photo can name) with one grasp; its billet is the sequence, for the places of a
+billet were captured in one go.
 """
 
 import re
 from collections import defaultdict
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
-from robot.errors import ImporterError, RecordingError
-from robot.importers import Progress
-from robot.recording.folder import Recording, RecordingWriter, read_recording
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Item, Progress, Skip, import_items
+from robot.recording.folder import Recording
 
-_FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
-_TRAP = (
-    "Light and gel drift from billet to billet: on the ground billets an 8 x 6 thumbnail of a blurred touch "
-    "names the billet far above chance. That is the capture leaking, not touch: print that control beside "
-    "every result, split by sequence_id, prefer the welded billets, give exact intervals: 9 billets are few."
+DATA_SET = DataSet(
+    source="github.com/rumilog/gelsight-contrastive-learning",
+    licence="GPL-3.0, with its source; the images are not ours to give on under another licence",
+    citation="github.com/rumilog/gelsight-contrastive-learning, no paper",
+    sensor="GelSight Mini",
+    rig="by hand, phone camera",
+    expects="pairs `<billet>/<place>_touch.png`, `<billet>/<place>_photo.jpg`",
+    traps=(
+        "Light and gel drift from billet to billet: on the ground billets an 8 x 6 thumbnail of a blurred touch "
+        "names the billet far above chance. That is the capture leaking, not touch: print that control beside "
+        "every result, split by sequence_id, prefer the welded billets, give exact intervals: 9 billets are few.",
+    ),
 )
-_INFO = {
-    "source": "github.com/rumilog/gelsight-contrastive-learning",
-    "licence": "GPL-3.0, with its source; the images are not ours to give on under another licence",
-    "sensor": "GelSight Mini",
-    "rig": "by hand, phone camera",
-    "seed": None,
-    "background": "none",
-}
-
-
-def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the billets below `src` into the recording `out`; continue it where it stopped.
-
-    Places without both files, or with a damaged name or file, are skipped and told in the recording's notes.
-    Raises ImporterError for a source without any pair, RecordingError, StorageError.
-    """
-    places, skipped = _find_places(Path(src))
-    with RecordingWriter(out, {**_INFO, "notes": [_TRAP, *skipped]}) as writer:
-        for done, (name, files) in enumerate(sorted(places.items()), start=1):
-            if name not in writer.grasp_ids:
-                skipped += _append(writer, name, files)
-            if progress is not None:
-                progress(done, len(places))
-    recording = read_recording(out)
-    return replace(recording, notes=(*recording.notes, *skipped, _TRAP))
-
-
+_FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
 _Files = dict[str, Path]  # "photo" and "touch" of one place
 
 
-def _append(writer: RecordingWriter, name: str, files: _Files) -> list[str]:
-    """Append one place; return why it was skipped, if it was."""
-    images = {"photo": files["photo"], "touch_a": files["touch"]}
-    try:
-        writer.append(name, name, images, sequence_id=files["touch"].parent.name)
-    except RecordingError as error:
-        return [f"skipped {name}: {error}"]
-    return []
+def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    """Import the billets below `src`. Raises ImporterError for a source without any pair."""
+    found = _find_files(Path(src))
+    if not any(len(files) == 2 for files in found.values()):
+        raise DATA_SET.refusal(src, "it holds no pair")
+    return import_items(DATA_SET, _places(found), out, total=len(found), progress=progress)
 
 
-def _find_places(src: Path) -> tuple[dict[str, _Files], list[str]]:
-    """Return ("<billet>-<place>" -> files, what is skipped and why). Raises ImporterError."""
-    places: dict[str, _Files] = {}
-    skipped = []
-    for (billet, place), files in _find_files(src).items():
+def _places(found: dict[tuple[str, str], _Files]) -> Iterator[Item | Skip]:
+    for (billet, place), files in sorted(found.items()):
         name = f"{billet}-{place}"
         if len(files) < 2:
-            file = next(iter(files.values()))
-            skipped.append(f"skipped {billet}/{file.name}: its photo or touch is missing")
-        elif name in places:
-            skipped.append(f"skipped {billet}/{place}: another place is called {name} already")
+            yield Skip("its photo or touch is missing", f"{billet}/{next(iter(files.values())).name}")
         else:
-            places[name] = files
-    if not places:
-        raise ImporterError(
-            f"{src} must hold pairs <billet>/<place>_touch.png, <billet>/<place>_photo.jpg, and holds none"
-        )
-    return places, skipped
+            yield Item(name, name, {"photo": files["photo"], "touch_a": files["touch"]}, {"sequence_id": billet})
 
 
 def _find_files(src: Path) -> dict[tuple[str, str], _Files]:

@@ -4,7 +4,7 @@
                       pair that served: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and what else
                       the writer wants to say
     metadata.jsonl    one JSON object a line for each grasp
-    images/           PNG or JPEG files
+    images/           PNG or JPEG files; one may belong to several grasps
     attempts.jsonl    where a rig collected it: every attempt, those without a grasp included
     (robot.recording.attempt_log)
 
@@ -56,7 +56,16 @@ UNITS = {
     "depth": "millimetre, uint16, 0 where unknown",
 }
 _MUST_AGREE = ("source", "sensor", "units", "background")
-_GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+@dataclass(frozen=True)
+class Shared:
+    """An image of several grasps, such as one no-contact frame for all: kept once. `name`, a grasp_id in form, tells it
+    from the other shared ones of the recording; of the same name the first is kept."""
+
+    name: str
+    source: ImageSource
 
 
 @dataclass(frozen=True)
@@ -186,7 +195,7 @@ class RecordingWriter:
     def _start(self, wanted: dict[str, Any]) -> None:
         """Create recording.json unless it is there, and cut metadata.jsonl after its last whole line."""
         if not (self.folder / INFO_FILE).exists():
-            write_file(self.folder / INFO_FILE, json.dumps(wanted, indent=2).encode() + b"\n")
+            write_file(self.folder / INFO_FILE, _text_of(wanted))
             sync_folder(self.folder)
         recording = read_recording(self.folder)
         self.info = recording.info
@@ -194,6 +203,7 @@ class RecordingWriter:
             if (old := self.info.get(key)) != (new := wanted.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
         self._grasp_ids = {grasp.grasp_id: None for grasp in recording.grasps}
+        self._shared: dict[str, str] = {}
         data = self._file.read()
         lines, torn = _whole_lines(data)
         self._end = len(data) - len(torn)
@@ -207,35 +217,67 @@ class RecordingWriter:
         """The grasps that the recording holds so far, in order."""
         return self._grasp_ids.keys()
 
-    def append(self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource], **fields: Any) -> RecordedGrasp:
+    def append(
+        self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource | Shared], **fields: Any
+    ) -> RecordedGrasp:
         """Add one grasp: first its images, then its line; when it returns, both are on the disk.
 
-        `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to ImageSource.
+        `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to an image.
         `fields`: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
         Raises RecordingError, StorageError.
         """
         if self._file.closed:
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
-        if not isinstance(grasp_id, str) or not _GRASP_ID.fullmatch(grasp_id):
+        if not isinstance(grasp_id, str) or not GRASP_ID.fullmatch(grasp_id):
             raise RecordingError(f"grasp_id must be letters, digits and ._- (at most 128), got {grasp_id!r}")
         if grasp_id in self._grasp_ids:
             raise RecordingError(f"the recording has grasp {grasp_id} already; see grasp_ids")
-        contents = {column: file_content(column, source) for column, source in images.items()}
-        paths = {
-            f"{column}_file_name": f"{IMAGES_FOLDER}/{grasp_id}_{column}{suffix}"
-            for column, (_, suffix) in contents.items()
-        }
+        contents: dict[str, bytes] = {}
+        paths: dict[str, str] = {}
+        for column, source in images.items():
+            if isinstance(source, Shared) and self.has_shared(source.name):
+                paths[f"{column}_file_name"] = self._shared[source.name]
+                continue
+            data, suffix = file_content(column, source.source if isinstance(source, Shared) else source)
+            name = f"{source.name}_shared" if isinstance(source, Shared) else f"{grasp_id}_{column}"
+            paths[f"{column}_file_name"] = path = f"{IMAGES_FOLDER}/{name}{suffix}"
+            contents[path] = data
         row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
         if unknown := sorted(unknown_keys(row)):
             raise RecordingError(f"unknown key {unknown[0]!r}; see robot.recording.folder for the known ones")
         grasp = RecordedGrasp.from_row(row)
         with storage_errors(self.folder):
-            for column, (data, _) in contents.items():
-                write_file(self.folder / paths[f"{column}_file_name"], data)
+            for path, data in contents.items():
+                write_file(self.folder / path, data)
             sync_folder(self.folder / IMAGES_FOLDER)
             self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
         self._grasp_ids[grasp_id] = None
         return grasp
+
+    def has_shared(self, name: str) -> bool:
+        """Whether the recording holds the shared image of this name. Raises RecordingError for what is no name."""
+        if not GRASP_ID.fullmatch(name):
+            raise RecordingError(f"the name of a shared image must be letters, digits and ._-, got {name!r}")
+        if name not in self._shared:
+            for suffix in (".png", ".jpg"):
+                path = f"{IMAGES_FOLDER}/{name}_shared{suffix}"
+                if (self.folder / path).is_file():
+                    self._shared[name] = path
+        return name in self._shared
+
+    def tell(self, **info: Any) -> None:
+        """Say more in recording.json, or say it anew, but not what grasps are held to.
+
+        Raises RecordingError, StorageError.
+        """
+        if fixed := sorted({*_MUST_AGREE, "schema_version"} & set(info)):
+            raise RecordingError(f"{fixed[0]} of a recording stays as it is")
+        told = _full_info({**self.info, **info})
+        if told != self.info:
+            with storage_errors(self.folder):
+                write_file(self.folder / INFO_FILE, _text_of(told))
+                sync_folder(self.folder)
+            self.info = told
 
     def _write_line(self, line: bytes) -> None:
         """Write after the last whole line and sync; whatever fails, no half of it stays."""
@@ -271,6 +313,10 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
         raise RecordingError(f"{INFO_FILE} must hold plain JSON: {error}") from error
     _check_info(full)
     return full
+
+
+def _text_of(info: Mapping[str, Any]) -> bytes:
+    return json.dumps(info, indent=2).encode() + b"\n"
 
 
 def software_version() -> str:

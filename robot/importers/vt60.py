@@ -1,0 +1,124 @@
+"""VT60: grey touches of one optical finger and turntable photos of 60 everyday objects, ten classes.
+
+    touch/<NN_class>/<II>/touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg    about 125 an object, grey
+    touch/baselineForCalibration.jpg                                                       the untouched finger
+    vision/<NN_class>/<II>/IMG_inst_<II>_img_<k>_validframeID_<f>.jpg                      about 40 an object
+
+An object is `<NN_class>-<II>`; class, instance and nickname stand in recording.json under `objects`. Nobody took a
+photo at the moment of a touch: touch number i of an object, in order of k, is written with its photo number i modulo
+the number of its photos, so that all photos are used equally often. Any photo of the object would do as well.
+
+An object was touched in one sitting, which is its sequence; a bottle that is there twice, empty and full, has one
+sequence for both, so that no split of objects tears it apart.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from robot.importers.base import (
+    DataSet,
+    Images,
+    Item,
+    Progress,
+    Published,
+    Skip,
+    folders,
+    import_items,
+    name_of,
+    numbered,
+)
+from robot.recording.folder import Recording, Shared
+
+DATA_SET = DataSet(
+    source="github.com/Exhor/deep_visuotactile_classification",
+    licence="none stated; the images are not ours to give on",
+    citation="Corradi, Hall, Iravani, Object recognition combining vision and touch, Robotics and Biomimetics 4:2 "
+    "(2017), doi 10.1186/s40638-017-0058-2",
+    sensor="hemispherical optical finger (VT60)",
+    rig="robot arm, one finger; photos on a turntable, one table and one light for all",
+    expects="`touch/<NN_class>/<II>/`, `vision/<NN_class>/<II>/`, `touch/baselineForCalibration.jpg`",
+    background="one frame for all grasps",
+    traps=(
+        "08_bottlefull and 02_bottleempty are the same bottles, full and empty: no photo tells them apart. They share "
+        "a sequence_id, so that drawn splits keep them together; of a gallery leave one of the classes out.",
+        "Many touches are hardly pressed; their difference from the no-contact frame ranks them.",
+        "Objects were touched class by class, so that drift of the finger may name the class, and a touch blurred to "
+        "8 x 6 names much of what a whole one does: print that control beside every result.",
+    ),
+)
+_TOUCH = re.compile(r"touch_(\d+)_img_(\d+)_name_(?P<class>[^_]+)_(?P<nickname>.+)_at_.*\.jpe?g", re.IGNORECASE)
+_PHOTO = re.compile(r"IMG_inst_(\d+)_img_(\d+)_.*\.jpe?g", re.IGNORECASE)
+_CLASS = re.compile(r"\d+_(.+)")
+_TWICE = {"bottleempty": "bottle", "bottlefull": "bottle"}
+"""Classes of the same things."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    """The folders of one instance, and how many files of touches lie there."""
+
+    object_id: str
+    touch: Path
+    vision: Path
+    count: int
+    about: dict[str, Any]
+
+
+def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    """Import the objects below `src`. Raises ImporterError where it has no touch/ and vision/ with classes in them."""
+    src = Path(src)
+    for part in ("touch", "vision"):
+        if not (src / part).is_dir():
+            raise DATA_SET.refusal(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
+    objects = [each for each in map(_look, _instances(src)) if each.count]
+    if not objects:
+        raise DATA_SET.refusal(src, "it holds no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg")
+    untouched = src / "touch" / "baselineForCalibration.jpg"
+    background = {"touch_a_before": Shared("untouched", untouched)} if untouched.is_file() else {}
+    return import_items(
+        DATA_SET if background else replace(DATA_SET, background="none"),
+        _items(src, objects, background),
+        out,
+        total=sum(each.count for each in objects),
+        progress=progress,
+        published=Published({each.object_id: each.about for each in objects}),
+    )
+
+
+def _instances(src: Path) -> Iterator[Path]:
+    """The folders touch/<NN_class>/<II>."""
+    for kind in folders(src / "touch"):
+        if _CLASS.fullmatch(kind.name):
+            yield from folders(kind)
+
+
+def _look(folder: Path) -> _Object:
+    kind, instance = folder.parent.name, folder.name
+    found = numbered(folder, _TOUCH)
+    name = kind.partition("_")[2]
+    about = {"class": name, "instance": instance, "nickname": found[0][0]["nickname"] if found else None}
+    vision = folder.parents[2] / "vision" / kind / instance
+    return _Object(name_of(kind, instance), folder, vision, len(found), about)
+
+
+def _items(src: Path, objects: list[_Object], background: dict[str, Shared]) -> Iterator[Item | Skip]:
+    touched = {each.vision for each in objects}
+    for shown in (instance for kind in folders(src / "vision") for instance in folders(kind)):
+        if shown not in touched:
+            yield Skip("photos of an object that was not touched", f"{shown.parent.name}/{shown.name}")
+    for each in objects:
+        photos = [path for _, path in numbered(each.vision, _PHOTO)]
+        thing = _TWICE.get(each.about["class"])
+        sequence = f"{thing}-{each.about['nickname']}" if thing else each.object_id
+        for number, (match, touch) in enumerate(numbered(each.touch, _TOUCH)):
+            name = name_of(each.object_id, match[2])
+            if not photos:
+                yield Skip("its object has no photo", name)
+                continue
+            photo = photos[number % len(photos)]
+            shared = Shared(name_of(each.object_id, photo.stem), photo)
+            images: Images = {"photo": shared, "touch_a": touch, **background}
+            yield Item(name, each.object_id, images, {"sequence_id": sequence})

@@ -1,0 +1,29 @@
+"""Miniatures of public data sets, for their importers: the published layout with small drawn pictures.
+
+Each module has `write(folder)`, which lays the data set below a folder that it makes, and `GRASPS`, how many grasps can
+be had of it.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+
+def picture(path: Path, seed: int, size: tuple[int, int] = (12, 16), **changes: Any) -> Path:
+    """Write a drawn picture of (H, W), other for another seed; `grey`: one channel. Returns its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encoded(path.suffix, seed, size, **changes))
+    return path
+
+
+def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False) -> bytes:
+    """The content of such a file."""
+    return bytes(cv2.imencode(suffix, pixels(seed, size)[..., 0] if grey else pixels(seed, size))[1].tobytes())
+
+
+def pixels(seed: int, size: tuple[int, int] = (12, 16)) -> Any:
+    """(H, W, 3) uint8, smooth."""
+    small = np.random.default_rng(seed).integers(0, 256, (3, 4, 3), dtype=np.uint8)
+    return cv2.resize(small, size[::-1], interpolation=cv2.INTER_LINEAR)

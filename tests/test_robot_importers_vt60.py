@@ -1,0 +1,87 @@
+"""VT60: what is its own; what holds of every importer stands in test_robot_importers."""
+
+from collections import Counter
+
+import pytest
+
+from retrieval.data.dataset import load_grasps, make_split
+from robot.errors import ImporterError
+from robot.importers.vt60 import import_vt60
+from tests.data import touch_data
+from tests.miniatures import vt60
+
+
+@pytest.fixture
+def source(tmp_path):
+    vt60.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+@pytest.fixture
+def recording(source, tmp_path):
+    return import_vt60(source, tmp_path / "out")
+
+
+def test_an_object_is_a_class_and_an_instance_which_the_recording_tells(recording):
+    assert {grasp.object_id for grasp in recording.grasps} == {"-".join(each) for each in vt60.OBJECTS}
+    assert recording.info["objects"]["03_ball-01"] == {
+        "class": "ball",
+        "instance": "01",
+        "nickname": "yellow_beachball",
+    }
+
+
+def test_the_ninth_touch_comes_before_the_tenth(recording):
+    ball = [grasp.grasp_id for grasp in recording.grasps if grasp.object_id == "03_ball-01"]
+    assert ball == [f"03_ball-01-{k}" for k in range(1, 13)]
+
+
+def test_touches_are_dealt_to_the_photos_of_their_own_object_in_turn(recording):
+    """12 touches and 5 photos: no photo is used more than once oftener than another."""
+    ball = [grasp for grasp in recording.grasps if grasp.object_id == "03_ball-01"]
+    assert [grasp.photo.split("_img_")[1].split("_")[0] for grasp in ball] == list("123451234512")
+    assert all(grasp.photo.startswith("images/03_ball-01-") for grasp in ball)
+    assert sorted(Counter(grasp.photo for grasp in ball).values()) == [2, 2, 2, 3, 3]
+
+
+def test_every_photo_and_the_untouched_frame_are_kept_once(recording):
+    assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/untouched_shared.jpg"}
+    files = list((recording.folder / "images").iterdir())
+    assert len(files) == vt60.GRASPS + vt60.PHOTOS * len(vt60.OBJECTS) + 1
+
+
+def test_a_bottle_empty_and_full_is_one_sequence_which_no_drawn_split_tears(recording):
+    sequence = {grasp.object_id: grasp.sequence_id for grasp in recording.grasps}
+    assert sequence["02_bottleempty-01"] == sequence["08_bottlefull-01"] == "bottle-buxton"
+    assert sequence["02_bottleempty-02"] == sequence["08_bottlefull-02"] == "bottle-volvic"
+    assert sequence["03_ball-01"] == "03_ball-01"
+    for seed in range(5):
+        split = make_split(load_grasps(recording.folder), validation=0, test=0.4, seed=seed)
+        assert ("02_bottleempty-01" in split.train) == ("08_bottlefull-01" in split.train)
+
+
+def test_photos_without_touches_are_told(recording):
+    assert "skipped 1: photos of an object that was not touched, such as 03_ball/07" in recording.notes
+
+
+def test_a_data_set_without_its_untouched_frame_is_imported_without(source, tmp_path):
+    (source / "touch/baselineForCalibration.jpg").unlink()
+    recording = import_vt60(source, tmp_path / "out")
+    assert not any(grasp.touches_before for grasp in recording.grasps)
+    assert recording.info["background"] == "none"
+
+
+def test_half_of_the_data_set_is_refused_with_what_is_missing(source, tmp_path):
+    (source / "vision").rename(source / "elsewhere")
+    with pytest.raises(ImporterError, match="it has no vision/"):
+        import_vt60(source, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_the_real_data_import_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+    recording = import_vt60(touch_data("vt60"), tmp_path / "out")
+    assert len(recording.grasps) == 4992
+    assert len({grasp.object_id for grasp in recording.grasps}) == 40
+    assert len({grasp.sequence_id for grasp in recording.grasps}) == 36
+    assert recording.info["skipped"] == {"photos of an object that was not touched": 3}
