@@ -63,6 +63,12 @@ def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
         shutil.rmtree(left)
 
 
+@pytest.fixture
+def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that write thousands of small files, and try no crash."""
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+
+
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of drawn pictures: 12 objects, 3 grasps each, two fingers, with untouched frames."""

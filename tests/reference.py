@@ -49,7 +49,7 @@ DATA_SETS_HEAD = """# Data sets
 ```sh
 retrieve import                                             # what can be imported, and the options of each
 retrieve import billets billets/ --out billets-recording/
-retrieve check billets-recording/
+retrieve check recording/                                   # before anything is trained on it
 ```
 
 An importer reads a public data set as it is published, or pictures of your own, and writes a

@@ -22,6 +22,8 @@ from tests.reference import DATA_SETS, data_sets
 
 PICTURES = {".png", ".jpg"}
 
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
 
 @pytest.fixture(scope="module", params=IMPORTERS)
 def name(request):

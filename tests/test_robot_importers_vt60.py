@@ -11,6 +11,9 @@ from tests.data import touch_data
 from tests.miniatures import vt60
 
 
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
 @pytest.fixture
 def source(tmp_path):
     vt60.write(tmp_path / "src")
@@ -78,8 +81,7 @@ def test_half_of_the_data_set_is_refused_with_what_is_missing(source, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_real_data_import_whole(tmp_path, monkeypatch):
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+def test_the_real_data_import_whole(tmp_path):
     recording = import_vt60(touch_data("vt60"), tmp_path / "out")
     assert len(recording.grasps) == 4992
     assert len({grasp.object_id for grasp in recording.grasps}) == 40
