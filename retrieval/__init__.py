@@ -1,6 +1,6 @@
 """Identify objects by touch: from the gel images of a grasp, find the catalogue photo of the object in the hand.
 
-The layers run one way: data -> model -> training, search -> methods -> evaluation -> report -> lab -> commands.
+The layers run one way: data -> model -> training, search -> methods -> evaluation -> report -> lab, serve -> commands.
 Public names are imported when they are used, so `import retrieval` costs nothing.
 
 >>> import retrieval
@@ -20,28 +20,36 @@ if TYPE_CHECKING:
     from retrieval.model.checkpoint import Checkpoint as Checkpoint
     from retrieval.model.checkpoint import load_checkpoint as load_checkpoint
     from retrieval.model.touches import Encoded as Encoded
+    from retrieval.search.agreement import Agreement as Agreement
+    from retrieval.search.agreement import agreement as agreement
     from retrieval.search.answer import Match as Match
     from retrieval.search.answer import QueryResult as QueryResult
     from retrieval.search.build import build_index as build_index
     from retrieval.search.build_report import BuildReport as BuildReport
     from retrieval.search.defaults import shipped_model as shipped_model
     from retrieval.search.embeddings import embed_photos as embed_photos
+    from retrieval.search.neighbours import Neighbour as Neighbour
+    from retrieval.search.neighbours import nearest_photos as nearest_photos
     from retrieval.search.searcher import Searcher as Searcher
 
     open = Searcher.open
 
 _PLACES = {
+    "Agreement": "search.agreement:Agreement",
     "BadInput": "errors:BadInput",
     "BuildReport": "search.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Encoded": "model.touches:Encoded",
     "Match": "search.answer:Match",
+    "Neighbour": "search.neighbours:Neighbour",
     "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.searcher:Searcher",
+    "agreement": "search.agreement:agreement",
     "build_index": "search.build:build_index",
     "embed_photos": "search.embeddings:embed_photos",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
+    "nearest_photos": "search.neighbours:nearest_photos",
     "open": "search.searcher:Searcher.open",
     "shipped_model": "search.defaults:shipped_model",
 }

@@ -18,7 +18,7 @@ from retrieval.model.towers import build_tower
 from retrieval.search.answer import EXIT_CODES
 from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
-from tests import synthetic
+from tests import serving, synthetic
 from tests.documents import PAGES, README, ROOT, blocks, text_of
 from tests.reference import COMMANDS
 from tests.reference import commands as commands_page
@@ -38,6 +38,7 @@ SHORTER = {
     "export": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--quick", "--only", "closing"],
+    "serve": ["--port", "0"],
 }
 """The commands, and what makes each of them quick."""
 
@@ -82,6 +83,11 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
 @pytest.mark.parametrize("page", [page for page in PAGES if of_program("retrieve", page)], ids=lambda page: page.stem)
 def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
     for line in of_program("retrieve", page):
+        if line[1] == "serve":  # until it is told to end
+            with serving.command(*line[2:], *SHORTER["serve"], cwd=home) as (process, _, _):
+                process.terminate()
+                assert process.wait(60) == 0
+            continue
         # An export that is not the faster one on this machine is refused, with exit code 1.
         accepted = {"export": {0, 1}, "query": set(EXIT_CODES.values())}.get(line[1], {0})
         assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line

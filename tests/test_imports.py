@@ -20,7 +20,7 @@ LAYERS = (
     ("methods",),
     ("evaluation",),
     ("report",),
-    ("lab",),
+    ("lab", "serve"),
     ("commands",),
     ("__main__",),
 )
@@ -92,7 +92,8 @@ def run_blocked(code, blocked):
     )
 
 
-HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2")
+SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "prometheus_client", "httpx")
+HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
 
 
 def test_robot_imports_without_torch():
@@ -170,6 +171,7 @@ def test_indexes_import_with_numpy_alone():
         ["export"],
         ["evaluate"],
         ["frontier"],
+        ["serve"],
         ["rig"],
         ["rig", "check"],
         ["rig", "calibrate"],

@@ -24,6 +24,7 @@ from retrieval.commands.frontier import frontier
 from retrieval.commands.import_ import import_
 from retrieval.commands.options import Command
 from retrieval.commands.query import query
+from retrieval.commands.serve import serve
 from retrieval.commands.train import train
 from retrieval.console.interruption import noticed_interrupts
 from retrieval.console.output import give_up_stdout, prepare_streams, printing, say, show
@@ -41,7 +42,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _command in (demo, collect, import_, check, train, build_index, query, export, evaluate, frontier):
+for _command in (demo, collect, import_, check, train, build_index, query, export, evaluate, frontier, serve):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)
 app.add_typer(rig.app)

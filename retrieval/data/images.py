@@ -9,6 +9,8 @@ import io
 import struct
 import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -87,6 +89,27 @@ def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
     Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
     several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
     """
+    with _opened(data, name) as image:
+        _reduce(image)
+        check_pixels(image.size, name)
+        image.load()
+        orientation = _orientation(image)
+        # Byte 24 of a PNG file is its bit depth.
+        bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
+        rgb = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
+        return np.ascontiguousarray(_upright(rgb, orientation))
+
+
+def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
+    """(width, height) of a picture as its file says, and nothing is decoded. Raises ImageError as `decode_rgb` does."""
+    with _opened(data, name) as image:
+        width, height = image.size
+        return width, height
+
+
+@contextmanager
+def _opened(data: bytes, name: str | Path) -> Iterator[Image.Image]:
+    """A picture whose header was read; whatever is wrong with it, here and below `with`, is an ImageError."""
     if not data:
         raise ImageError(name, "the file is empty")
     try:
@@ -98,14 +121,7 @@ def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
             except Image.DecompressionBombError:
                 raise ImageError(name, _too_large("far more")) from None
             with image:
-                _reduce(image)
-                check_pixels(image.size, name)
-                image.load()
-                orientation = _orientation(image)
-                # Byte 24 of a PNG file is its bit depth.
-                bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
-                rgb = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
-        return np.ascontiguousarray(_upright(rgb, orientation))
+                yield image
     except ImageError:
         raise
     except UnidentifiedImageError:

@@ -139,7 +139,31 @@ class Searcher:
         """
         held = self._held()
         limit = held._limit(top, candidates)
-        return held._answers([read_grasps(touches, held.reader.fingers)], background, top, limit, none_prior)[0]
+        grasps = read_grasps(touches, held.reader.fingers)
+        return held._answers(grasps, [slice(len(grasps))], background, top, limit, none_prior)[0]
+
+    def query_growing(
+        self,
+        touches: AnyTouches,
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> list[QueryResult]:
+        """What `query` answers after the first grasp, after the first two, and so on to all of them; every grasp is
+        encoded once.
+
+        >>> with retrieval.open("index") as searcher:
+        ...     after_one, after_two = searcher.query_growing([["a.png", "b.png"], ["a2.png", "b2.png"]])
+        >>> len(after_one.touches), len(after_two.touches)
+        (1, 2)
+        """
+        held = self._held()
+        limit = held._limit(top, candidates)
+        grasps = read_grasps(touches, held.reader.fingers)
+        asked = [slice(count) for count in range(1, len(grasps) + 1)]
+        return held._answers(grasps, asked, background, top, limit, none_prior)
 
     def query_many(
         self,
@@ -161,7 +185,10 @@ class Searcher:
             read_grasps(touches, held.reader.fingers, of=f"object {number}, ")
             for number, touches in enumerate(objects, 1)
         ]
-        return held._answers(asked, background, top, limit, none_prior) if asked else []
+        ends = np.cumsum([len(grasps) for grasps in asked]).tolist()
+        spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, asked, strict=True)]
+        every = [grasp for grasps in asked for grasp in grasps]
+        return held._answers(every, spans, background, top, limit, none_prior) if asked else []
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
         """The unit embeddings (G, embedding_dim) and halves (G, hidden) of G grasps, given as `query` takes them.
@@ -195,21 +222,22 @@ class Searcher:
 
     def _answers(
         self,
-        asked: Sequence[Sequence[Sequence[GivenImage]]],
+        grasps: Sequence[Sequence[GivenImage]],
+        asked: Sequence[slice],
         background: Sequence[AnyImage] | None,
         top: int,
         limit: int,
         none_prior: float,
     ) -> list[QueryResult]:
+        """An answer for each of `asked`, which names the grasps that are of its object."""
         require_prior(none_prior)
         clock = Stopwatch()
         references = self.reader.references(background)
-        codes = self.reader.encode([grasp for grasps in asked for grasp in grasps], references, clock)
-        ends = np.cumsum([len(grasps) for grasps in asked])[:-1]
+        codes = self.reader.encode(grasps, references, clock)
         shown = np.full(len(codes.halves), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
             shown = np.array(self.gel_check.judge(codes.readings, codes.levels))
-        parts = list(zip(*(np.split(of_all, ends) for of_all in (shown, codes.halves, codes.embeddings)), strict=True))
+        parts = [(shown[own], codes.halves[own], codes.embeddings[own]) for own in asked]
         judged = []
         for own, halves, embeddings in parts:
             felt = (own == CONTACT) & (own != NOT_A_GEL).all()
@@ -219,8 +247,8 @@ class Searcher:
                 judged.append(self._judged(halves[felt], rows, top, none_prior))
         timing_ms = clock.finished(len(asked))
         return [
-            self._answer(grasps, own.tolist(), timing_ms, found, top, none_prior)
-            for grasps, (own, *_), found in zip(asked, parts, judged, strict=True)
+            self._answer(grasps[its], own.tolist(), timing_ms, found, top, none_prior)
+            for its, (own, *_), found in zip(asked, parts, judged, strict=True)
         ]
 
     def _candidates(self, embeddings: Floats, k: int) -> Rows:

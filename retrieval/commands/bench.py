@@ -1,0 +1,100 @@
+"""What a rig gives to the service: pictures of its sensors, and, of the simulated one, jaws that close on an object.
+
+A real rig shows its sensors only: nothing that comes over HTTP moves it.
+"""
+
+import random
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from threading import Lock
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from indexes.errors import IndexesError
+from indexes.store.folder import IndexStore
+from retrieval.errors import BadInput
+from retrieval.serve.service import Bench, Grasped
+from robot.devices import TactileSensor
+from robot.rig import load_rig
+from robot.sim.rig import SimRig
+
+_SIMULATED = re.compile(r".+-(\d{4,})-\d{5,}")
+"""How the simulated rig calls its objects: their seed, and their number."""
+_FRESH = 10_000
+"""Attempts from this number on are in no recording."""
+_TRIES = 20
+
+
+def of_rig(spec: str, index: Path) -> Bench:
+    """The sensors of a rig, which are connected at once. Raises RobotError."""
+    rig = load_rig(spec, seed=_seed(index) or 0)
+    if isinstance(rig, SimRig):
+        return _simulated(rig)
+    for sensor in rig.sensors.values():
+        sensor.connect()
+    return Bench({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
+
+
+def of_index(index: Path) -> Bench | None:
+    """The simulated rig, where the index shows its objects."""
+    seed = _seed(index)
+    return None if seed is None else _simulated(SimRig(seed))
+
+
+def _seed(index: Path) -> int | None:
+    """Of the simulated objects that an index shows; None where its first is none."""
+    try:
+        first = IndexStore(index).open(verify=False).rows[0]["object_id"]
+    except IndexesError:
+        return None  # said when it is opened
+    found = _SIMULATED.fullmatch(str(first))
+    return int(found[1]) if found else None
+
+
+class _Jaws:
+    """The simulated rig from several threads, one after the other; its gels show what they closed on last."""
+
+    def __init__(self, rig: SimRig) -> None:
+        self._rig, self._lock = rig, Lock()
+        self._gels: dict[str, npt.NDArray[np.uint8]] = {}
+
+    def grasp(self, names: list[str]) -> Grasped:
+        """Close on one of these objects, drawn at random; again where they close on air."""
+        draw = random.SystemRandom()
+        with self._lock:
+            for _ in range(_TRIES):
+                name = draw.choice(names)
+                felt = self._rig.press(name, _FRESH + draw.randrange(1_000_000))
+                if felt:
+                    fingers = sorted(self._rig.sensors)
+                    self._gels = {finger: felt[f"touch_{finger}"] for finger in fingers}
+                    before = [_encoded(".png", felt[f"touch_{finger}_before"]) for finger in fingers]
+                    return Grasped(name, [_encoded(".png", self._gels[finger]) for finger in fingers], before)
+        raise BadInput(f"{_TRIES} times the jaws closed on air; try again")
+
+    def picture(self, finger: str) -> bytes:
+        """The gel of a finger, as it was pressed last."""
+        with self._lock:
+            if finger not in self._gels:
+                self._rig.prepare(self._rig.object_ids(1)[0], 0)
+                self._gels[finger] = self._rig.world.now().image(f"touch_{finger}_before")
+            return _encoded(".jpg", self._gels[finger])
+
+
+def _simulated(rig: SimRig) -> Bench:
+    jaws = _Jaws(rig)
+    sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
+    return Bench(sensors, jaws.grasp)
+
+
+def _jpeg_of(sensor: TactileSensor, lock: Lock) -> bytes:
+    with lock:
+        return _encoded(".jpg", sensor.read().pixels)
+
+
+def _encoded(ending: str, pixels: npt.NDArray[np.uint8]) -> bytes:
+    return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes())

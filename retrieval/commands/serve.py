@@ -1,0 +1,83 @@
+"""`retrieve serve`: the answers over HTTP, and a page."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from retrieval.console.output import say
+from retrieval.errors import BadInput, ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.serve.service import Bench
+
+TOKEN = "RETRIEVE_TOKEN"
+"""Variable of the environment that may hold the token."""
+
+
+def serve(
+    *,
+    index: Annotated[
+        str | None, typer.Option(help="index folder (default: ./index, else the last one built from this folder)")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
+    host: Annotated[str, typer.Option(help="where to listen; other machines reach it only with a token")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="port; 0 for a free one")] = 8000,
+    token_file: Annotated[
+        Path | None, typer.Option(help=f"file with the token that requests must carry (or variable {TOKEN})")
+    ] = None,
+    rig: Annotated[
+        str | None, typer.Option(help="rig by name or TOML file, for live pictures (default: sim for its own objects)")
+    ] = None,
+    queue: Annotated[int, typer.Option(help="requests that are held at once; more are told to come again")] = 8,
+    workers: Annotated[int, typer.Option(help="requests in work at once")] = 1,
+    batch_ms: Annotated[float, typer.Option(help="how long a query waits for others to be encoded with it")] = 0.0,
+    deadline: Annotated[float, typer.Option(metavar="SECONDS", help="after which no answer is waited for")] = 30.0,
+    no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
+) -> None:
+    """Answer over HTTP, and show a page, until Ctrl-C or SIGTERM."""
+    try:
+        from retrieval.serve.app import create_app
+        from retrieval.serve.run import serve as run
+        from retrieval.serve.settings import ServiceSettings
+    except ImportError as error:
+        raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
+    from retrieval.search import defaults
+
+    path, why = defaults.find_index(index)
+    if index is None:
+        say(f"index: {path} ({why})")
+    settings = ServiceSettings(
+        index=path,
+        model=Path(model) if model else None,
+        verify=not no_verify,
+        host=host,
+        port=port,
+        token=_token(token_file),
+        queue=queue,
+        workers=workers,
+        batch_ms=batch_ms,
+        deadline_s=deadline,
+    )
+    app = create_app(settings, _bench(rig, path))
+    shown = f"[{host}]" if ":" in host else host
+    run(app, lambda bound: say(f"listening on http://{shown}:{bound}"))
+
+
+def _token(file: Path | None) -> str | None:
+    if file is None:
+        return os.environ.get(TOKEN)
+    from indexes.store.regular import read_regular
+
+    try:
+        return read_regular(file).decode("ascii").strip()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file} must hold a token in ASCII: {error}") from error
+
+
+def _bench(rig: str | None, index: Path) -> "Bench | None":
+    """What the rig gives the service; without --rig, the simulated one where the index shows its objects."""
+    from retrieval.commands.bench import of_index, of_rig
+
+    return of_rig(rig, index) if rig else of_index(index)

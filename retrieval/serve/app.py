@@ -1,0 +1,111 @@
+"""The application: its parts, put together."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio.to_thread
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+from pydantic import BaseModel
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from retrieval.serve import bench, catalogue, errors, health, queries
+from retrieval.serve.generations import Generations
+from retrieval.serve.metrics import Metrics
+from retrieval.serve.queries import AgreementBody
+from retrieval.serve.queue import Queue
+from retrieval.serve.security import Guard
+from retrieval.serve.service import Bench, Service
+from retrieval.serve.settings import ServiceSettings
+from retrieval.serve.thumbnails import Thumbnails
+from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
+from retrieval.version import __version__
+
+PAGE = Path(__file__).parent / "page"
+THREADS = 4
+"""That read files and make thumbnails; the model has its own."""
+_BODIES: tuple[type[BaseModel], ...] = (QueryBody, BatchBody, AgreementBody, errors.ProblemDocument)
+
+
+def create_app(settings: ServiceSettings, beside: Bench | None = None) -> FastAPI:
+    """The service over the index of `settings`, which is opened when the application starts."""
+    metrics = Metrics()
+    generations = Generations(settings, metrics)
+    parts = Service(
+        settings,
+        metrics,
+        generations,
+        Queue(generations, settings, metrics),
+        beside or Bench(),
+        Thumbnails(),
+        asyncio.Semaphore(settings.streams),
+    )
+    app = FastAPI(
+        title="touch-retrieval",
+        summary="From the gel images of a grasp, find which catalogue photo shows the object in the hand.",
+        version=__version__,
+        docs_url=None,  # its page loads scripts from elsewhere
+        redoc_url=None,
+        lifespan=_lifespan,
+        separate_input_output_schemas=False,
+    )
+    app.state.service = parts
+    errors.install(app)
+    for paths in (queries, catalogue, bench, health):
+        app.include_router(paths.router)
+    app.mount("/", StaticFiles(directory=PAGE, html=True))
+    app.openapi = lambda: _document(app)  # type: ignore[method-assign]
+    app.add_middleware(BodyLimit, seconds=settings.body_s)
+    app.add_middleware(Guard, settings=settings)
+    app.add_middleware(Counted, metrics=metrics)
+    return app
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
+    """Opens the index; ends when what is in flight is done, which the server waits for."""
+    parts: Service = app.state.service
+    anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
+    await asyncio.to_thread(parts.generations.open)
+    running = [asyncio.ensure_future(one) for one in (*parts.queue.workers(), parts.generations.watch())]
+    try:
+        yield
+    finally:
+        parts.stopping.set()
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+        parts.queue.close()
+
+
+class Counted:
+    """Counts responses by status."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self.app, self.metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+
+        async def counted(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self.metrics.responses.labels(message["status"]).inc()
+            await send(message)
+
+        await self.app(scope, receive, counted if scope["type"] == "http" else send)
+
+
+def _document(app: FastAPI) -> dict[str, Any]:
+    """OpenAPI, with the bodies that the paths read themselves."""
+    if app.openapi_schema is None:
+        document = FastAPI.openapi(app)
+        schemas = document.setdefault("components", {}).setdefault("schemas", {})
+        for model in _BODIES:
+            found = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= found.pop("$defs", {})
+            schemas[model.__name__] = found
+        app.openapi_schema = document
+    return app.openapi_schema

@@ -1,0 +1,100 @@
+"""The paths of what stands beside the service: live pictures of sensors, and jaws that close on something."""
+
+import asyncio
+import base64
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from retrieval.serve.documents import GraspDocument
+from retrieval.serve.errors import Problem, problems
+from retrieval.serve.generations import Opened
+from retrieval.serve.service import Parts, Service
+
+router = APIRouter(tags=["bench"])
+MOST_NAMES = 1000
+"""Objects among which one is drawn to be grasped."""
+BOUNDARY = "picture"
+Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at most")]
+
+
+@router.post("/v1/grasp", responses=problems("unknown", "failed", "not-ready"))
+async def grasp(parts: Parts) -> GraspDocument:
+    """Close the jaws on one of the catalogue's objects, drawn at random."""
+    close = parts.bench.grasp
+    if close is None:
+        raise Problem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
+    names = await run_in_threadpool(_object_ids, parts.generations.current)
+    try:
+        felt = await run_in_threadpool(close, names)
+    except Exception as error:  # of any rig
+        raise Problem("failed", f"the rig could not grasp: {error}") from error
+    encoded = [
+        [base64.b64encode(data).decode("ascii") for data in some] for some in (felt.touches, felt.background or [])
+    ]
+    return GraspDocument(object_id=felt.object_id, touches=encoded[0], background=encoded[1] or None)
+
+
+def _object_ids(opened: Opened) -> list[str]:
+    """Names of objects, spread over the catalogue."""
+    rows = opened.generation.rows
+    step = max(1, len(rows) // MOST_NAMES)
+    return sorted({str(rows[number]["object_id"]) for number in range(0, len(rows), step)})
+
+
+@router.get(
+    "/v1/sensors/{name}/frame",
+    response_class=Response,
+    responses={200: {"content": {"image/jpeg": {}}, "description": "the picture"}, **problems("unknown", "failed")},
+)
+async def frame(name: str, parts: Parts) -> Response:
+    """The newest picture of a sensor."""
+    return Response(await _read(parts, name), media_type="image/jpeg")
+
+
+@router.get(
+    "/v1/sensors/{name}/stream",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"multipart/x-mixed-replace": {}}, "description": "pictures without end (MJPEG)"},
+        **problems("unknown", "failed", "busy"),
+    },
+)
+async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:
+    """The pictures of a sensor as they come; an `<img>` shows them."""
+    if parts.streams.locked():
+        raise Problem("busy", f"{parts.settings.streams} streams run already", {"retry-after": "5"})
+    first = await _read(parts, name)  # what fails, fails before the stream begins
+    return StreamingResponse(
+        _pictures(parts, name, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+    )
+
+
+async def _pictures(parts: Service, name: str, first: bytes, pause_s: float) -> AsyncIterator[bytes]:
+    async with parts.streams:
+        data: bytes | None = first
+        while data is not None and not parts.stopping.is_set():
+            yield b"--%b\r\ncontent-type: image/jpeg\r\ncontent-length: %d\r\n\r\n%b\r\n" % (
+                BOUNDARY.encode(),
+                len(data),
+                data,
+            )
+            await asyncio.sleep(pause_s)
+            try:
+                data = await _read(parts, name)
+            except Problem:
+                data = None  # the sensor was unplugged: the stream ends
+
+
+async def _read(parts: Service, name: str) -> bytes:
+    read = parts.bench.sensors.get(name)
+    if read is None:
+        known = ", ".join(sorted(parts.bench.sensors)) or "none; name a rig with --rig"
+        raise Problem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
+    try:
+        return await run_in_threadpool(read)
+    except Exception as error:  # of any driver
+        raise Problem("failed", f"sensor {name}: {error}") from error

@@ -1,0 +1,179 @@
+"""The paths of the catalogue: its photos by page, by search, by nearness; pictures and thumbnails by id; the index.
+
+An id is looked up in the index, and the file is the one that the index names: no text of a request is part of a path.
+"""
+
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+
+from indexes.store.rows import key_of
+from retrieval.data.images import read_bytes
+from retrieval.errors import ImageError
+from retrieval.report.pages import jpeg, thumbnail
+from retrieval.search.neighbours import nearest_photos
+from retrieval.search.objects import ListedPhoto, listed_photo
+from retrieval.serve.documents import (
+    CatalogueDocument,
+    IndexDocument,
+    NearPhoto,
+    NearPhotosDocument,
+    PhotoDocument,
+)
+from retrieval.serve.errors import Problem, problems
+from retrieval.serve.generations import Opened
+from retrieval.serve.service import Parts
+from retrieval.version import __version__
+
+router = APIRouter(tags=["catalogue"])
+_SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+"""Files that every browser shows, by their first bytes; others are sent as JPEG."""
+_PICTURES: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
+}
+WHOLE_PX = 4096
+"""Longer side of a photo that is sent as another file than it is."""
+
+
+def photo_of(opened: Opened, photo: str) -> ListedPhoto:
+    """The photo of that id. Raises Problem where the index has none."""
+    return listed_photo(_row(opened, photo))
+
+
+def _row(opened: Opened, photo: str) -> dict[str, object]:
+    try:
+        return opened.generation.rows[opened.generation.row_number(photo)]
+    except KeyError:
+        raise Problem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them") from None
+
+
+def _gone(path: str) -> Problem:
+    return Problem("unknown", f"the photo {path!r} cannot be read any more; run `retrieve build-index` again")
+
+
+Offset = Annotated[int, Query(ge=0, le=2**31)]
+Limit = Annotated[int, Query(ge=1, le=500, description="photos of a page")]
+Search = Annotated[
+    str, Query(max_length=200, description="words that object, path and metadata must hold, all of them")
+]
+Named = Annotated[str | None, Query(max_length=1000, alias="object", description="photos of this object alone")]
+
+
+@router.get("/v1/catalogue", responses=problems("bad-input", "not-ready"))
+def catalogue(
+    parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: Named = None
+) -> CatalogueDocument:
+    """Photos of the index, in its order, page by page."""
+    opened = parts.generations.current
+    found = np.arange(opened.generation.count)
+    if name is not None:
+        found = found[opened.generation.rows.keys("object_id") == key_of(name)]
+    if words := search.casefold().split():
+        texts = opened.texts()
+        found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
+    end = min(offset + limit, len(found))
+    return CatalogueDocument(
+        generation=opened.name,
+        total=len(found),
+        offset=offset,
+        next=end if end < len(found) else None,
+        items=[_document(listed_photo(opened.generation.rows[int(row)])) for row in found[offset:end]],
+    )
+
+
+def _document(photo: ListedPhoto) -> PhotoDocument:
+    return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
+
+
+@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+def photo(request: Request, photo: str, parts: Parts) -> Response:
+    """A photo of the catalogue as it is; one that browsers do not show, as JPEG."""
+    opened = parts.generations.current
+    row = _row(opened, photo)
+    if response := _unchanged(request, row, "whole"):
+        return response
+    listed = listed_photo(row)
+    path = opened.searcher.catalogue / listed.path
+    try:
+        data = read_bytes(path)
+    except ImageError:
+        raise _gone(listed.path) from None
+    kind = next((kind for magic, kind in _SHOWN.items() if data.startswith(magic)), None)
+    if kind is None:
+        image = thumbnail(path, WHOLE_PX)
+        if image is None:
+            raise _gone(listed.path)
+        data, kind = jpeg(image), "image/jpeg"
+    return _picture(data, kind, row, "whole")
+
+
+@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+def small(
+    request: Request,
+    photo: str,
+    parts: Parts,
+    px: Annotated[int, Query(ge=32, le=1024, description="of the longer side")] = 320,
+) -> Response:
+    """A photo as a small JPEG."""
+    opened = parts.generations.current
+    row = _row(opened, photo)
+    if response := _unchanged(request, row, str(px)):
+        return response
+    listed = listed_photo(row)
+    data = parts.thumbnails.of(opened.searcher.catalogue / listed.path, str(row.get("digest")), px)
+    if data is None:
+        raise _gone(listed.path)
+    return _picture(data, "image/jpeg", row, str(px))
+
+
+def _tag(row: dict[str, object], size: str) -> str:
+    return f'"{row.get("digest")}-{size}"'
+
+
+def _unchanged(request: Request, row: dict[str, object], size: str) -> Response | None:
+    if row.get("digest") and request.headers.get("if-none-match") == _tag(row, size):
+        return Response(status_code=304, headers={"etag": _tag(row, size)})
+    return None
+
+
+def _picture(data: bytes, kind: str, row: dict[str, object], size: str) -> Response:
+    return Response(data, media_type=kind, headers={"etag": _tag(row, size), "cache-control": "private, no-cache"})
+
+
+@router.get("/v1/nearest/{photo:path}", responses=problems("unknown", "bad-input"))
+def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
+    """Photos that look to the model like this one."""
+    opened = parts.generations.current
+    photo_of(opened, photo)  # says what is missing
+    items = [
+        NearPhoto(**_document(near.photo).model_dump(), score=near.score)
+        for near in nearest_photos(opened.searcher, photo, count)
+    ]
+    return NearPhotosDocument(generation=opened.name, photo=photo, items=items)
+
+
+@router.get("/v1/index", responses=problems("not-ready"))
+def index(parts: Parts) -> IndexDocument:
+    """What answers, and with what it is asked."""
+    opened = parts.generations.current
+    searcher, manifest = opened.searcher, opened.generation.manifest
+    measured = manifest.about.get("candidates") or {}
+    return IndexDocument(
+        generation=opened.name,
+        kind=manifest.kind,
+        photos=opened.generation.count,
+        objects=searcher.objects.count,
+        model=searcher.checkpoint.path.name,
+        trained_on=str(searcher.checkpoint.provenance.get("source", "unknown")),
+        encoder=searcher.encoder.name,
+        fingers=opened.fingers,
+        background=searcher.checkpoint.config.preprocessing.background,
+        calibrated=searcher.posterior is not None,
+        candidates=measured.get("k"),
+        sensors=sorted(parts.bench.sensors),
+        can_grasp=parts.bench.grasp is not None,
+        keeps=False,
+        trials=0,
+        version=__version__,
+    )

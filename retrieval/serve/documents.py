@@ -1,0 +1,158 @@
+"""The documents of the service, for OpenAPI and for what the service makes itself. The answer to a query is that of
+`QueryResult.to_dict`, and is sent as it is."""
+
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+EXAMPLE: dict[str, Any] = {
+    "query": {
+        "touches": [["grasp 1, finger a (48120 bytes)", "grasp 1, finger b (47903 bytes)"]],
+        "grasps": ["contact"],
+    },
+    "index": {
+        "path": "index",
+        "generation": "gen-000007",
+        "kind": "flat",
+        "photos": 60,
+        "objects": 20,
+        "scored": 60,
+        "encoder": "onnx",
+        "catalogue": "/data/catalog",
+        "model": "/data/model.safetensors",
+        "trained_on": "simulated rig",
+    },
+    "timing_ms": {"decode": 2.1, "encode": 14.0, "candidates": 0.1, "rerank": 0.6, "total": 17.0},
+    "verdict": "match",
+    "none_probability": 0.02,
+    "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "judged_objects": 20, "unjudged_probability": 0.0},
+    "results": [
+        {
+            "rank": 1,
+            "object_id": "mug",
+            "logit": 3.2,
+            "probability": 0.96,
+            "photo": "mug/1.jpg",
+            "metadata": {"material": "glazed clay"},
+        }
+    ],
+}
+
+
+class MatchDocument(BaseModel):
+    """One object of a ranking, shown by its best photo, whose id is `photo`."""
+
+    rank: int
+    object_id: str
+    logit: float
+    probability: float | None
+    photo: str
+    metadata: dict[str, Any]
+
+
+class QueryDocument(BaseModel):
+    """The document of `retrieve query --json`."""
+
+    model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
+
+    query: dict[str, Any]
+    index: dict[str, Any]
+    timing_ms: dict[str, float]
+    verdict: str
+    none_probability: float | None
+    posterior: dict[str, Any] | None
+    results: list[MatchDocument]
+
+
+class BatchDocument(BaseModel):
+    """An answer for each object, in the order in which they were given."""
+
+    answers: list[QueryDocument]
+
+
+class GrowingDocument(BaseModel):
+    """The answer after the first grasp, after the first two, and so on."""
+
+    answers: list[QueryDocument]
+
+
+class PhotoDocument(BaseModel):
+    """A photo of the catalogue; `id` names it in all paths. metadata: the user's own."""
+
+    id: str = Field(examples=["mug/1.jpg"])
+    object_id: str = Field(examples=["mug"])
+    metadata: dict[str, Any] = Field(examples=[{"material": "glazed clay"}])
+
+
+class CatalogueDocument(BaseModel):
+    """A page of photos. total: photos that were looked for; next: offset of the next page, null at the end."""
+
+    generation: str = Field(examples=["gen-000007"])
+    total: int
+    offset: int
+    next: int | None
+    items: list[PhotoDocument]
+
+
+class NearPhoto(PhotoDocument):
+    """score: inner product of the two unit embeddings, 1 for equal pictures."""
+
+    score: float
+
+
+class NearPhotosDocument(BaseModel):
+    """Photos near a photo, the nearest first, itself left out."""
+
+    generation: str
+    photo: str
+    items: list[NearPhoto]
+
+
+class AgreementDocument(BaseModel):
+    """Where a photo agrees with a touch: by how much the match logit falls when that square of the photo is hidden.
+
+    falls: rows from the top, columns from the left; negative where the photo without it would agree better.
+    """
+
+    generation: str
+    photo: str
+    logit: float
+    rows: int
+    columns: int
+    falls: list[list[float]]
+
+
+class IndexDocument(BaseModel):
+    """What answers, and with what it is asked. sensors: names of live pictures; can_grasp: whether POST /v1/grasp
+    works; keeps: whether queries and what is said of them are kept; trials: unseen objects for the human test."""
+
+    generation: str
+    kind: str
+    photos: int
+    objects: int
+    model: str
+    trained_on: str
+    encoder: str
+    fingers: int
+    background: str
+    calibrated: bool
+    candidates: int | None
+    sensors: list[str]
+    can_grasp: bool
+    keeps: bool
+    trials: int
+    version: str
+
+
+class GraspDocument(BaseModel):
+    """Gel images of one grasp of the simulated rig, as PNG files in base64, and the object that it closed on."""
+
+    object_id: str
+    touches: list[str]
+    background: list[str] | None
+
+
+class Health(BaseModel):
+    """status: "ok", or why not."""
+
+    status: str

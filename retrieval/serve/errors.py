@@ -1,0 +1,120 @@
+"""What goes wrong, as problem documents (RFC 9457): a type that programs compare, and our sentence for people."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+from indexes.errors import IndexesError
+from retrieval.errors import BadInput, ImageError, RetrievalError
+
+MEDIA_TYPE = "application/problem+json"
+PREFIX = "urn:touch-retrieval:problem:"
+LONGEST = 2000
+"""Characters of a sentence; what stands in a hostile request may be of any length."""
+
+KINDS: Mapping[str, tuple[int, str]] = {
+    "malformed": (400, "The request is not what it says it is"),
+    "no-token": (401, "A token is needed"),
+    "refused": (403, "The request is refused"),
+    "unknown": (404, "There is no such thing"),
+    "not-allowed": (405, "This path does not take that method"),
+    "too-slow": (408, "The body did not come in time"),
+    "conflict": (409, "This was said already"),
+    "too-large": (413, "The request is too large"),
+    "unsupported-type": (415, "The body is of a kind that is not read"),
+    "wrong-host": (421, "The request is meant for another host"),
+    "bad-input": (422, "The input cannot be used"),
+    "bad-image": (422, "An image cannot be read"),
+    "busy": (429, "The service has all it can hold"),
+    "failed": (500, "The service failed"),
+    "not-ready": (503, "The service is not ready"),
+    "late": (504, "The deadline passed"),
+}
+"""Kind of a problem -> status and title."""
+_OF_STATUS = {400: "malformed", 404: "unknown", 405: "not-allowed", 413: "too-large", 415: "unsupported-type"}
+
+
+class ProblemDocument(BaseModel):
+    """What every error of the service is, as `application/problem+json`."""
+
+    type: str = Field(examples=[PREFIX + "bad-image"])
+    title: str = Field(examples=["An image cannot be read"])
+    status: int = Field(examples=[422])
+    detail: str = Field(
+        examples=["grasp 1, finger a (12 bytes): not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture"]
+    )
+
+
+class Problem(Exception):
+    """A request that is not answered as asked: its kind, of KINDS, and why."""
+
+    def __init__(self, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.kind, self.detail, self.headers = kind, detail, dict(headers or {})
+
+    @property
+    def status(self) -> int:
+        """Of HTTP."""
+        return KINDS[self.kind][0]
+
+    def response(self) -> JSONResponse:
+        """The document."""
+        status, title = KINDS[self.kind]
+        detail = self.detail if len(self.detail) <= LONGEST else self.detail[:LONGEST] + " ..."
+        document = ProblemDocument(type=PREFIX + self.kind, title=title, status=status, detail=detail)
+        return JSONResponse(document.model_dump(), status, {"cache-control": "no-store", **self.headers}, MEDIA_TYPE)
+
+
+def problem_of(error: Exception) -> Problem:
+    """What an exception means to the one who asked."""
+    match error:
+        case Problem():
+            return error
+        case ImageError():
+            return Problem("bad-image", str(error))
+        case BadInput():
+            return Problem("bad-input", str(error))
+        case RetrievalError() | IndexesError():
+            return Problem("failed", str(error))
+        case RequestValidationError():
+            return Problem("bad-input", invalid(error.errors()))
+        case ClientDisconnect():
+            return Problem("malformed", "the connection ended before the whole body had come")
+        case HTTPException():
+            kind = _OF_STATUS.get(error.status_code, "malformed" if error.status_code < 500 else "failed")
+            return Problem(kind, str(error.detail), error.headers)
+        case _:
+            return Problem("failed", f"unexpected {type(error).__name__}; the log of the service says more")
+
+
+def invalid(errors: Any) -> str:
+    """pydantic's findings in a sentence: the first ones, each with its place."""
+    told = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in list(errors)[:5]]
+    return "; ".join(told) or "the request does not have the form that /openapi.json says"
+
+
+def install(app: FastAPI) -> None:
+    """What a path raises on purpose becomes its problem document; `security.Guard` answers for the rest."""
+
+    async def answer(request: Request, error: Exception) -> JSONResponse:
+        return problem_of(error).response()
+
+    for kind in (Problem, RetrievalError, IndexesError, RequestValidationError, ClientDisconnect, HTTPException):
+        app.add_exception_handler(kind, answer)
+
+
+def problems(*kinds: str) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a path for OpenAPI: those of these kinds, and what every path may say."""
+    found: dict[int | str, dict[str, Any]] = {}
+    for kind in (*kinds, "malformed", "no-token", "refused", "wrong-host", "failed"):
+        status, title = KINDS[kind]
+        said = [title, *([found[status]["description"]] if status in found else [])]
+        schema = {"$ref": "#/components/schemas/ProblemDocument"}
+        found[status] = {"description": "; ".join(said), "content": {MEDIA_TYPE: {"schema": schema}}}
+    return found

@@ -1,0 +1,98 @@
+"""Which generation of the index answers: the newest that could be opened. Whoever asks takes `current` once, so that an
+answer comes from one generation; the one before is let go of when nobody uses it any more."""
+
+import asyncio
+import gc
+import logging
+from functools import cached_property
+from threading import Lock
+
+from indexes.errors import IndexesError
+from indexes.store.folder import IndexStore
+from retrieval.errors import RetrievalError
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.search.searcher import Searcher
+from retrieval.serve.errors import Problem
+from retrieval.serve.metrics import Metrics
+from retrieval.serve.settings import ServiceSettings
+
+log = logging.getLogger(__name__)
+_AGAIN_S = 10.0
+"""After which one that could not be opened is tried again."""
+
+
+class Opened:
+    """A generation that is served: its searcher, and what is made of it when it is first asked for."""
+
+    def __init__(self, searcher: Searcher) -> None:
+        self.searcher, self.generation = searcher, searcher.generation
+        self.fingers: int = searcher.checkpoint.config.matcher.fingers
+        self._lock = Lock()
+
+    @property
+    def name(self) -> str:
+        """Of the generation."""
+        return self.generation.name
+
+    def checkpoint(self) -> Checkpoint:
+        """The whole model, photo tower too, which queries do without."""
+        with self._lock:
+            return self._checkpoint
+
+    @cached_property
+    def _checkpoint(self) -> Checkpoint:
+        return load_checkpoint(self.searcher.checkpoint.path, known=self.searcher.checkpoint)
+
+    def texts(self) -> list[str]:
+        """What each row is found by: object, path and metadata, without capitals."""
+        with self._lock:
+            return self._texts
+
+    @cached_property
+    def _texts(self) -> list[str]:
+        found = []
+        for row in self.generation.rows:
+            values = [row.get("object_id"), row.get("path"), *(row.get("metadata") or {}).values()]
+            found.append(" ".join(str(value) for value in values).casefold())
+        return found
+
+
+class Generations:
+    """The generations of one index folder, as they come."""
+
+    def __init__(self, settings: ServiceSettings, metrics: Metrics) -> None:
+        self._settings, self._metrics = settings, metrics
+        self._store = IndexStore(settings.index)
+        self._current: Opened | None = None
+
+    @property
+    def current(self) -> Opened:
+        """What answers now. Raises Problem before anything could be opened."""
+        if self._current is None:
+            raise Problem("not-ready", "no index is open yet", {"retry-after": "1"})
+        return self._current
+
+    def open(self) -> None:
+        """Open the newest generation. Raises the errors of `Searcher.open`."""
+        said = self._settings
+        opened = Opened(Searcher.open(said.index, model=said.model, verify=said.verify))
+        self._current = opened
+        self._metrics.serves(opened.name)
+        gc.collect()  # what the one before held in circles
+
+    async def watch(self) -> None:
+        """Take up each new generation; one that cannot be opened is told, and the old one goes on answering."""
+        failed, again = "", 0.0
+        while True:
+            await asyncio.sleep(self._settings.poll_s)
+            now = asyncio.get_running_loop().time()
+            try:
+                name = await asyncio.to_thread(self._store.current)
+                if name == self.current.name or (name == failed and now < again):
+                    continue
+                failed, again = name, now + _AGAIN_S
+                await asyncio.to_thread(self.open)
+                log.warning("generation %s answers from now on", self.current.name)
+            except (RetrievalError, IndexesError, OSError) as error:
+                self._metrics.reload_failures.inc()
+                log.warning("a new generation cannot be taken up, %s goes on answering: %s", self.current.name, error)

@@ -1,0 +1,60 @@
+"""Whether the service lives, whether it is ready, and its numbers; and the page's cookie."""
+
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from retrieval.serve.documents import Health
+from retrieval.serve.errors import Problem, problems
+from retrieval.serve.security import COOKIE, same_token
+from retrieval.serve.service import Parts
+
+router = APIRouter(tags=["health"])
+
+
+@router.get("/healthz")
+async def lives() -> Health:
+    """The process answers."""
+    return Health(status="ok")
+
+
+@router.get("/readyz", responses=problems("not-ready"))
+async def ready(parts: Parts) -> Health:
+    """An index is open, and the service is not about to end."""
+    if parts.stopping.is_set():
+        raise Problem("not-ready", "the service is about to end")
+    return Health(status=f"ok: {parts.generations.current.name}")
+
+
+@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
+async def metrics(parts: Parts) -> Response:
+    """Numbers for Prometheus."""
+    return Response(parts.metrics.page(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+class SessionBody(BaseModel):
+    """The service's token."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    token: str = Field(max_length=1000)
+
+
+@router.post("/v1/session", status_code=204, responses=problems("bad-input"))
+async def session(body: SessionBody, parts: Parts) -> Response:
+    """For the page of a service with a token: the token becomes a cookie that scripts cannot read, for pictures cannot
+    send a header."""
+    wanted = parts.settings.token
+    if wanted is not None and not same_token(body.token, wanted):
+        raise Problem("no-token", "this is not the service's token", {"www-authenticate": "Bearer"})
+    response = Response(status_code=204)
+    if wanted is not None:
+        response.set_cookie(COOKIE, wanted, httponly=True, samesite="strict", path="/")
+    return response
+
+
+@router.delete("/v1/session", status_code=204)
+async def end_session() -> Response:
+    """Take the cookie away."""
+    response = Response(status_code=204)
+    response.delete_cookie(COOKIE, httponly=True, samesite="strict", path="/")
+    return response

@@ -1,0 +1,57 @@
+"""What Prometheus reads at /metrics."""
+
+from collections.abc import Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from retrieval.search.answer import QueryResult
+
+_SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+_SIZES = (1, 2, 4, 8, 16, 32)
+
+
+class Metrics:
+    """The numbers of one service; each service has its own registry."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.stages = Histogram(
+            "retrieve_stage_seconds", "Time of a query by stage", ["stage"], buckets=_SECONDS, registry=self.registry
+        )
+        self.waiting = Histogram(
+            "retrieve_wait_seconds", "Time in the queue before work", buckets=_SECONDS, registry=self.registry
+        )
+        self.batches = Histogram(
+            "retrieve_batch_queries", "Queries answered together", buckets=_SIZES, registry=self.registry
+        )
+        self.held = Gauge("retrieve_held_requests", "Requests that wait or are in work", registry=self.registry)
+        self.verdicts = Counter("retrieve_verdicts", "Answers by verdict", ["verdict"], registry=self.registry)
+        self.dropped = Counter("retrieve_dropped", "Requests that were not worked on", ["why"], registry=self.registry)
+        self.responses = Counter("retrieve_responses", "Responses by status", ["status"], registry=self.registry)
+        self.problems = Counter("retrieve_problems", "Problem documents by kind", ["kind"], registry=self.registry)
+        self.reloads = Counter("retrieve_reloads", "Generations taken up", registry=self.registry)
+        self.reload_failures = Counter(
+            "retrieve_reload_failures", "Generations that could not be opened", registry=self.registry
+        )
+        self.unrecorded = Counter(
+            "retrieve_unrecorded", "What could not be kept, by what", ["what"], registry=self.registry
+        )
+        self.generation = Gauge("retrieve_generation", "1 for the one that answers", ["name"], registry=self.registry)
+
+    def answered(self, results: Mapping[str, float] | QueryResult) -> None:
+        """Count an answer and its stages."""
+        if isinstance(results, QueryResult):
+            self.verdicts.labels(results.verdict).inc()
+            results = results.timing_ms
+        for stage, ms in results.items():
+            self.stages.labels(stage).observe(ms / 1e3)
+
+    def serves(self, generation: str) -> None:
+        """A generation was taken up."""
+        self.generation.clear()
+        self.generation.labels(generation).set(1)
+        self.reloads.inc()
+
+    def page(self) -> bytes:
+        """In Prometheus' text format."""
+        return generate_latest(self.registry)

@@ -1,0 +1,117 @@
+"""The paths of queries: one object, several, an answer grasp by grasp, and where a photo agrees with a touch."""
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from retrieval.search.agreement import agreement
+from retrieval.serve.catalogue import photo_of
+from retrieval.serve.documents import AgreementDocument, BatchDocument, GrowingDocument, QueryDocument
+from retrieval.serve.errors import problems
+from retrieval.serve.generations import Opened
+from retrieval.serve.service import Parts
+from retrieval.serve.uploads import (
+    QUERY_BODY,
+    Asked,
+    BatchBody,
+    Grasps,
+    Picture,
+    check_pictures,
+    json_body,
+    read_json,
+    read_query,
+)
+
+router = APIRouter(tags=["queries"])
+_PROBLEMS = problems("bad-input", "bad-image", "too-large", "too-slow", "unsupported-type", "busy", "late", "not-ready")
+
+
+@router.post(
+    "/v1/query",
+    response_model=QueryDocument,
+    responses=_PROBLEMS,
+    openapi_extra={"requestBody": QUERY_BODY},
+    summary="Which object is in the hand?",
+)
+async def query(request: Request, parts: Parts) -> JSONResponse:
+    """The document of `retrieve query --json` for one or several grasps of one object."""
+    parts.queue.require_room()
+    asked = await read_query(request, parts.generations.current.fingers)
+    result = await parts.queue.ask(asked, request)
+    return JSONResponse(result.to_dict())
+
+
+@router.post(
+    "/v1/query/growing", response_model=GrowingDocument, responses=_PROBLEMS, openapi_extra={"requestBody": QUERY_BODY}
+)
+async def query_growing(request: Request, parts: Parts) -> JSONResponse:
+    """How the answer changes grasp by grasp: after the first, after the first two, and so on."""
+    parts.queue.require_room()
+    asked = await read_query(request, parts.generations.current.fingers)
+    answers = await parts.queue.do(
+        lambda opened: opened.searcher.query_growing(asked.touches, **asked.keywords),
+        request,
+        asked.options.deadline_ms,
+    )
+    return JSONResponse({"answers": [answer.to_dict() for answer in answers]})
+
+
+@router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
+async def query_batch(request: Request, parts: Parts) -> JSONResponse:
+    """Several objects in one request: their touches are encoded together, an answer for each in their order."""
+    parts.queue.require_room()
+    body = await read_json(request, BatchBody)
+    for number, touches in enumerate(body.objects, start=1):
+        check_pictures(touches, body.background, f"object {number}, ")
+    asked = Asked([], body.background, body)
+    answers = await parts.queue.do(
+        lambda opened: opened.searcher.query_many(body.objects, **asked.keywords), request, body.deadline_ms
+    )
+    for answer in answers:
+        parts.metrics.answered(answer)
+    return JSONResponse({"answers": [answer.to_dict() for answer in answers]})
+
+
+class AgreementBody(BaseModel):
+    """A photo of the catalogue by its id, and touches."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    photo: str = Field(min_length=1, max_length=4096, examples=["mug/1.jpg"])
+    touches: Grasps
+    background: list[Picture] | None = None
+    squares: int = Field(8, ge=2, le=16, description="squares of a side")
+
+
+@router.post(
+    "/v1/agreement",
+    response_model=AgreementDocument,
+    responses={**_PROBLEMS, **problems("unknown")},
+    openapi_extra=json_body("AgreementBody"),
+)
+async def agree(request: Request, parts: Parts) -> AgreementDocument:
+    """Where a photo agrees with a touch: the match logit's fall as one square after the other is hidden."""
+    parts.queue.require_room()
+    body = await read_json(request, AgreementBody)
+    check_pictures(body.touches, body.background)
+
+    def work(opened: Opened) -> AgreementDocument:
+        photo = photo_of(opened, body.photo)
+        found = agreement(
+            opened.searcher,
+            body.touches,
+            opened.searcher.catalogue / photo.path,
+            background=body.background,
+            model=opened.checkpoint(),
+            squares=body.squares,
+        )
+        return AgreementDocument(
+            generation=opened.name,
+            photo=body.photo,
+            logit=found.logit,
+            rows=body.squares,
+            columns=body.squares,
+            falls=found.falls.tolist(),
+        )
+
+    return await parts.queue.do(work, request)

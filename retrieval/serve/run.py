@@ -1,0 +1,67 @@
+"""The server around the application: it listens, and SIGTERM or Ctrl-C lets it finish what is in flight."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from retrieval.serve.service import Service
+
+KEEP_ALIVE_S = 5
+MOST_CONNECTIONS = 512
+
+
+class Server(uvicorn.Server):
+    """Ends when it is told to, and then its process has done what it was asked: no signal is raised again."""
+
+    def __init__(self, config: uvicorn.Config, parts: Service, started: Callable[[int], object]) -> None:
+        super().__init__(config)
+        self._parts, self._say_started = parts, started
+
+    async def startup(self, sockets: object = None) -> None:
+        """Listen, and say at which port."""
+        await super().startup(sockets)  # type: ignore[arg-type]
+        if self.started:
+            self._say_started(self.servers[0].sockets[0].getsockname()[1])
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Both signals end it while it serves; what they were before is put back."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Streams, which never end by themselves, end now."""
+        self._parts.stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(app: FastAPI, started: Callable[[int], object]) -> None:
+    """Serve until SIGTERM or Ctrl-C; `started` is told the port as soon as it listens."""
+    parts: Service = app.state.service
+    settings = parts.settings
+    config = uvicorn.Config(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        ws="none",
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=round(settings.deadline_s) + 5,
+    )
+    Server(config, parts, started).run()

@@ -1,0 +1,126 @@
+"""Who may ask, and the headers of every response.
+
+Without a token the service hears this machine alone. A page of a stranger, open in a browser here, is not this
+machine: its requests name the stranger's host or origin, and are refused.
+"""
+
+import hashlib
+import hmac
+import logging
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from retrieval.serve.errors import Problem, problem_of
+from retrieval.serve.settings import ServiceSettings
+
+log = logging.getLogger(__name__)
+COOKIE = "retrieve-token"
+_LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+_OPEN_PATHS = frozenset({"/healthz", "/readyz", "/v1/session", "/openapi.json"})
+"""Without a token: whether it lives, how to say the token, and what it can be asked; the page too, which holds nothing
+of anyone."""
+CONTENT_SECURITY_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' blob: data:",
+        "media-src 'self' blob:",
+        "connect-src 'self'",
+        "font-src 'self'",
+        "manifest-src 'self'",
+        "base-uri 'none'",
+        "form-action 'self'",
+        "frame-ancestors 'none'",
+    )
+)
+HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(self), microphone=(), geolocation=()",
+}
+
+
+def same_token(given: str, token: str) -> bool:
+    """Whether two tokens are equal, in a time that says nothing of either."""
+    digests = [hashlib.sha256(text.encode("utf-8", "replace")).digest() for text in (given, token)]
+    return hmac.compare_digest(*digests)
+
+
+class Guard:
+    """Refuses strangers before anything of a request is read, and adds HEADERS to every response."""
+
+    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
+        self.app, self.settings = app, settings
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        begun = False
+
+        async def with_headers(message: Message) -> None:
+            nonlocal begun
+            if message["type"] == "http.response.start":
+                begun = True
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                if scope["path"].startswith("/v1/"):
+                    headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        if problem := self._refusal(scope["path"], Headers(scope=scope)):
+            await problem.response()(scope, receive, with_headers)
+            return
+        try:
+            await self.app(scope, receive, with_headers)
+        except Exception as error:
+            log.exception("unexpected error at %s", scope["path"])
+            if begun:  # the connection is cut off, so that nobody takes half an answer for one
+                raise
+            await problem_of(error).response()(scope, receive, with_headers)
+
+    def _refusal(self, path: str, headers: Headers) -> Problem | None:
+        host = _host_name(headers.get("host", ""))
+        if self.settings.is_local and host not in _LOCAL_NAMES:
+            return Problem("wrong-host", "this service hears this machine alone: ask it as localhost or 127.0.0.1")
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != headers.get("host"):
+            return Problem("refused", "a page of another origin may not ask this service")
+        if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
+            return Problem("refused", "a page of another site may not ask this service")
+        token = self.settings.token
+        if token is None or path in _OPEN_PATHS or not path.startswith(("/v1/", "/metrics")):
+            return None
+        if any(same_token(given, token) for given in _given_tokens(headers)):
+            return None
+        why = "send the service's token as `Authorization: Bearer TOKEN`"
+        return Problem("no-token", why, {"www-authenticate": "Bearer"})
+
+
+def _host_name(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _given_tokens(headers: Headers) -> list[str]:
+    """By the header of programs, and by the cookie of the page, whose pictures cannot send a header."""
+    scheme, _, value = headers.get("authorization", "").partition(" ")
+    found = [value.strip()] if scheme.lower() == "bearer" else []
+    try:
+        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return found
+    return [*found, *([cookie.value] if cookie else [])]

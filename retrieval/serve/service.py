@@ -1,0 +1,61 @@
+"""What the paths share: the parts of one service, which stand in the application's state."""
+
+from asyncio import Semaphore
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from threading import Event
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from retrieval.serve.generations import Generations
+from retrieval.serve.metrics import Metrics
+from retrieval.serve.queue import Queue
+from retrieval.serve.settings import ServiceSettings
+from retrieval.serve.thumbnails import Thumbnails
+
+
+@dataclass(frozen=True)
+class Grasped:
+    """What a rig felt: the name of the object, and PNG files of the fingers, in their order; of the untouched gels
+    where the rig has seen them."""
+
+    object_id: str
+    touches: list[bytes]
+    background: list[bytes] | None = None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What stands beside the service, as callables that may be asked from any thread.
+
+    sensors: name -> the newest picture as a JPEG file. grasp: closes jaws on one of the objects of these names; None
+    where nothing can be closed. Both may raise anything; the sentence is shown.
+    """
+
+    sensors: Mapping[str, Callable[[], bytes]] = field(default_factory=dict)
+    grasp: Callable[[list[str]], Grasped] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Service:
+    """The parts of one service. streams: places for live pictures. stopping: set when it is to end, for what would
+    never end by itself."""
+
+    settings: ServiceSettings
+    metrics: Metrics
+    generations: Generations
+    queue: Queue
+    bench: Bench
+    thumbnails: Thumbnails
+    streams: Semaphore
+    stopping: Event = field(default_factory=Event)
+
+
+def _service(request: Request) -> Service:
+    found: Service = request.app.state.service
+    return found
+
+
+Parts = Annotated[Service, Depends(_service)]
+"""A parameter of a path that wants the service."""

@@ -1,0 +1,72 @@
+"""What an operator may choose of the service."""
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+
+from retrieval.data.images import MAX_PIXELS
+from retrieval.errors import ConfigError
+
+MAX_BODY_BYTES = 20_000_000
+MAX_BODY_PIXELS = 5 * MAX_PIXELS
+"""Of all pictures of one request together; of each, MAX_PIXELS."""
+MAX_PICTURES = 128
+LEAST_TOKEN = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServiceSettings:
+    """What `retrieve serve` was told.
+
+    host: where it listens; anything but this machine needs a `token` (16 characters at least). queue: requests that
+    are held at once, the one in work among them. workers: requests in work at once. batch_ms: how long a request waits
+    for others to be answered with it; 0 for none. deadline_s: after which an answer is no longer waited for. body_s: by
+    which the body of a request must have come. poll_s: how often a new generation of the index is looked for.
+    keep: queries that are kept for the history. streams: pictures of sensors that run at once.
+    """
+
+    index: Path
+    model: Path | None = None
+    verify: bool = True
+    host: str = "127.0.0.1"
+    port: int = 8000
+    token: str | None = None
+    queue: int = 8
+    workers: int = 1
+    batch_ms: float = 0.0
+    batch_most: int = 8
+    deadline_s: float = 30.0
+    body_s: float = 10.0
+    poll_s: float = 1.0
+    keep: int = 10_000
+    streams: int = 8
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError."""
+        for name in ("queue", "workers", "batch_most", "keep", "streams"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be 1 or more; got {getattr(self, name)}")
+        for name in ("deadline_s", "body_s", "poll_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be more than 0 seconds; got {getattr(self, name)}")
+        if not 0 <= self.batch_ms <= 1000:
+            raise ConfigError(f"batch_ms must be from 0 to 1000; got {self.batch_ms}")
+        if not 0 <= self.port < 2**16:
+            raise ConfigError(f"port must be from 0 to 65535; got {self.port}")
+        if self.token is None and not self.is_local:
+            raise ConfigError(
+                f"{self.host} can be reached from other machines, so a token must be given: write {LEAST_TOKEN} or "
+                "more characters into a file and name it with --token-file, or leave out --host"
+            )
+        if self.token is not None and not (len(self.token) >= LEAST_TOKEN and self.token.isascii()):
+            raise ConfigError(f"a token must be {LEAST_TOKEN} or more ASCII characters; got {len(self.token)}")
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine reaches the service."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False

@@ -1,0 +1,52 @@
+"""A service for tests: in this process, or as the command on a port of its own."""
+
+import re
+import sys
+import threading
+from contextlib import contextmanager
+
+from fastapi.testclient import TestClient
+
+from retrieval.serve.app import create_app
+from retrieval.serve.settings import ServiceSettings
+from tests.waiting import running
+
+
+@contextmanager
+def service(index, beside=None, **settings):
+    """A client of the application, which runs in this process."""
+    app = create_app(ServiceSettings(index=index, **settings), beside)
+    with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
+        yield client
+
+
+@contextmanager
+def command(*options, **popen):
+    """`retrieve serve` as a process, its address, and what it says on stderr, a growing list."""
+    line = [sys.executable, "-m", "retrieval", "serve", *map(str, options)]
+    with running(line, **popen) as process:
+        said, listening = [], threading.Event()
+
+        def listen():
+            for text in process.stderr:
+                said.append(text)
+                if "listening on" in text:
+                    listening.set()
+            listening.set()
+
+        threading.Thread(target=listen, daemon=True).start()
+        assert listening.wait(120), "it did not listen within two minutes"
+        found = re.search(r"listening on (\S+)", "".join(said))
+        assert found, "".join(said)
+        yield process, found[1], said
+
+
+def problem(response, status, kind):
+    """The sentence of a response that must be the problem document of that kind."""
+    assert (response.status_code, response.headers["content-type"]) == (status, "application/problem+json"), (
+        response.text
+    )
+    document = response.json()
+    assert set(document) == {"type", "title", "status", "detail"}
+    assert (document["type"], document["status"]) == (f"urn:touch-retrieval:problem:{kind}", status)
+    return document["detail"]

@@ -1,0 +1,75 @@
+"""The catalogue over HTTP: pages, search, photos by id, nearness; and no file that the index does not name."""
+
+import io
+
+import pytest
+from PIL import Image
+
+from tests.serving import problem, service
+
+
+@pytest.fixture(scope="module")
+def client(index):
+    with service(index) as opened:
+        yield opened
+
+
+def test_the_pages_hold_every_photo_once_in_the_order_of_the_index(client, searcher):
+    found, offset = [], 0
+    while offset is not None:
+        page = client.get("/v1/catalogue", params={"offset": offset, "limit": 7}).json()
+        assert (page["total"], page["offset"], page["generation"]) == (24, offset, searcher.generation.name)
+        found, offset = found + page["items"], page["next"]
+    assert [item["id"] for item in found] == [row["path"] for row in searcher.generation.rows]
+    assert client.get("/v1/catalogue", params={"offset": 500}).json()["items"] == []
+
+
+def test_an_object_and_words_narrow_the_catalogue_down(client, searcher):
+    name = searcher.generation.rows[0]["object_id"]
+    own = client.get("/v1/catalogue", params={"object": name}).json()["items"]
+    assert {item["object_id"] for item in own} == {name}
+    assert len(own) == 3
+    words = f"{name.upper()} 2.jpg"
+    assert [item["id"] for item in client.get("/v1/catalogue", params={"search": words}).json()["items"]] == [
+        f"{name}/2.jpg"
+    ]
+    assert client.get("/v1/catalogue", params={"object": "nobody's"}).json()["total"] == 0
+
+
+def test_a_photo_is_its_file_and_a_thumbnail_is_small(client, catalogue, searcher):
+    name = searcher.generation.rows[0]["path"]
+    whole = client.get(f"/v1/photos/{name}")
+    assert whole.content == (catalogue / name).read_bytes()
+    assert whole.headers["content-type"] == "image/jpeg"
+    small = client.get(f"/v1/thumbnails/{name}", params={"px": 64})
+    assert max(Image.open(io.BytesIO(small.content)).size) == 64
+    for first in (whole, small):
+        again = client.get(first.request.url, headers={"if-none-match": first.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+
+
+@pytest.mark.parametrize("path", ["photos", "thumbnails", "nearest"])
+@pytest.mark.parametrize(
+    "name", ["nobody/1.jpg", "../index/CURRENT", "..%2F..%2Fetc%2Fpasswd", "%2Fetc%2Fpasswd", "%00", "%FF", "."]
+)
+def test_what_the_index_does_not_name_is_unknown_wherever_it_lies(client, path, name):
+    response = client.get(f"/v1/{path}/{name}")
+    assert problem(response, 404, "unknown")
+
+
+def test_the_nearest_photos_are_those_of_the_searcher(client, searcher):
+    from retrieval import nearest_photos
+
+    name = searcher.generation.rows[0]["path"]
+    items = client.get(f"/v1/nearest/{name}", params={"count": 5}).json()["items"]
+    expected = nearest_photos(searcher, name, 5)
+    assert [item["id"] for item in items] == [near.photo.path for near in expected]
+    assert [item["score"] for item in items] == pytest.approx([near.score for near in expected])
+    assert name not in [item["id"] for item in items]
+    assert [item["score"] for item in items] == sorted((item["score"] for item in items), reverse=True)
+
+
+def test_the_index_says_what_answers(client, searcher):
+    said = client.get("/v1/index").json()
+    assert (said["photos"], said["objects"], said["fingers"]) == (24, 8, 2)
+    assert (said["generation"], said["can_grasp"], said["sensors"]) == (searcher.generation.name, False, [])

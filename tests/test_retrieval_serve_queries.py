@@ -1,0 +1,102 @@
+"""Queries over HTTP: the same answer as in Python, however the pictures are sent."""
+
+import base64
+
+import pytest
+
+from tests import synthetic
+from tests.serving import problem, service
+
+
+@pytest.fixture(scope="module")
+def grasps(tmp_path_factory):
+    """Files' contents of two grasps of one object."""
+    objects = synthetic.make_objects(1, seed=9)
+    files = synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 2)[objects[0].object_id]
+    return [[path.read_bytes() for path in grasp] for grasp in files]
+
+
+@pytest.fixture(scope="module")
+def client(index):
+    with service(index) as opened:
+        yield opened
+
+
+def encoded(grasps):
+    return [[base64.b64encode(image).decode() for image in grasp] for grasp in grasps]
+
+
+def form(grasps, **fields):
+    images = [("gelsight", (f"{number}.png", image)) for grasp in grasps for number, image in enumerate(grasp)]
+    return {"files": images, "data": fields}
+
+
+def same(document, result):
+    """All of an answer but how long it took."""
+    expected = result.to_dict()
+    return {**document, "timing_ms": 0} == {**expected, "timing_ms": 0} and set(document["timing_ms"]) == set(
+        expected["timing_ms"]
+    )
+
+
+def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):
+    for given in (grasps[:1], grasps):
+        expected = searcher.query(given, top=3, none_prior=0.2)
+        by_json = client.post("/v1/query", json={"touches": encoded(given), "top": 3, "none_prior": 0.2})
+        by_form = client.post("/v1/query", **form(given, top="3", none_prior="0.2"))
+        assert same(by_json.json(), expected), by_json.text
+        assert same(by_form.json(), expected), by_form.text
+
+
+def test_a_batch_gives_an_answer_for_each_object_in_their_order(client, searcher, grasps):
+    objects = [grasps, grasps[1:]]
+    answers = client.post("/v1/query/batch", json={"objects": [encoded(one) for one in objects]}).json()["answers"]
+    for answer, expected in zip(answers, searcher.query_many(objects), strict=True):
+        assert same(answer, expected)
+
+
+def test_a_growing_query_answers_after_each_grasp(client, searcher, grasps):
+    answers = client.post("/v1/query/growing", json={"touches": encoded(grasps)}).json()["answers"]
+    assert [len(answer["query"]["touches"]) for answer in answers] == [1, 2]
+    for answer, expected in zip(answers, searcher.query_growing(grasps), strict=True):
+        assert same(answer, expected)
+
+
+def test_the_map_of_a_photo_that_is_all_of_one_colour_is_flat_and_a_real_one_is_not(client, searcher, grasps):
+    photo = searcher.generation.rows[0]["path"]
+    found = client.post("/v1/agreement", json={"photo": photo, "touches": encoded(grasps), "squares": 2}).json()
+    assert (found["rows"], found["columns"], [len(row) for row in found["falls"]]) == (2, 2, [2, 2])
+    assert len({fall for row in found["falls"] for fall in row}) > 1
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({"touches": []}, "touches: List should have at least 1 item"),
+        ({"touches": [["%%%"]]}, "touches.0.0: Value error, must be a picture's file in base64"),
+        ({"touches": [["aGk="]], "tops": 3}, "tops: Extra inputs are not permitted"),
+        ({"touches": [["aGk="]], "top": 0}, "top: Input should be greater than or equal to 1"),
+        ({"touches": [["aGk="]], "none_prior": 1}, "none_prior: Input should be less than 1"),
+    ],
+)
+def test_a_body_of_the_wrong_form_is_told_by_place(client, body, said):
+    assert said in problem(client.post("/v1/query", json=body), 422, "bad-input")
+
+
+def test_what_is_no_picture_and_a_missing_finger_are_told_in_our_sentences(client, grasps):
+    told = problem(client.post("/v1/query", json={"touches": [["aGk=", "aGk="]]}), 422, "bad-image")
+    assert told.startswith("grasp 1, finger 1: not a PNG, JPEG, BMP")
+    told = problem(client.post("/v1/query", json={"touches": [encoded(grasps)[0][:1]]}), 422, "bad-input")
+    assert "this model takes 2 gel image(s) for one touch; got 1" in told
+    told = problem(client.post("/v1/query", **form([grasps[0][:1]])), 422, "bad-input")
+    assert "gelsight must be given 2 times for each grasp; got 1" in told
+
+
+def test_a_body_of_another_kind_and_broken_json_are_refused(client):
+    problem(client.post("/v1/query", content=b"x", headers={"content-type": "text/plain"}), 415, "unsupported-type")
+    problem(client.post("/v1/query", content=b"x"), 415, "unsupported-type")
+    broken = client.post("/v1/query", content=b"{", headers={"content-type": "application/json"})
+    problem(broken, 400, "malformed")
+    half = client.post("/v1/query", content=b"--x\r\n", headers={"content-type": "multipart/form-data; boundary=x"})
+    problem(half, 422, "bad-input")
+    problem(client.post("/v1/query", content=b"x", headers={"content-type": "multipart/form-data"}), 400, "malformed")

@@ -1,0 +1,97 @@
+"""Who may ask the service, and what every response says to browsers."""
+
+import pytest
+
+from retrieval.errors import ConfigError
+from retrieval.serve.security import HEADERS
+from retrieval.serve.settings import ServiceSettings
+from tests.serving import problem, service
+
+TOKEN = "a token of some length"
+
+
+@pytest.fixture(scope="module")
+def client(index):
+    with service(index) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def guarded(index):
+    with service(index, host="0.0.0.0", token=TOKEN) as opened:
+        yield opened
+
+
+def test_another_bind_than_this_machine_needs_a_token(index):
+    for host in ("0.0.0.0", "::", "192.168.1.4", "robot.local"):
+        with pytest.raises(ConfigError, match=f"{host} can be reached from other machines, so a token must be given"):
+            ServiceSettings(index=index, host=host)
+        ServiceSettings(index=index, host=host, token=TOKEN)
+    for host in ("127.0.0.1", "::1", "localhost", "127.3.2.1"):
+        ServiceSettings(index=index, host=host)
+    with pytest.raises(ConfigError, match="a token must be 16 or more ASCII characters; got 5"):
+        ServiceSettings(index=index, token="short")
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "", "[::1"])
+def test_a_name_that_leads_here_from_elsewhere_is_refused(client, host):
+    problem(client.get("/v1/index", headers={"host": host}), 421, "wrong-host")
+
+
+def test_a_page_of_another_origin_may_not_ask(client):
+    for headers in ({"origin": "https://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
+        response = client.post("/v1/query", headers=headers)
+        problem(response, 403, "refused")
+        assert not any(name.startswith("access-control") for name in response.headers)
+    assert client.get("/v1/index", headers={"origin": "http://127.0.0.1:8000"}).status_code == 200
+    problem(client.options("/v1/query", headers={"origin": "https://evil.example"}), 403, "refused")
+
+
+def test_only_who_knows_the_token_is_answered(guarded):
+    for headers in (
+        {},
+        {"authorization": "Bearer wrong"},
+        {"authorization": TOKEN},
+        {"cookie": "retrieve-token=wrong"},
+    ):
+        for path in ("/v1/index", "/metrics", "/v1/photos/x", "/v1/nothing"):
+            response = guarded.get(path, headers=headers)
+            problem(response, 401, "no-token")
+            assert response.headers["www-authenticate"] == "Bearer"
+    assert guarded.get("/v1/index", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    assert guarded.get("/healthz").status_code == guarded.get("/").status_code == 200
+
+
+def test_the_page_gets_a_cookie_that_scripts_cannot_read_for_the_token(guarded):
+    problem(guarded.post("/v1/session", json={"token": "wrong"}), 401, "no-token")
+    response = guarded.post("/v1/session", json={"token": TOKEN})
+    cookie = response.headers["set-cookie"]
+    assert (response.status_code, "HttpOnly" in cookie, "SameSite=strict" in cookie) == (204, True, True)
+    assert guarded.get("/v1/index").status_code == 200
+    guarded.delete("/v1/session")
+    problem(guarded.get("/v1/index"), 401, "no-token")
+
+
+@pytest.mark.parametrize("path", ["/", "/v1/index", "/v1/nothing", "/v1/photos/x", "/openapi.json", "/healthz"])
+def test_every_response_tells_browsers_to_run_no_script_but_ours(client, path):
+    response = client.get(path)
+    for name, value in HEADERS.items():
+        assert response.headers[name] == value
+    assert "unsafe-inline" not in HEADERS["content-security-policy"]
+    assert "default-src 'none'" in HEADERS["content-security-policy"]
+
+
+def test_the_page_holds_no_inline_script_or_style(client):
+    page = client.get("/").text
+    assert "<style" not in page
+    assert " style=" not in page
+    assert "<script>" not in page
+
+
+def test_a_failure_says_nothing_of_the_inside(client, monkeypatch):
+    parts = client.app.state.service
+    monkeypatch.setattr(parts.metrics, "page", lambda: 1 / 0)
+    response = client.get("/metrics")
+    told = problem(response, 500, "failed")
+    assert told == "unexpected ZeroDivisionError; the log of the service says more"
+    assert response.headers["x-content-type-options"] == "nosniff"
