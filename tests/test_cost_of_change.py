@@ -32,9 +32,10 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.losses.match import match_loss
 from retrieval.model.towers.small import small
 from retrieval.training.step import batch_loss
-from robot import importers, real_rig
+from robot import exporters, importers, real_rig
 from robot import rig as rigs
 from robot.devices import TactileSensor
+from robot.exporters.base import Exported, whole_folder
 from robot.grasping import gates
 from robot.readings import Frame
 from robot.sim.objects import draw, materials, relief, shapes
@@ -169,6 +170,21 @@ def imported(source, out, progress=None):
     with robot.RecordingWriter(out, {"source": "mine", "sensor": "mine", "background": "none"}) as writer:
         writer.append("1", "a", {"photo": picture, "touch_a": picture})
     return robot.read_recording(out)
+
+
+def add_a_format_to_export_to(monkeypatch, tmp_path):
+    monkeypatch.setitem(exporters.EXPORTERS, "mine", f"{HERE}:exported")
+    imported(tmp_path, tmp_path / "r")
+    assert (
+        command_line.main(["export-recording", str(tmp_path / "r"), "--to", "mine", "--out", str(tmp_path / "o")]) == 0
+    )
+    assert (tmp_path / "o" / "mine").read_text() == "1"
+
+
+def exported(recording, out, *, parts=None, progress=None):
+    with whole_folder(out) as folder:
+        (folder / "mine").write_text(recording.grasps[0].grasp_id)
+    return Exported(out, 1)
 
 
 def add_an_approximation_to_measure(monkeypatch):

@@ -36,6 +36,7 @@ SHORTER = {
     "build-index": [],
     "query": [],
     "export": [],
+    "export-recording": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--quick", "--only", "closing"],
     "serve": ["--port", "0"],

@@ -20,6 +20,7 @@ from retrieval.commands.collect import collect
 from retrieval.commands.demo import demo
 from retrieval.commands.evaluate import evaluate
 from retrieval.commands.export import export
+from retrieval.commands.export_recording import export_recording
 from retrieval.commands.frontier import frontier
 from retrieval.commands.import_ import import_
 from retrieval.commands.options import Command
@@ -42,7 +43,20 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _command in (demo, collect, import_, check, train, build_index, query, export, evaluate, frontier, serve):
+for _command in (
+    demo,
+    collect,
+    import_,
+    export_recording,
+    check,
+    train,
+    build_index,
+    query,
+    export,
+    evaluate,
+    frontier,
+    serve,
+):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)
 app.add_typer(rig.app)

@@ -1,0 +1,98 @@
+"""Open-X-Tactile, as FTP-1 reads it: a zarr store of version 2, whose arrays run along time.
+
+Written after notes on the published stores, none of which was at hand: names, shapes and types of `data` and
+`meta/episode_ends` are theirs; which strings the siblings of a tactile array take was not verified.
+
+    grasps.zarr/meta/episode_ends                (E,) int64: where each episode ends; an episode is a grasp
+    grasps.zarr/data/camera_main_rgb             (T, H, W, 3) uint8: the photo, still through its episode
+    grasps.zarr/data/right_tactile_data_0        (T, fingers, H, W, 3) uint8
+    grasps.zarr/data/right_tactile_{sensor,type,area}_0    the sensor's name, "image", and (fingers,) int64: 0, 1, ...
+
+Beside these, of ours: meta/object_id, meta/grasp_id and what else was recorded of a grasp, (E,) each, and meta/moment,
+(steps of an episode,): "before", "during", "after". Splits are ranges of episodes in the attributes of the store.
+Pictures keep their size, and those of a camera share one.
+"""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robot.exporters.base import Exported, Parts, Steps, in_parts, plain_fields, whole_folder
+from robot.importers.base import Progress, library
+from robot.recording.folder import RecordedGrasp, Recording
+
+STORE = "grasps.zarr"
+_WHAT = "the format of Open-X-Tactile"
+_SAID = ("source", "sensor", "rig", "licence", "citation", "background")
+
+
+def export_open_x_tactile(
+    recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
+) -> Exported:
+    """Write a zarr store of version 2. Raises RecordingError, ImporterError without zarr, StorageError."""
+    zarr = library("zarr", _WHAT)
+    found, notes = in_parts(recording, parts)
+    grasps = [grasp for part in found.values() for grasp in part]
+    steps = Steps(recording, grasps)
+    length = len(steps.moments)
+    if len({steps.sizes[f"touch_{finger}"] for finger in steps.fingers}) > 1:
+        for finger in steps.fingers[1:]:
+            steps.sizes[f"touch_{finger}"] = steps.sizes[f"touch_{steps.fingers[0]}"]
+    with whole_folder(out) as folder:
+        root = zarr.open_group(str(folder / STORE), mode="w", zarr_format=2)
+        ends = np.cumsum([0, *map(len, found.values())]).tolist()
+        root.attrs["splits"] = {part: [ends[at], ends[at + 1]] for at, part in enumerate(found)}
+        root.attrs["recording"] = {key: recording.info.get(key) for key in _SAID}
+        data, meta = root.create_group("data"), root.create_group("meta")
+        photo, touch = (steps.sizes[name] for name in ("photo", f"touch_{steps.fingers[0]}"))
+        photos = _frames(data, "camera_main_rgb", len(grasps) * length, (*photo, 3))
+        touches = _frames(data, "right_tactile_data_0", len(grasps) * length, (len(steps.fingers), *touch, 3))
+        _store(data, "right_tactile_sensor_0", np.array([str(recording.info["sensor"])]))
+        _store(data, "right_tactile_type_0", np.array(["image"]))
+        _store(data, "right_tactile_area_0", np.arange(len(steps.fingers), dtype=np.int64))
+        for episode, grasp in enumerate(grasps):
+            pictures = steps.of(grasp)
+            at = slice(episode * length, (episode + 1) * length)
+            photos[at] = np.stack(pictures["photo"])
+            touches[at] = np.stack([np.stack(pictures[f"touch_{finger}"]) for finger in steps.fingers], axis=1)
+            if progress is not None:
+                progress(episode + 1, len(grasps))
+        for name, values in _lines(grasps).items():
+            _store(meta, name, values)
+        _store(meta, "moment", np.array(steps.moments))
+        _store(meta, "episode_ends", length * np.arange(1, len(grasps) + 1, dtype=np.int64))
+    return Exported(out, len(grasps), (*notes, *steps.remarks()))
+
+
+def _frames(group: Any, name: str, count: int, shape: tuple[int, ...]) -> Any:
+    """Pictures along time, a file each."""
+    return group.create_array(name, shape=(count, *shape), chunks=(1, *shape), dtype="uint8")
+
+
+def _store(group: Any, name: str, values: np.ndarray[Any, Any]) -> None:
+    with warnings.catch_warnings():  # of zarr, on strings in stores of version 3
+        warnings.simplefilter("ignore")
+        array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
+    array[...] = values
+
+
+def _lines(grasps: list[RecordedGrasp]) -> dict[str, np.ndarray[Any, Any]]:
+    """What was recorded of any grasp, by key: (E,) strings, numbers with NaN, and grasped as 1, 0, -1 unknown; poses
+    (E, k)."""
+    rows = [plain_fields(grasp) for grasp in grasps]
+    found: dict[str, np.ndarray[Any, Any]] = {}
+    for key in dict.fromkeys(key for row in rows for key in row):
+        values: list[Any] = [row.get(key) for row in rows]
+        known = next(value for value in values if value is not None)
+        if isinstance(known, str):
+            found[key] = np.array([value or "" for value in values])
+        elif isinstance(known, bool):
+            found[key] = np.array([-1 if value is None else int(value) for value in values], dtype=np.int8)
+        elif isinstance(known, float):
+            found[key] = np.array([np.nan if value is None else value for value in values])
+        else:
+            width = max(len(value) for value in values if value is not None)
+            found[key] = np.array([[*(value or ()), *[np.nan] * width][:width] for value in values])
+    return found
