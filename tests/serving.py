@@ -13,9 +13,9 @@ from tests.waiting import running
 
 
 @contextmanager
-def service(index, beside=None, **settings):
+def service(index, beside=None, recorder=None, trials=None, **settings):
     """A client of the application, which runs in this process."""
-    app = create_app(ServiceSettings(index=index, **settings), beside)
+    app = create_app(ServiceSettings(index=index, **settings), beside, recorder, trials)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
 

@@ -1,6 +1,7 @@
 """`retrieve serve`: the answers over HTTP, and a page."""
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
     from retrieval.serve.service import Bench
+    from robot.recording.folder import RecordingWriter
 
 TOKEN = "RETRIEVE_TOKEN"
 """Variable of the environment that may hold the token."""
@@ -29,6 +31,13 @@ def serve(
     ] = None,
     rig: Annotated[
         str | None, typer.Option(help="rig by name or TOML file, for live pictures (default: sim for its own objects)")
+    ] = None,
+    history: Annotated[
+        Path | None, typer.Option(help="folder for queries and what is said of them (default: INDEX-history)")
+    ] = None,
+    no_history: Annotated[bool, typer.Option("--no-history", help="keep nothing")] = False,
+    trials: Annotated[
+        Path | None, typer.Option(metavar="RECORDING", help="test people with objects the model never saw")
     ] = None,
     queue: Annotated[int, typer.Option(help="requests that are held at once; more are told to come again")] = 8,
     workers: Annotated[int, typer.Option(help="requests in work at once")] = 1,
@@ -59,10 +68,26 @@ def serve(
         workers=workers,
         batch_ms=batch_ms,
         deadline_s=deadline,
+        history=None if no_history else history or path.resolve().with_name(f"{path.resolve().name}-history"),
     )
-    app = create_app(settings, _bench(rig, path))
-    shown = f"[{host}]" if ":" in host else host
-    run(app, lambda bound: say(f"listening on http://{shown}:{bound}"))
+    with ExitStack() as closed:
+        recorder = _recorder(settings.history, path, closed) if settings.history else None
+        app = create_app(settings, _bench(rig, path), recorder, trials)
+        shown = f"[{host}]" if ":" in host else host
+        run(app, lambda bound: say(f"listening on http://{shown}:{bound}"))
+
+
+def _recorder(folder: Path, index: Path, closed: ExitStack) -> "RecordingWriter":
+    """The writer of the recording of what people say. Raises RobotError."""
+    from indexes.store.folder import IndexStore
+    from retrieval.model.stored import read_stored
+    from retrieval.search.defaults import model_of
+    from robot.recording.folder import RecordingWriter
+
+    stored = read_stored(model_of(IndexStore(index).open(verify=False).manifest))
+    info = {"source": "what people said of queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
+    say(f"queries and what is said of them are kept in {folder}")
+    return closed.enter_context(RecordingWriter(folder / "recording", info))
 
 
 def _token(file: Path | None) -> str | None:

@@ -1,8 +1,11 @@
 """What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from retrieval.model.judge import NO_CONTACT, NOT_A_GEL
 
@@ -51,6 +54,7 @@ class QueryResult:
     contact" or "not a gel image"; only grasps with contact were judged. none_probability: that the object is none of
     the catalogue's. posterior: the formula and its numbers (`retrieval.model.posterior`). index: what was searched with
     what. timing_ms: by stage, of this query; of several at once (`Searcher.query_many`) an equal share for each.
+    embeddings: of the grasps, (G, embedding_dim), where they were encoded in this process; in no document.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -68,6 +72,7 @@ class QueryResult:
     none_probability: float | None
     posterior: dict[str, Any] | None
     results: list[Match]
+    embeddings: NDArray[np.float32] | None = field(default=None, repr=False, compare=False)
 
     @property
     def top(self) -> Match | None:

@@ -247,8 +247,8 @@ class Searcher:
                 judged.append(self._judged(halves[felt], rows, top, none_prior))
         timing_ms = clock.finished(len(asked))
         return [
-            self._answer(grasps[its], own.tolist(), timing_ms, found, top, none_prior)
-            for its, (own, *_), found in zip(asked, parts, judged, strict=True)
+            self._answer(grasps[its], own.tolist(), embeddings, timing_ms, found, top, none_prior)
+            for its, (own, _, embeddings), found in zip(asked, parts, judged, strict=True)
         ]
 
     def _candidates(self, embeddings: Floats, k: int) -> Rows:
@@ -301,6 +301,7 @@ class Searcher:
         self,
         grasps: Sequence[Sequence[GivenImage]],
         shown: list[str],
+        embeddings: Floats,
         timing_ms: dict[str, float],
         judged: "_Judged | None",
         top: int,
@@ -327,6 +328,7 @@ class Searcher:
             none_probability=belief.none if belief else None,
             posterior=self._meaning(judged, none_prior) if judged else None,
             results=self._ranking(judged, top) if judged else [],
+            embeddings=embeddings,
         )
 
     def _ranking(self, judged: "_Judged", top: int) -> list[Match]:

@@ -12,26 +12,48 @@ from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from retrieval.serve import bench, catalogue, errors, health, queries
+from retrieval.serve import bench, catalogue, errors, health, history, human, queries
 from retrieval.serve.generations import Generations
+from retrieval.serve.history import FeedbackBody
+from retrieval.serve.human import ChoiceBody, NewRun
+from retrieval.serve.keeping import Keeping
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queries import AgreementBody
 from retrieval.serve.queue import Queue
+from retrieval.serve.recording import Recorder
 from retrieval.serve.security import Guard
 from retrieval.serve.service import Bench, Service
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.thumbnails import Thumbnails
+from retrieval.serve.trials import Trials
 from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
 from retrieval.version import __version__
 
 PAGE = Path(__file__).parent / "page"
 THREADS = 4
 """That read files and make thumbnails; the model has its own."""
-_BODIES: tuple[type[BaseModel], ...] = (QueryBody, BatchBody, AgreementBody, errors.ProblemDocument)
+_BODIES: tuple[type[BaseModel], ...] = (
+    QueryBody,
+    BatchBody,
+    AgreementBody,
+    FeedbackBody,
+    NewRun,
+    ChoiceBody,
+    errors.ProblemDocument,
+)
 
 
-def create_app(settings: ServiceSettings, beside: Bench | None = None) -> FastAPI:
-    """The service over the index of `settings`, which is opened when the application starts."""
+def create_app(
+    settings: ServiceSettings,
+    beside: Bench | None = None,
+    recorder: Recorder | None = None,
+    trials: Path | None = None,
+) -> FastAPI:
+    """The service over the index of `settings`, which is opened when the application starts.
+
+    recorder: writes what people said into the recording in the history's folder; nothing is kept without it. trials: a
+    recording with whose unseen objects people are tested. Raises BadInput.
+    """
     metrics = Metrics()
     generations = Generations(settings, metrics)
     parts = Service(
@@ -41,6 +63,8 @@ def create_app(settings: ServiceSettings, beside: Bench | None = None) -> FastAP
         Queue(generations, settings, metrics),
         beside or Bench(),
         Thumbnails(),
+        Keeping(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
+        Trials(trials) if trials else None,
         asyncio.Semaphore(settings.streams),
     )
     app = FastAPI(
@@ -54,7 +78,7 @@ def create_app(settings: ServiceSettings, beside: Bench | None = None) -> FastAP
     )
     app.state.service = parts
     errors.install(app)
-    for paths in (queries, catalogue, bench, health):
+    for paths in (queries, catalogue, bench, history, human, health):
         app.include_router(paths.router)
     app.mount("/", StaticFiles(directory=PAGE, html=True))
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
@@ -70,15 +94,20 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     parts: Service = app.state.service
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     await asyncio.to_thread(parts.generations.open)
-    running = [asyncio.ensure_future(one) for one in (*parts.queue.workers(), parts.generations.watch())]
+    work = [*parts.queue.workers(), parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
+    running = [asyncio.ensure_future(one) for one in work]
     try:
         yield
     finally:
         parts.stopping.set()
+        if parts.keeping:
+            await parts.keeping.written()
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
         parts.queue.close()
+        if parts.keeping:
+            parts.keeping.close()
 
 
 class Counted:

@@ -27,7 +27,7 @@ from retrieval.serve.service import Parts
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
-_SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """Files that every browser shows, by their first bytes; others are sent as JPEG."""
 _PICTURES: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
@@ -99,7 +99,7 @@ def photo(request: Request, photo: str, parts: Parts) -> Response:
         data = read_bytes(path)
     except ImageError:
         raise _gone(listed.path) from None
-    kind = next((kind for magic, kind in _SHOWN.items() if data.startswith(magic)), None)
+    kind = next((kind for magic, kind in SHOWN.items() if data.startswith(magic)), None)
     if kind is None:
         image = thumbnail(path, WHOLE_PX)
         if image is None:
@@ -173,7 +173,7 @@ def index(parts: Parts) -> IndexDocument:
         candidates=measured.get("k"),
         sensors=sorted(parts.bench.sensors),
         can_grasp=parts.bench.grasp is not None,
-        keeps=False,
-        trials=0,
+        keeps=parts.keeping is not None,
+        trials=len(parts.trials.unseen(opened)) if parts.trials else 0,
         version=__version__,
     )

@@ -26,6 +26,7 @@ class Opened:
 
     def __init__(self, searcher: Searcher) -> None:
         self.searcher, self.generation = searcher, searcher.generation
+        self.model = searcher.checkpoint.digest
         self.fingers: int = searcher.checkpoint.config.matcher.fingers
         self._lock = Lock()
 

@@ -37,8 +37,9 @@ async def query(request: Request, parts: Parts) -> JSONResponse:
     """The document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_room()
     asked = await read_query(request, parts.generations.current.fingers)
-    result = await parts.queue.ask(asked, request)
-    return JSONResponse(result.to_dict())
+    answered = await parts.queue.ask(asked, request)
+    name = parts.keeping.keep(asked, answered) if parts.keeping else None
+    return JSONResponse(answered.result.to_dict(), headers={"x-query-id": name} if name else None)
 
 
 @router.post(

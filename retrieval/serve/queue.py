@@ -10,13 +10,12 @@ import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from starlette.requests import Request
 
 from retrieval.errors import RetrievalError
 from retrieval.search.answer import QueryResult
-from retrieval.search.searcher import Searcher
 from retrieval.serve.errors import Problem
 from retrieval.serve.generations import Generations, Opened
 from retrieval.serve.metrics import Metrics
@@ -24,6 +23,13 @@ from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import Asked
 
 Result = TypeVar("Result")
+
+
+class Answered(NamedTuple):
+    """An answer, and the digest of the model that gave it."""
+
+    result: QueryResult
+    model: str
 
 
 @dataclass(eq=False)
@@ -65,15 +71,16 @@ class Queue:
                 {"retry-after": "1", "connection": "close"},
             )
 
-    async def ask(self, asked: Asked, request: Request) -> QueryResult:
+    async def ask(self, asked: Asked, request: Request) -> Answered:
         """Answer a query. Raises Problem, and the errors of `Searcher.query`."""
-
-        def work(opened: Opened) -> QueryResult:
-            return opened.searcher.query(asked.touches, **asked.keywords)
-
-        result: QueryResult = await self.do(work, request, asked.options.deadline_ms, asked)
-        self._metrics.answered(result)
-        return result
+        answered: Answered = await self.do(
+            lambda opened: Answered(opened.searcher.query(asked.touches, **asked.keywords), opened.model),
+            request,
+            asked.options.deadline_ms,
+            asked,
+        )
+        self._metrics.answered(answered.result)
+        return answered
 
     async def do(
         self,
@@ -154,17 +161,18 @@ async def _gone(request: Request) -> None:
 
 def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
     """The answer of each job, or the exception that is its answer; one bad query spoils no other."""
-    if len(jobs) > 1 and (together := _batch(opened.searcher, jobs)) is not None:
+    if len(jobs) > 1 and (together := _batch(opened, jobs)) is not None:
         return list(together)
     return [_answer(opened, job) for job in jobs]
 
 
-def _batch(searcher: Searcher, jobs: list[_Job]) -> list[QueryResult] | None:
+def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
     try:
-        return searcher.query_many([one.touches for one in asked], **asked[0].keywords)
+        found = opened.searcher.query_many([one.touches for one in asked], **asked[0].keywords)
     except RetrievalError:
         return None
+    return [Answered(result, opened.model) for result in found]
 
 
 def _answer(opened: Opened, job: _Job) -> Any:

@@ -9,10 +9,12 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from retrieval.serve.generations import Generations
+from retrieval.serve.keeping import Keeping as Keeping
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.thumbnails import Thumbnails
+from retrieval.serve.trials import Trials
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Service:
     queue: Queue
     bench: Bench
     thumbnails: Thumbnails
+    keeping: Keeping | None
+    trials: Trials | None
     streams: Semaphore
     stopping: Event = field(default_factory=Event)
 

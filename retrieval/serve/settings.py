@@ -22,7 +22,8 @@ class ServiceSettings:
     are held at once, the one in work among them. workers: requests in work at once. batch_ms: how long a request waits
     for others to be answered with it; 0 for none. deadline_s: after which an answer is no longer waited for. body_s: by
     which the body of a request must have come. poll_s: how often a new generation of the index is looked for.
-    keep: queries that are kept for the history. streams: pictures of sensors that run at once.
+    history: folder where queries are kept, and what is said of them; None keeps nothing. keep, keep_bytes: queries of
+    which nothing was said, and their gel images, that are kept at most. streams: pictures of sensors that run at once.
     """
 
     index: Path
@@ -38,12 +39,14 @@ class ServiceSettings:
     deadline_s: float = 30.0
     body_s: float = 10.0
     poll_s: float = 1.0
+    history: Path | None = None
     keep: int = 10_000
+    keep_bytes: int = 4 * 2**30
     streams: int = 8
 
     def __post_init__(self) -> None:
         """Raises ConfigError."""
-        for name in ("queue", "workers", "batch_most", "keep", "streams"):
+        for name in ("queue", "workers", "batch_most", "keep", "keep_bytes", "streams"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be 1 or more; got {getattr(self, name)}")
         for name in ("deadline_s", "body_s", "poll_s"):

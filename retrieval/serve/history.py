@@ -1,0 +1,321 @@
+"""The paths of the history: queries that were answered, touches near a touch, what people said; all of it as a file."""
+
+import asyncio
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from string import ascii_lowercase
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from indexes.store.rows import key_of
+from retrieval.data.images import read_bytes
+from retrieval.errors import BadInput, ImageError
+from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
+from retrieval.search.objects import listed_photo
+from retrieval.serve.catalogue import SHOWN
+from retrieval.serve.documents import QueryDocument
+from retrieval.serve.errors import Problem, problems
+from retrieval.serve.generations import Opened
+from retrieval.serve.recording import recordable
+from retrieval.serve.service import Keeping, Parts, Service
+from retrieval.serve.store import BACKGROUND, NONE, OBJECT, RIGHT, Kept
+from retrieval.serve.uploads import json_body, read_json
+
+router = APIRouter(tags=["history"])
+Said = Literal["right", "object", "none"]
+
+
+class HistoryItem(BaseModel):
+    """A query that was answered. touches: where the gel images of each grasp lie; said, object_id: what a person said
+    of it, null before."""
+
+    id: str
+    time: str
+    verdict: str
+    best: str | None
+    probability: float | None
+    generation: str
+    touches: list[list[str]]
+    said: Said | None
+    object_id: str | None
+
+
+class HistoryDocument(BaseModel):
+    """A page of the history, the newest first."""
+
+    total: int
+    offset: int
+    next: int | None
+    items: list[HistoryItem]
+
+
+class HistoryEntry(HistoryItem):
+    """A query with its whole answer."""
+
+    answer: QueryDocument
+
+
+class NearTouch(HistoryItem):
+    """score: inner product of the two mean embeddings, 1 for equal touches."""
+
+    score: float
+
+
+class NearTouchesDocument(BaseModel):
+    """Touches near a touch, the nearest first. compared: how many the same model encoded."""
+
+    id: str
+    compared: int
+    items: list[NearTouch]
+
+
+class FeedbackBody(BaseModel):
+    """right: the answer was; object: it was the object named; none: it is not in the catalogue."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    query: str = Field(min_length=1, max_length=64, description="the X-Query-Id of the answer")
+    said: Said
+    object_id: str | None = Field(None, min_length=1, max_length=1000)
+
+
+class FeedbackDocument(BaseModel):
+    """What is kept. recorded: whether the grasps are in the recording, for which the object must have a photo."""
+
+    query: str
+    said: Said
+    object_id: str | None
+    recorded: bool
+
+
+def _keeping(parts: Service) -> Keeping:
+    if parts.keeping is None:
+        raise Problem("unknown", "this service keeps no queries; it was started with --no-history")
+    return parts.keeping
+
+
+async def _entry(parts: Service, name: str) -> Kept:
+    """A query by its id; one that was answered just now is being written."""
+    keeping = _keeping(parts)
+    await keeping.written()
+    kept = await run_in_threadpool(keeping.store.query, name)
+    if kept is None:
+        raise Problem("unknown", f"the history has no query {name[:64]!r}; the oldest are left out")
+    return kept
+
+
+def _item(kept: Kept) -> dict[str, Any]:
+    best = (kept.answer["results"] or [{}])[0]
+    touches = [
+        [f"/v1/history/{kept.id}/touches/{grasp}/{ascii_lowercase[finger]}" for finger in range(len(images))]
+        for grasp, images in enumerate(kept.answer["query"]["touches"], start=1)
+    ]
+    return {
+        "id": kept.id,
+        "time": datetime.fromtimestamp(kept.time, UTC).isoformat(timespec="milliseconds"),
+        "verdict": kept.verdict,
+        "best": best.get("object_id"),
+        "probability": best.get("probability"),
+        "generation": kept.answer["index"]["generation"],
+        "touches": touches,
+        "said": kept.said,
+        "object_id": kept.object_id,
+    }
+
+
+@router.get("/v1/history", responses=problems("unknown", "bad-input"))
+async def history(
+    parts: Parts,
+    offset: Annotated[int, Query(ge=0, le=2**31)] = 0,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    search: Annotated[str, Query(max_length=200, description="words of verdict, object and what was said")] = "",
+    said: Annotated[Literal["right", "object", "none", "nothing"] | None, Query()] = None,
+) -> HistoryDocument:
+    """Queries that were answered, the newest first."""
+    keeping = _keeping(parts)
+    await keeping.written()
+    total, found = await run_in_threadpool(
+        lambda: keeping.store.history(words=search.split()[:20], said=said, offset=offset, limit=limit)
+    )
+    end = offset + len(found)
+    items = [HistoryItem(**_item(kept)) for kept in found]
+    return HistoryDocument(total=total, offset=offset, next=end if end < total and found else None, items=items)
+
+
+@router.get("/v1/history/{name}", responses=problems("unknown"))
+async def entry(name: str, parts: Parts) -> HistoryEntry:
+    """A query with its whole answer."""
+    kept = await _entry(parts, name)
+    return HistoryEntry(**_item(kept), answer=QueryDocument(**kept.answer))
+
+
+@router.get(
+    "/v1/history/{name}/touches/{grasp}/{finger}",
+    response_class=Response,
+    responses={200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"}, **problems("unknown")},
+)
+async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
+    """A gel image as it was sent; what browsers do not show, as PNG. grasp: from 1, 0 for the no-contact frames."""
+    kept = await _entry(parts, name)
+    data = None
+    if BACKGROUND <= grasp <= len(kept.answer["query"]["touches"]):
+        data = await run_in_threadpool(_keeping(parts).store.picture, name, grasp, finger)
+    if data is None:
+        raise Problem("unknown", f"the query has no picture of grasp {grasp}, finger {finger[:10]!r}")
+    shown = await run_in_threadpool(recordable, data)
+    kind = next(kind for magic, kind in SHOWN.items() if shown.startswith(magic))
+    return Response(shown, media_type=kind, headers={"cache-control": "private, max-age=86400, immutable"})
+
+
+@router.get("/v1/history/{name}/nearest", responses=problems("unknown", "bad-input"))
+async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearTouchesDocument:
+    """Touches of the history that feel to the model like this one."""
+    await _entry(parts, name)
+    store, model = _keeping(parts).store, parts.generations.current.model
+    names, vectors = await run_in_threadpool(store.vectors, model)
+    if name not in names:
+        raise Problem("bad-input", "another model encoded this touch, or it felt nothing: there is nothing to compare")
+    own = names.index(name)
+    scores = vectors @ vectors[own]
+    order = [place for place in np.lexsort((names, -scores)).tolist() if place != own][:count]
+    items = []
+    for place in order:
+        kept = await run_in_threadpool(store.query, names[place])
+        if kept is not None:
+            items.append(NearTouch(**_item(kept), score=float(scores[place])))
+    return NearTouchesDocument(id=name, compared=len(names), items=items)
+
+
+# What people say ------------------------------------------------------------------------------------------------------
+
+
+@router.post(
+    "/v1/feedback",
+    status_code=201,
+    responses=problems("unknown", "bad-input", "conflict"),
+    openapi_extra=json_body("FeedbackBody"),
+)
+async def feedback(request: Request, parts: Parts, response: Response) -> FeedbackDocument:
+    """Say whether an answer was right. When this is answered, what was said outlives the machine; saying the same twice
+    is saying it once (200), saying another thing is refused."""
+    body = await read_json(request, FeedbackBody)
+    kept = await _entry(parts, body.query)
+    keeping, opened = _keeping(parts), parts.generations.current
+
+    def say() -> tuple[bool, bool, str | None]:
+        said, name, photo = _meant(body, kept, opened)
+        new = keeping.store.say(body.query, said, name, photo)
+        keeping.recording.bring_up()
+        return new, photo is not None, name
+
+    try:
+        new, recorded, name = await asyncio.shield(asyncio.to_thread(say))
+    except BadInput as error:
+        raise Problem("conflict", str(error)) from error
+    response.status_code = 201 if new else 200
+    return FeedbackDocument(query=body.query, said=body.said, object_id=name, recorded=recorded)
+
+
+def _meant(body: FeedbackBody, kept: Kept, opened: Opened) -> tuple[str, str | None, bytes | None]:
+    """What is kept of a word: what was said, of which object, and its photo. Raises Problem."""
+    results = kept.answer["results"]
+    if body.said == RIGHT:
+        if body.object_id is not None:
+            raise Problem("bad-input", 'said "right" names no object; say "object" to name one')
+        if kept.verdict == NONE_OF_THESE:
+            return RIGHT, None, None
+        if kept.verdict not in (MATCH, UNCALIBRATED):
+            raise Problem("bad-input", f'the answer was "{kept.verdict}", which says nothing of an object')
+        return RIGHT, results[0]["object_id"], _photo(opened, results[0]["photo"])
+    if body.said == NONE:
+        return NONE, body.object_id, None
+    if body.object_id is None:
+        raise Problem("bad-input", 'said "object" must name it in object_id')
+    shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
+    return OBJECT, body.object_id, _photo(opened, shown or _first_photo(opened, body.object_id))
+
+
+def _first_photo(opened: Opened, object_id: str) -> str:
+    rows = np.flatnonzero(opened.generation.rows.keys("object_id") == key_of(object_id))
+    if not len(rows):
+        raise Problem("bad-input", f'the index has no object {object_id!r}; say "none" where the catalogue lacks it')
+    return listed_photo(opened.generation.rows[int(rows[0])]).path
+
+
+def _photo(opened: Opened, photo: str) -> bytes | None:
+    """Its file; None where it is gone, and then the grasps are kept but in no recording."""
+    try:
+        listed = listed_photo(opened.generation.rows[opened.generation.row_number(photo)])
+        return read_bytes(opened.searcher.catalogue / listed.path)
+    except (KeyError, ImageError):
+        return None
+
+
+# Export ---------------------------------------------------------------------------------------------------------------
+
+
+@router.get(
+    "/v1/export.zip",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"application/zip": {}}, "description": "the archive"}, **problems("unknown")},
+)
+async def export(parts: Parts) -> StreamingResponse:
+    """All that is kept, as an archive: `recording/`, which `retrieve train` reads, and `history.jsonl`, a line for each
+    query with its answer and what was said."""
+    keeping = _keeping(parts)
+    await keeping.written()
+    headers = {"content-disposition": 'attachment; filename="retrieve-history.zip"'}
+    return StreamingResponse(_archive(keeping), media_type="application/zip", headers=headers)
+
+
+def _archive(keeping: Keeping) -> Iterator[bytes]:
+    """One file after the other, so that memory holds one."""
+    sink = _Sink()
+    with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:  # pictures are compressed already
+        folder = keeping.folder / "recording"
+        for path in _files_of(folder):
+            archive.write(path, f"recording/{path.relative_to(folder)}")
+            yield sink.taken()
+        with archive.open("history.jsonl", "w", force_zip64=True) as lines:
+            for name in keeping.store.names():
+                if (kept := keeping.store.query(name)) is not None:
+                    lines.write(json.dumps({**_item(kept), "answer": kept.answer}).encode() + b"\n")
+                    yield sink.taken()
+    yield sink.taken()
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Of a recording, the lines after the images: what they name is in the archive."""
+    found = [folder / "recording.json", *sorted((folder / "images").glob("*.*")), folder / "metadata.jsonl"]
+    return [path for path in found if path.is_file() and path.suffix != ".part"]
+
+
+class _Sink(io.RawIOBase):
+    """What is written into it is taken out again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._parts: list[bytes] = []
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Hold it until it is taken."""
+        self._parts.append(bytes(data))
+        return len(data)
+
+    def taken(self) -> bytes:
+        """All that was written since."""
+        parts, self._parts = self._parts, []
+        return b"".join(parts)

@@ -1,0 +1,297 @@
+"""What the service keeps, in SQLite: queries with their gel images and answers, what people said of them, trials.
+
+Write-ahead log and `synchronous = FULL`: when a method that writes returns, what it wrote outlives the process and the
+machine. One connection, one thread at a time.
+"""
+
+import json
+import secrets
+import sqlite3
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from string import ascii_lowercase
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput, RetrievalError
+from retrieval.search.answer import QueryResult
+
+RIGHT, OBJECT, NONE = "right", "object", "none"
+SAID = (RIGHT, OBJECT, NONE)
+_APPLICATION, _VERSION = 0x746F7563, 1
+_TRIM_EVERY = 32
+_SCHEMA = """
+CREATE TABLE queries (
+    id TEXT PRIMARY KEY, time REAL NOT NULL, verdict TEXT NOT NULL, answer TEXT NOT NULL, search TEXT NOT NULL,
+    model TEXT NOT NULL, vector BLOB, bytes INTEGER NOT NULL
+) STRICT;
+CREATE TABLE pictures (
+    query TEXT NOT NULL REFERENCES queries ON DELETE CASCADE, grasp INTEGER NOT NULL, finger TEXT NOT NULL,
+    data BLOB NOT NULL, PRIMARY KEY (query, grasp, finger)
+) STRICT;
+CREATE TABLE said (
+    query TEXT PRIMARY KEY REFERENCES queries, time REAL NOT NULL, said TEXT NOT NULL, object_id TEXT,
+    photo BLOB
+) STRICT;
+CREATE TABLE runs (
+    id TEXT PRIMARY KEY, time REAL NOT NULL, who TEXT NOT NULL, seed INTEGER NOT NULL, count INTEGER NOT NULL,
+    recording TEXT NOT NULL
+) STRICT;
+CREATE TABLE choices (
+    run TEXT NOT NULL REFERENCES runs, number INTEGER NOT NULL, choice INTEGER NOT NULL, truth INTEGER NOT NULL,
+    model INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (run, number)
+) STRICT;
+"""
+BACKGROUND = 0
+"""The number of the grasp that the no-contact frames are kept as."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A query of the history. said: what a person said of it, one of SAID, and of which object; None before."""
+
+    id: str
+    time: float
+    verdict: str
+    answer: dict[str, Any]
+    said: str | None
+    object_id: str | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """A series of trials that one person does."""
+
+    id: str
+    time: float
+    who: str
+    seed: int
+    count: int
+    recording: str
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen in a trial, counted from 1: by the person, in truth, and by the model."""
+
+    number: int
+    choice: int
+    truth: int
+    model: int
+
+
+def new_id() -> str:
+    """A name that nobody guesses; later ones sort after earlier ones."""
+    return f"{time.time_ns() // 1_000_000:011x}{secrets.token_hex(6)}"
+
+
+class Store:
+    """The database in a file, made where there is none. Raises BadInput for another file, RetrievalError where the disk
+    refuses."""
+
+    def __init__(self, path: Path, keep: int, keep_bytes: int) -> None:
+        self.path, self._keep, self._keep_bytes = path, keep, keep_bytes
+        self._lock, self._since_trim = Lock(), 0
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+        try:
+            self._prepare()
+        except sqlite3.DatabaseError as error:
+            self._database.close()
+            raise BadInput(f"{path} must be the history of a service: {error}; name another folder") from error
+
+    def _prepare(self) -> None:
+        said = self._database.execute
+        said("PRAGMA journal_mode = WAL")
+        said("PRAGMA synchronous = FULL")
+        said("PRAGMA foreign_keys = ON")
+        if said("PRAGMA user_version").fetchone()[0] == 0 and not said("SELECT 1 FROM sqlite_master").fetchone():
+            self._database.executescript(
+                f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA application_id = {_APPLICATION};"
+                f"PRAGMA user_version = {_VERSION}; COMMIT;"
+            )
+        found = said("PRAGMA application_id").fetchone()[0], said("PRAGMA user_version").fetchone()[0]
+        if found != (_APPLICATION, _VERSION):
+            raise sqlite3.DatabaseError(f"it is of another program or version ({found[1]})")
+
+    def close(self) -> None:
+        """Write what stands in the log into the file, and let go of it."""
+        with self._lock:
+            self._database.close()
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """A transaction that is on the disk when this ends, or never was."""
+        with self._lock:
+            try:
+                self._database.execute("BEGIN IMMEDIATE")
+                yield self._database
+                self._database.execute("COMMIT")
+            except BaseException as error:
+                if self._database.in_transaction:
+                    self._database.execute("ROLLBACK")
+                if isinstance(error, sqlite3.Error) and not isinstance(error, sqlite3.IntegrityError):
+                    raise RetrievalError(f"{self.path} cannot be written: {error}") from error
+                raise
+
+    def _read(self, text: str, values: Sequence[Any] = ()) -> list[Any]:
+        with self._lock:
+            return self._database.execute(text, values).fetchall()
+
+    # Queries ------------------------------------------------------------------------------------------------
+
+    def keep(
+        self,
+        name: str,
+        touches: Sequence[Sequence[bytes]],
+        background: Sequence[bytes] | None,
+        result: QueryResult,
+        model: str,
+    ) -> None:
+        """Keep a query. model: digest of the one whose embeddings the answer carries."""
+        pictures = [
+            (name, number, ascii_lowercase[finger], data)
+            for number, images in enumerate([background or (), *touches])
+            for finger, data in enumerate(images)
+        ]
+        words = [result.verdict, *(match.object_id for match in result.results[:1])]
+        vector = None
+        if result.embeddings is not None and len(result.embeddings):
+            mean = result.embeddings.mean(axis=0)
+            vector = (mean / max(float(np.linalg.norm(mean)), 1e-12)).astype("<f4").tobytes()
+        size = sum(len(data) for *_, data in pictures)
+        row = (name, time.time(), result.verdict, json.dumps(result.to_dict()), _searched(words), model, vector, size)
+        with self._writing() as database:
+            database.execute("INSERT INTO queries VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
+            database.executemany("INSERT INTO pictures VALUES (?, ?, ?, ?)", pictures)
+            self._since_trim += 1
+            if self._since_trim >= _TRIM_EVERY:
+                self._since_trim = 0
+                self._trim(database)
+
+    def _trim(self, database: sqlite3.Connection) -> None:
+        """The oldest of which nothing was said go."""
+        database.execute(
+            """DELETE FROM queries WHERE id IN (SELECT id FROM (
+                SELECT id, ROW_NUMBER() OVER newest AS number, SUM(bytes) OVER newest AS total FROM queries
+                WHERE id NOT IN (SELECT query FROM said) WINDOW newest AS (ORDER BY id DESC)
+            ) WHERE number > ? OR total > ?)""",
+            (self._keep, self._keep_bytes),
+        )
+
+    def history(
+        self, *, words: Sequence[str] = (), said: str | None = None, offset: int = 0, limit: int = 100
+    ) -> tuple[int, list[Kept]]:
+        """How many queries hold all words and of which this was said ("nothing": no one said anything), and some of
+        them, the newest first."""
+        conditions = ["instr(search, ?) > 0"] * len(words)
+        values: list[Any] = [word.casefold() for word in words]
+        if said == "nothing":
+            conditions.append("said IS NULL")
+        elif said is not None:
+            conditions.append("said = ?")
+            values.append(said)
+        where = f"FROM queries LEFT JOIN said ON query = id WHERE {' AND '.join(conditions) or '1'}"
+        total = self._read(f"SELECT COUNT(*) {where}", values)[0][0]
+        found = self._read(f"SELECT {_COLUMNS} {where} ORDER BY id DESC LIMIT ? OFFSET ?", [*values, limit, offset])
+        return total, [_kept(row) for row in found]
+
+    def names(self) -> list[str]:
+        """The ids of all queries, the oldest first."""
+        return [name for (name,) in self._read("SELECT id FROM queries ORDER BY id")]
+
+    def query(self, name: str) -> Kept | None:
+        """A query by its id."""
+        found = self._read(f"SELECT {_COLUMNS} FROM queries LEFT JOIN said ON query = id WHERE id = ?", [name])  # noqa: S608
+        return _kept(found[0]) if found else None
+
+    def picture(self, name: str, grasp: int, finger: str) -> bytes | None:
+        """A gel image as it was sent; grasp: from 1, BACKGROUND for a no-contact frame."""
+        values = (name, grasp, finger)
+        found = self._read("SELECT data FROM pictures WHERE query = ? AND grasp = ? AND finger = ?", values)
+        return found[0][0] if found else None
+
+    def pictures(self, name: str) -> dict[tuple[int, str], bytes]:
+        """All gel images of a query by grasp and finger."""
+        found = self._read("SELECT grasp, finger, data FROM pictures WHERE query = ? ORDER BY grasp, finger", [name])
+        return {(grasp, finger): data for grasp, finger, data in found}
+
+    def vectors(self, model: str) -> tuple[list[str], NDArray[np.float32]]:
+        """The queries that this model encoded, and their unit embeddings (Q, embedding_dim)."""
+        found = self._read("SELECT id, vector FROM queries WHERE model = ? AND vector IS NOT NULL", [model])
+        vectors = np.array([np.frombuffer(vector, "<f4") for _, vector in found], dtype=np.float32)
+        return [name for name, _ in found], vectors
+
+    # What people said -----------------------------------------------------------------------------------------
+
+    def say(self, name: str, said: str, object_id: str | None, photo: bytes | None) -> bool:
+        """Keep what was said of a query; False where the same was said before. Raises BadInput where something else
+        was."""
+        before = self._read("SELECT said, object_id FROM said WHERE query = ?", [name])
+        if before:
+            if before[0] == (said, object_id):
+                return False
+            raise BadInput(f"of this query was said already: {before[0][0]}, {before[0][1] or 'no object'}")
+        try:
+            with self._writing() as database:
+                database.execute("INSERT INTO said VALUES (?, ?, ?, ?, ?)", (name, time.time(), said, object_id, photo))
+                more = _searched([said, object_id or ""])
+                database.execute("UPDATE queries SET search = search || ? WHERE id = ?", (more, name))
+        except sqlite3.IntegrityError:  # said between the two steps
+            return self.say(name, said, object_id, photo)
+        return True
+
+    def recordable(self) -> list[tuple[str, str]]:
+        """Queries whose object is known and has a photo, with the object; in the order in which it was said."""
+        found = self._read("SELECT query, object_id FROM said WHERE photo IS NOT NULL ORDER BY time, query")
+        return [(name, object_id) for name, object_id in found]
+
+    def photo(self, name: str) -> bytes | None:
+        """The photo of the object that was said."""
+        found = self._read("SELECT photo FROM said WHERE query = ?", [name])
+        return found[0][0] if found else None
+
+    # Trials -------------------------------------------------------------------------------------------------
+
+    def add_run(self, run: Run) -> None:
+        """Keep a new series of trials."""
+        with self._writing() as database:
+            values = (run.id, run.time, run.who, run.seed, run.count, run.recording)
+            database.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", values)
+
+    def runs(self, recording: str) -> list[Run]:
+        """All series of a recording's objects, the newest first."""
+        return [Run(*row) for row in self._read("SELECT * FROM runs WHERE recording = ? ORDER BY id DESC", [recording])]
+
+    def choose(self, run: str, choice: Choice) -> bool:
+        """Keep what was chosen; False where something was chosen before."""
+        try:
+            with self._writing() as database:
+                values = (run, choice.number, choice.choice, choice.truth, choice.model, time.time())
+                database.execute("INSERT INTO choices VALUES (?, ?, ?, ?, ?, ?)", values)
+        except sqlite3.IntegrityError:
+            return False
+        return True
+
+    def choices(self, run: str) -> list[Choice]:
+        """What was chosen so far, by number."""
+        found = self._read("SELECT number, choice, truth, model FROM choices WHERE run = ? ORDER BY number", [run])
+        return [Choice(*row) for row in found]
+
+
+_COLUMNS = "id, queries.time, verdict, answer, said, object_id"
+
+
+def _kept(row: tuple[Any, ...]) -> Kept:
+    name, when, verdict, answer, said, object_id = row
+    return Kept(name, when, verdict, json.loads(answer), said, object_id)
+
+
+def _searched(words: Sequence[str]) -> str:
+    return "".join(f"\n{word.casefold()}" for word in words)

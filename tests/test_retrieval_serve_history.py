@@ -1,0 +1,247 @@
+"""What is kept: queries, what people said of them as a recording that training reads, and trials with people."""
+
+import base64
+import io
+import json
+import shutil
+import zipfile
+
+import pytest
+
+from retrieval.data.check.recording import check_recording
+from retrieval.data.dataset import load_grasps
+from retrieval.serve.store import Store
+from robot.recording.folder import RecordingWriter
+from tests import synthetic
+from tests.serving import problem, service
+
+INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    """The contents of two grasps of each of three objects of the catalogue, by object."""
+    files = synthetic.write_queries(tmp_path_factory.mktemp("touches"), synthetic.make_objects(3, seed=9), 2)
+    return {name: [[path.read_bytes() for path in grasp] for grasp in grasps] for name, grasps in files.items()}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "history"
+
+
+@pytest.fixture
+def client(index, folder):
+    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as opened:
+        yield opened
+
+
+def ask(client, grasps, **more):
+    encoded = [[base64.b64encode(image).decode() for image in grasp] for grasp in grasps]
+    response = client.post("/v1/query", json={"touches": encoded, **more})
+    assert response.status_code == 200, response.text
+    return response.headers["x-query-id"], response.json()
+
+
+def say(client, query, said, object_id=None):
+    return client.post("/v1/feedback", json={"query": query, "said": said, "object_id": object_id})
+
+
+def test_a_query_is_kept_with_its_answer_and_its_gel_images(client, touches):
+    grasps = next(iter(touches.values()))
+    query, answer = ask(client, grasps)
+    entry = client.get(f"/v1/history/{query}").json()
+    assert entry["answer"] == answer
+    assert (entry["id"], entry["said"], entry["best"]) == (query, None, answer["results"][0]["object_id"])
+    assert [[client.get(path).content for path in paths] for paths in entry["touches"]] == grasps
+
+
+def test_the_history_is_paged_from_the_newest_and_searched(client, touches):
+    asked = [ask(client, grasps[:1])[0] for grasps in touches.values()]
+    say(client, asked[0], "object", sorted(touches)[0])
+    first = client.get("/v1/history", params={"limit": 2}).json()
+    rest = client.get("/v1/history", params={"limit": 2, "offset": first["next"]}).json()
+    assert [item["id"] for item in first["items"] + rest["items"]] == asked[::-1]
+    assert (first["total"], rest["next"]) == (3, None)
+    words = {"search": f"object {sorted(touches)[0].upper()}"}
+    assert [item["id"] for item in client.get("/v1/history", params=words).json()["items"]] == asked[:1]
+    for said, found in (("nothing", asked[:0:-1]), ("object", asked[:1]), ("none", [])):
+        assert [item["id"] for item in client.get("/v1/history", params={"said": said}).json()["items"]] == found
+
+
+def test_what_people_said_is_a_recording_that_training_and_the_check_read(client, touches, folder, catalogue):
+    names = sorted(touches)
+    for name, grasps in touches.items():
+        query, _ = ask(client, grasps)
+        response = say(client, query, "object", name)
+        assert (response.status_code, response.json()["recorded"]) == (201, True)
+    recorded = load_grasps(folder / "recording")
+    assert sorted(grasp.object_id for grasp in recorded) == sorted(names * 2)
+    for grasp in recorded:
+        place = int(grasp.grasp_id[-2:])
+        assert [path.read_bytes() for path in grasp.touches] == touches[grasp.object_id][place]
+        assert grasp.photo.read_bytes() in [path.read_bytes() for path in (catalogue / grasp.object_id).iterdir()]
+    assert not [found for found in check_recording(folder / "recording") if found.severity == "error"]
+
+
+def test_the_right_answer_is_recorded_as_the_object_that_was_found(client, touches, folder):
+    query, answer = ask(client, next(iter(touches.values())), none_prior=0.001)
+    assert answer["verdict"] in ("match", "uncalibrated")
+    said = say(client, query, "right").json()
+    assert said == {"query": query, "said": "right", "object_id": answer["results"][0]["object_id"], "recorded": True}
+    assert load_grasps(folder / "recording")[0].object_id == answer["results"][0]["object_id"]
+
+
+def test_what_was_said_once_is_kept_once_and_not_changed(client, touches, folder):
+    query, _ = ask(client, next(iter(touches.values())))
+    name = sorted(touches)[0]
+    assert [say(client, query, "object", name).status_code for _ in range(3)] == [201, 200, 200]
+    assert "said already: object" in problem(say(client, query, "none"), 409, "conflict")
+    assert len(load_grasps(folder / "recording")) == 2
+
+
+def test_an_object_that_the_catalogue_lacks_is_kept_but_in_no_recording(client, touches, folder):
+    query, _ = ask(client, next(iter(touches.values())))
+    assert say(client, query, "none", "a new mug").json()["recorded"] is False
+    assert client.get(f"/v1/history/{query}").json()["object_id"] == "a new mug"
+    assert (folder / "recording" / "metadata.jsonl").read_bytes() == b""
+
+
+def test_words_that_mean_nothing_are_refused(client, touches):
+    query, _ = ask(client, next(iter(touches.values())))
+    problem(say(client, "no such query", "none"), 404, "unknown")
+    assert "must name it" in problem(say(client, query, "object"), 422, "bad-input")
+    assert "the index has no object" in problem(say(client, query, "object", "nobody's"), 422, "bad-input")
+    assert "names no object" in problem(say(client, query, "right", "x"), 422, "bad-input")
+
+
+def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index, touches, folder):
+    class Full(RecordingWriter):
+        def append(self, *args, **fields):
+            raise OSError("the disk is full")
+
+    name, grasps = next(iter(touches.items()))
+    with Full(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
+        query, _ = ask(client, grasps)
+        assert say(client, query, "object", name).status_code == 201
+        assert b'retrieve_unrecorded_total{what="said"} 1.0' in client.get("/metrics").content
+    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
+        client.get("/v1/history")
+    assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
+
+
+def test_the_nearest_touch_of_a_touch_is_its_copy(client, touches):
+    asked = [ask(client, grasps[:1])[0] for grasps in touches.values()]
+    copy, _ = ask(client, next(iter(touches.values()))[:1])
+    near = client.get(f"/v1/history/{copy}/nearest").json()
+    assert near["compared"] == 4
+    assert near["items"][0]["id"] == asked[0]
+    assert near["items"][0]["score"] == pytest.approx(1, abs=1e-5)
+    assert copy not in [item["id"] for item in near["items"]]
+
+
+def test_the_oldest_queries_of_which_nothing_was_said_go(index, touches, tmp_path, searcher):
+    store = Store(tmp_path / "h.sqlite", keep=2, keep_bytes=2**40)
+    result = searcher.query(next(iter(touches.values())))
+    for number in range(40):
+        store.keep(f"{number:03}", [[b"a"]], None, result, "m")
+        if number == 3:
+            store.say("003", "none", None, None)
+    assert store.names() == ["003", *(f"{number:03}" for number in range(30, 40))]
+    store.close()
+    small = Store(tmp_path / "h.sqlite", keep=1000, keep_bytes=3)
+    for number in range(40, 72):
+        small.keep(f"{number:03}", [[b"a"]], None, result, "m")
+    assert small.names() == ["003", "069", "070", "071"]
+    small.close()
+
+
+def test_a_file_of_another_program_is_no_history(tmp_path):
+    from retrieval.errors import BadInput
+
+    (tmp_path / "x").write_bytes(b"not a database, for sure" * 100)
+    with pytest.raises(BadInput, match="must be the history of a service"):
+        Store(tmp_path / "x", 1, 1)
+
+
+def test_the_export_holds_the_recording_and_every_query(client, touches, tmp_path):
+    asked = []
+    for name, grasps in touches.items():
+        query, _ = ask(client, grasps)
+        say(client, query, "object", name)
+        asked.append(query)
+    archive = zipfile.ZipFile(io.BytesIO(client.get("/v1/export.zip").content))
+    assert archive.testzip() is None
+    archive.extractall(tmp_path / "out")
+    assert len(load_grasps(tmp_path / "out" / "recording")) == 6
+    lines = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
+    assert [json.loads(line)["id"] for line in lines] == asked
+
+
+def test_a_service_that_keeps_nothing_says_so(index, touches):
+    with service(index) as client:
+        encoded = [[base64.b64encode(image).decode() for image in next(iter(touches.values()))[0]]]
+        assert "x-query-id" not in client.post("/v1/query", json={"touches": encoded}).headers
+        for path in ("/v1/history", "/v1/export.zip", "/v1/history/x", "/v1/trials"):
+            problem(client.get(path), 404, "unknown")
+
+
+# The human test -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def examined(index, folder, tmp_path):
+    """A service with a recording of twelve objects that the model never saw."""
+    unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(12, seed=500), 2)
+    with (
+        RecordingWriter(folder / "recording", INFO) as writer,
+        service(index, None, writer, unseen, history=folder) as opened,
+    ):
+        yield opened
+
+
+def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(examined):
+    known = examined.app.state.service
+    drawn = [known.trials.trial(known.generations.current, 5, number) for number in range(1, 25)]
+    for trial in drawn:
+        owners = [path.name.rsplit("-", 1)[0] for path in trial.photos]
+        assert len(set(owners)) == 10
+        assert owners[trial.truth - 1] == trial.grasp.object_id
+        assert trial.photos[trial.truth - 1] != trial.grasp.photo  # of another grasp
+    assert len({trial.grasp.object_id for trial in drawn[:12]}) == 12
+    assert [trial.truth for trial in drawn] == [
+        known.trials.trial(known.generations.current, 5, number).truth for number in range(1, 25)
+    ]
+
+
+def test_a_series_counts_the_persons_choices_beside_the_models(examined):
+    assert examined.get("/v1/trials").json()["objects"] == 12
+    run = examined.post("/v1/trials", json={"count": 4, "who": "Ada", "seed": 3}).json()
+    where, right, model = f"/v1/trials/{run['id']}", 0, 0
+    assert (run["next"], run["human"]["share"], run["chance"]) == (1, None, 0.1)
+    for number in (1, 2, 3):
+        trial = examined.get(f"{where}/{number}").json()
+        assert (trial["truth"], trial["model"], len(trial["touches"]), len(trial["photos"])) == (None, None, 2, 10)
+        for path in (*trial["touches"], *trial["photos"]):
+            assert examined.get(path).headers["content-type"].startswith("image/")
+        done = examined.post(f"{where}/{number}", json={"choice": 4}).json()
+        right, model = right + (done["truth"] == 4), model + (done["model"] == done["truth"])
+    problem(examined.post(f"{where}/1", json={"choice": 1}), 409, "conflict")
+    problem(examined.post(f"{where}/5", json={"choice": 1}), 404, "unknown")
+    state = examined.get(where).json()
+    assert (state["answered"], state["next"]) == (3, 4)
+    assert (state["human"]["right"], state["model"]["right"]) == (right, model)
+    assert state["human"]["trials"] == state["model"]["trials"] == 3
+    assert 0 <= state["human"]["low"] <= state["human"]["share"] <= state["human"]["high"] <= 1
+
+
+def test_too_few_unseen_objects_are_told(index, folder, recording, tmp_path):
+    """The model was trained on most objects of that recording."""
+    shutil.copytree(recording, tmp_path / "seen")
+    with (
+        RecordingWriter(folder / "recording", INFO) as writer,
+        service(index, None, writer, tmp_path / "seen", history=folder) as client,
+    ):
+        assert "needs 10 objects that the model was not trained on" in problem(
+            client.post("/v1/trials", json={}), 422, "bad-input"
+        )
