@@ -26,6 +26,7 @@ class Importer(Protocol):
 
 IMPORTERS = {
     "billets": "robot.importers.billets:import_billets",
+    "folder": "robot.importers.folder:import_folder",
     "vt60": "robot.importers.vt60:import_vt60",
 }
 

@@ -255,7 +255,7 @@ def numbered(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Match[str]
     if not folder.is_dir():
         return []
     found = [(match, path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name))]
-    return sorted(found, key=lambda each: _natural(each[1].name))
+    return sorted(found, key=lambda each: natural(each[1].name))
 
 
 def folders(parent: Path) -> list[Path]:
@@ -263,13 +263,13 @@ def folders(parent: Path) -> list[Path]:
     try:
         return sorted(
             (path for path in parent.iterdir() if path.is_dir() and not path.name.startswith(".")),
-            key=lambda path: _natural(path.name),
+            key=lambda path: natural(path.name),
         )
     except OSError as error:
         raise ImporterError(f"{parent} cannot be read: {error.strerror}") from error
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural(name: str) -> list[tuple[int, str]]:
     """Digits compare as numbers, after text."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)] + [(0, name)]
 

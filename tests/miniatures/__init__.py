@@ -12,18 +12,19 @@ import numpy as np
 
 
 def picture(path: Path, seed: int, size: tuple[int, int] = (12, 16), **changes: Any) -> Path:
-    """Write a drawn picture of (H, W), other for another seed; `grey`: one channel. Returns its path."""
+    """Write a drawn picture of (H, W), other for another seed; `grey`: one channel, `noise`: of every pixel."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encoded(path.suffix, seed, size, **changes))
     return path
 
 
-def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False) -> bytes:
+def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False, noise: bool = False) -> bytes:
     """The content of such a file."""
-    return bytes(cv2.imencode(suffix, pixels(seed, size)[..., 0] if grey else pixels(seed, size))[1].tobytes())
+    drawn = pixels(seed, size, noise)
+    return bytes(cv2.imencode(suffix, drawn[..., 0] if grey else drawn)[1].tobytes())
 
 
-def pixels(seed: int, size: tuple[int, int] = (12, 16)) -> Any:
-    """(H, W, 3) uint8, smooth."""
-    small = np.random.default_rng(seed).integers(0, 256, (3, 4, 3), dtype=np.uint8)
+def pixels(seed: int, size: tuple[int, int] = (12, 16), noise: bool = False) -> Any:
+    """(H, W, 3) uint8, smooth or noise."""
+    small = np.random.default_rng(seed).integers(0, 256, (*(size if noise else (3, 4)), 3), dtype=np.uint8)
     return cv2.resize(small, size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,0 +1,199 @@
+"""Pictures of one's own, by patterns and by files of pairs; what holds of every importer is in test_robot_importers."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.errors import ImporterError
+from robot.importers.folder import _Pattern, import_folder
+from tests.miniatures import folder, picture
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
+@pytest.fixture
+def source(tmp_path):
+    folder.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+def told(recording):
+    """(grasp, object, name of the photo's drawing) in order."""
+    return [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps]
+
+
+def photo_of(recording, source, number):
+    """The path in the source of a grasp's photo."""
+    data = (recording.folder / recording.grasps[number].photo).read_bytes()
+    (path,) = [path for path in source.rglob("*.jpg") if path.read_bytes() == data]
+    return path.relative_to(source).as_posix()
+
+
+# Patterns ------------------------------------------------------------------------------------------------------
+
+
+def test_the_folder_names_the_object_and_the_ninth_comes_before_the_tenth(source, tmp_path):
+    recording = import_folder(source, tmp_path / "out")
+    assert told(recording)[:3] == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-10", "mug")]
+    assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can"}
+
+
+def test_touches_are_dealt_to_the_photos_of_their_object_in_turn(source, tmp_path):
+    recording = import_folder(source, tmp_path / "out")
+    photos = [photo_of(recording, source, number) for number in range(3)]
+    assert photos == ["mug/photo_1.jpg", "mug/photo_2.jpg", "mug/photo_1.jpg"]
+    assert len(list((tmp_path / "out/images").iterdir())) == 6 + 4
+
+
+def test_words_that_both_patterns_have_must_agree(tmp_path):
+    for number in (1, 2, 3):
+        picture(tmp_path / f"src/day1/mug/{number}_touch.png", number)
+        picture(tmp_path / f"src/day1/mug/{number}_photo.jpg", 10 + number)
+    (tmp_path / "src/day1/mug/2_photo.jpg").unlink()
+    options = {"touch": "{sequence}/{object}/{n}_touch", "photo": "{sequence}/{object}/{n}_photo"}
+    recording = import_folder(tmp_path / "src", tmp_path / "out", **options)
+    assert told(recording) == [("mug-day1-1", "mug"), ("mug-day1-3", "mug")]
+    assert photo_of(recording, tmp_path / "src", 1) == "day1/mug/3_photo.jpg"
+    assert {grasp.sequence_id for grasp in recording.grasps} == {"day1"}
+    assert recording.info["skipped"] == {"no photo agrees with it": 1}
+
+
+def test_fingers_are_put_together_and_a_grasp_that_lacks_one_is_told(tmp_path):
+    for finger in ("left", "right"):
+        picture(tmp_path / f"src/rest_{finger}.png", len(finger))
+        for number in (1, 2):
+            picture(tmp_path / f"src/mug/touch_{number}_{finger}.png", 10 * number + len(finger))
+    picture(tmp_path / "src/mug/photo_1.jpg", 5)
+    (tmp_path / "src/mug/touch_2_left.png").unlink()
+    options = {"touch": "{object}/touch_{n}_{finger}", "background": "rest_{finger}"}
+    recording = import_folder(tmp_path / "src", tmp_path / "out", sensor="DIGIT", **options)
+    (grasp,) = recording.grasps
+    assert grasp.grasp_id == "mug-1"
+    left = (tmp_path / "src/mug/touch_1_left.png").read_bytes()
+    assert (tmp_path / "out" / grasp.touches["a"]).read_bytes() == left
+    right = (tmp_path / "src/rest_right.png").read_bytes()
+    assert (tmp_path / "out" / grasp.touches_before["b"]).read_bytes() == right
+    assert recording.info["skipped"] == {"a finger has no picture": 1}
+    assert (recording.info["sensor"], recording.info["fingers"]) == ("DIGIT", 2)
+    assert recording.info["background"] != "none"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"touch": "{object}/felt_*"}, r"must hold a touch that fits '\{object\}/felt_\*'.*such as mug/notes\.png"),
+        ({"photo": "{object}/seen_*"}, "must hold a photo that fits"),
+        ({"touch": "touch_*"}, r"must say where \{object\} stands"),
+        ({"touch": "{object}/{"}, "must hold one word each"),
+        ({"touch": "{object}/{1}"}, "must be letters"),
+        ({"touch": "{object}/*", "photo": "{object}/*"}, "fits both patterns"),
+        ({"pairs": "gone.csv"}, "is not there"),
+    ],
+)
+def test_wrong_patterns_are_refused_in_a_sentence(source, tmp_path, options, said):
+    with pytest.raises(ImporterError, match=said):
+        import_folder(source, tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+@given(st.text("ab/*{}nobject_.", max_size=30), st.text("ab/_.n", max_size=20))
+def test_any_pattern_is_taken_or_refused(text, path):
+    try:
+        pattern = _Pattern("touch", text)
+    except ImporterError:
+        return
+    words = pattern.fit(path)
+    assert words is None or all(value in path for value in words.values())
+
+
+# Files of pairs ------------------------------------------------------------------------------------------------
+
+
+def write_pairs(source, kind, rows):
+    path = source / f"pairs.{kind}"
+    if kind == "csv":
+        columns = list(rows[0])
+        lines = [",".join(columns), *(",".join(str(row.get(each, "")) for each in columns) for row in rows)]
+        path.write_text("\n".join(lines))
+    else:
+        path.write_text("\n".join(map(json.dumps, rows)))
+    return path.name
+
+
+def row(number, **changes):
+    plain = {"object": "mug", "photo": "mug/photo_1.jpg", "touch": f"mug/touch_{number}.png"}
+    return {**plain, "sequence": "monday", "force_n": 2.5, **changes}
+
+
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_a_file_of_pairs_is_a_grasp_a_line(source, tmp_path, kind):
+    name = write_pairs(source, kind, [row(1), row(10, background="mug/touch_2.png"), row(2)])
+    recording = import_folder(source, tmp_path / "out", pairs=name)
+    assert told(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
+    touch = (tmp_path / "out" / recording.grasps[1].touches["a"]).read_bytes()
+    assert touch == (source / "mug/touch_10.png").read_bytes()
+    assert {(grasp.sequence_id, grasp.force_n) for grasp in recording.grasps} == {("monday", 2.5)}
+    assert len({grasp.photo for grasp in recording.grasps}) == 1
+
+
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_lines_that_are_wrong_are_skipped_by_reason(source, tmp_path, kind):
+    wrong = [row(2, photo=""), row(2, touch="../../etc/touch.png"), row(2, force_n="much"), row(3)]
+    name = write_pairs(source, kind, [row(1), *wrong])
+    recording = import_folder(source, tmp_path / "out", pairs=name)
+    assert told(recording) == [("mug-1", "mug")]
+    assert recording.info["skipped"] == {
+        "its line lacks its object, its photo or a touch": 1,
+        "a path must lead to a file below the folder, from there on": 1,
+        "force_n, opening_mm, time_s must be numbers": 1,
+        "its touch a is missing": 1,
+    }
+
+
+def test_a_line_that_is_no_json_costs_its_own_grasp(source, tmp_path):
+    name = write_pairs(source, "jsonl", [row(1), row(2)])
+    (source / name).write_text((source / name).read_text().replace("\n", "\n{half\n[1]\n"))
+    recording = import_folder(source, tmp_path / "out", pairs=name)
+    assert told(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
+    assert recording.info["skipped"] == {"its line is not a JSON object": 2}
+
+
+@pytest.mark.parametrize("content", [b"", b"object,photo\nmug,x.jpg\n", b"\xff\xfe\x00", b"object\x00,photo", b"[]\n"])
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_a_file_that_lists_no_pairs_is_refused(source, tmp_path, kind, content):
+    (source / f"pairs.{kind}").write_bytes(content)
+    with pytest.raises(ImporterError, match=r"pairs\.(csv|jsonl)"):
+        import_folder(source, tmp_path / "out", pairs=f"pairs.{kind}")
+    assert not (tmp_path / "out").exists()
+
+
+def resident_mb():
+    """Of this process, now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
+def test_memory_does_not_grow_with_the_pictures(source, tmp_path):
+    """100,000 rows of a picture of 4 kB: 400 MB. What grows is the names of the grasps, 0.1 kB each."""
+    picture(source / "noise.png", 1, (40, 40), noise=True)
+    assert (source / "noise.png").stat().st_size > 4000
+    with open(source / "pairs.jsonl", "w") as file:
+        for _ in range(100_000):
+            file.write(json.dumps(row(1, touch="noise.png")) + "\n")
+    at = {}
+
+    def look(done, total):
+        assert total == 100_000
+        if done % 10_000 == 0:
+            at[done] = resident_mb()
+
+    recording = import_folder(source, tmp_path / "out", look, pairs="pairs.jsonl")
+    assert len(recording.grasps) == 100_000
+    shutil.rmtree(tmp_path / "out")
+    assert at[100_000] - at[10_000] < 40, at
