@@ -26,8 +26,12 @@ class Importer(Protocol):
 
 IMPORTERS = {
     "billets": "robot.importers.billets:import_billets",
+    "feeling-of-success": "robot.importers.feeling_of_success:import_feeling_of_success",
     "folder": "robot.importers.folder:import_folder",
+    "objectfolder": "robot.importers.objectfolder:import_objectfolder",
+    "visgel": "robot.importers.visgel:import_visgel",
     "vt60": "robot.importers.vt60:import_vt60",
+    "ycb-slide": "robot.importers.ycb_slide:import_ycb_slide",
 }
 
 

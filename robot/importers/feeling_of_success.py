@@ -1,0 +1,156 @@
+"""The Feeling of Success: 9,269 grasps of a hundred everyday objects with two GelSights and a Kinect.
+
+    calandra_corl2017_000.h5 ... calandra_corl2017_037.h5    250 grasps each (extra `importers`)
+        /data/i0, /data/i1, ...                              groups with the attributes object_name, is_gripping
+            kinectA_rgb_before, _during, _after              (H, W, 3) uint8
+            gelsightA_before, _during, _after, gelsightB_... (H, W, 3) uint8
+
+The photo is the Kinect's before the grasp; "during" is after closing and before the lift, "before" and "after" are
+kept as the untouched gel and the gel after the lift. `grasped` is what the data set says (`is_gripping`): training
+leaves the others out. Grasps of one object that follow each other are a sequence. Nothing in the files is unpickled,
+and what they link to in other files is not followed.
+"""
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Images, Item, Progress, Skip, import_items, library, name_of, numbered
+from robot.recording.folder import Recording
+
+DATA_SET = DataSet(
+    source="The Feeling of Success",
+    licence="not stated in its files; see its page, doi 10.25532/OPARA-700",
+    citation="Calandra, Owens, Upadhyaya, Yuan, Lin, Adelson, Levine, The Feeling of Success: Does Touch Sensing Help "
+    "Predict Grasp Outcomes?, CoRL 2017",
+    sensor="GelSight",
+    rig="Sawyer, Weiss WSG-50, Kinect 2",
+    fingers=2,
+    background="before each grasp",
+    expects="`calandra_corl2017_000.h5` to `calandra_corl2017_037.h5`, or some of them",
+    traps=(
+        "The gels of 2017 carry black marks, which move with shear.",
+        "Objects were grasped one after the other, so that light and gel drift with the object: print the control of "
+        "the blurred touch beside every result.",
+    ),
+    unverified=(
+        "how the published files are compressed: blosc needs pip install hdf5plugin",
+        "that the first colour is red",
+        "that a name stands for one object: earlier files cut names off, so that an object might have two",
+    ),
+)
+_FILE = re.compile(r".*\.(h5|hdf5)")
+_GRASP = re.compile(r"i(\d+)")
+_COLUMNS = {
+    "photo": "kinectA_rgb_before",
+    **{f"touch_{ours}": f"gelsight{theirs}_during" for ours, theirs in (("a", "A"), ("b", "B"))},
+    **{f"touch_{ours}_before": f"gelsight{theirs}_before" for ours, theirs in (("a", "A"), ("b", "B"))},
+    **{f"touch_{ours}_after": f"gelsight{theirs}_after" for ours, theirs in (("a", "A"), ("b", "B"))},
+}
+_MOST_PIXELS = 50_000_000
+_BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError)
+"""What h5py raises for damaged files."""
+
+
+def import_feeling_of_success(src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    """Import the HDF5 files in `src`. Raises ImporterError where it holds none, and where h5py is missing."""
+    files = [path for _, path in numbered(Path(src), _FILE)]
+    if not files:
+        raise DATA_SET.refusal(Path(src), "it holds no HDF5 file")
+    h5py = library("h5py", "The Feeling of Success")
+    with contextlib.suppress(ImportError):
+        import_module("hdf5plugin")  # which registers its filters
+    total = sum(_count(h5py, path) for path in files)
+    return import_items(DATA_SET, _items(h5py, files), out, total=total, progress=progress)
+
+
+def _count(h5py: Any, path: Path) -> int:
+    try:
+        with h5py.File(path) as file:
+            return len(file["data"])
+    except _BROKEN:
+        return 1
+
+
+def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
+    last, run = "", 0
+    for path in files:
+        try:
+            file = h5py.File(path)
+        except OSError:
+            yield Skip("its file is not HDF5, or is cut off", path.name)
+            continue
+        with file:
+            for group in _groups(h5py, file):
+                if isinstance(group, Skip):
+                    yield Skip(group.reason, path.name)
+                    continue
+                name = name_of(path.stem, group.name.rpartition("/")[2])
+                object_id, grasped = _attributes(group)
+                if object_id is None or grasped is None:
+                    yield Skip("its object_name or is_gripping is missing", name)
+                    continue
+                if object_id != last:
+                    last, run = object_id, run + 1
+                images: Images = {column: _reader(h5py, group, dataset) for column, dataset in _COLUMNS.items()}
+                yield Item(name, object_id, images, {"grasped": grasped, "sequence_id": f"{object_id}-{run}"})
+
+
+def _groups(h5py: Any, file: Any) -> Iterator[Any]:
+    """The grasps of a file, in the order of their numbers; or why there are none."""
+    data = _own(h5py, file, "data")
+    if not isinstance(data, h5py.Group):
+        yield Skip("its file has no /data, as files of another version", "")
+        return
+    try:
+        names = [name for name in data if isinstance(name, str) and _GRASP.fullmatch(name)]
+    except _BROKEN:
+        yield Skip("its file is not HDF5, or is cut off", "")
+        return
+    for name in sorted(names, key=lambda name: int(name[1:])):
+        group = _own(h5py, data, name)
+        yield group if isinstance(group, h5py.Group) else Skip("a grasp is no group", "")
+
+
+def _own(h5py: Any, group: Any, name: str) -> Any:
+    """What stands under a name in the file itself; None for nothing, and for links to elsewhere."""
+    try:
+        return group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    except _BROKEN:
+        return None
+
+
+def _attributes(group: Any) -> tuple[str | None, bool | None]:
+    try:
+        name, grasped = group.attrs.get("object_name"), group.attrs.get("is_gripping")
+    except _BROKEN:
+        return None, None
+    text = name.decode(errors="replace") if isinstance(name, bytes) else str(name) if name is not None else ""
+    try:
+        return text.strip() or None, None if grasped is None else bool(grasped)
+    except ValueError:
+        return None, None
+
+
+def _reader(h5py: Any, group: Any, name: str) -> Callable[[], npt.NDArray[Any]]:
+    """Reads a picture when it is its turn. It raises ImporterError, which names no file."""
+
+    def read() -> npt.NDArray[Any]:
+        dataset = _own(h5py, group, name)
+        try:
+            if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+                raise ImporterError(f"its {name} is missing")
+            height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
+            if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MOST_PIXELS:
+                raise ImporterError(f"its {name} is not a picture of 8-bit colours")
+            return dataset[()]  # type: ignore[no-any-return]
+        except _BROKEN as error:
+            raise ImporterError(f"its {name} cannot be read; blosc needs pip install hdf5plugin") from error
+
+    return read

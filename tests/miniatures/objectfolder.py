@@ -1,0 +1,34 @@
+"""A pack of the benchmark: four real objects, the tenth before the hundredth, and the split by objects.
+
+`write_samples`: two samples of ObjectFolder Real, with the table of names.
+"""
+
+import json
+from pathlib import Path
+
+from tests.miniatures import picture
+
+OBJECTS = ("2", "10", "31", "100")
+INSTANCES = (1, 2, 10)
+GRASPS = len(OBJECTS) * len(INSTANCES)
+SPLIT = {"train": ["2", "31"], "val": ["10"], "test": ["100"]}
+
+
+def write(folder: Path, width: int = 32) -> None:
+    for number, name in enumerate(OBJECTS):
+        for instance in INSTANCES:
+            picture(folder / "touch" / name / f"{instance}.png", 100 * number + instance, (24, width))
+            picture(folder / "vision" / name / f"{instance}.png", 100 * number + 50 + instance, (16, 16))
+    (folder / "audio_spectrogram/2").mkdir(parents=True)
+    (folder / "audio_spectrogram/2/1.npy").write_bytes(b"\x93NUMPY")
+    parts = {part: {name: list(INSTANCES) for name in names} for part, names in SPLIT.items()}
+    (folder / "split.json").write_text(json.dumps(parts))
+
+
+def write_samples(folder: Path) -> None:
+    for number in (3, 20):
+        picture(folder / str(number) / "visual/0.png", number, (27, 48))
+        picture(folder / str(number) / "tactile/0.png", 50 + number, (24, 32))
+        (folder / str(number) / "audio").mkdir()
+    table = "Index,Name,Material\n3,Ladle,Wood\n20,Ladle,Steel\n"
+    (folder / "objectfolder_real_metadata.csv").write_text(table)

@@ -1,0 +1,152 @@
+"""The Feeling of Success: HDF5 and what may be wrong with it; the rest stands in test_robot_importers."""
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from retrieval.data.dataset import load_attempts, load_grasps
+from robot.errors import ImporterError
+from robot.importers import base
+from robot.importers.feeling_of_success import import_feeling_of_success
+from tests.miniatures import feeling_of_success, pixels
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+FIRST = "calandra_corl2017_000"
+
+
+@pytest.fixture
+def source(tmp_path):
+    feeling_of_success.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+@pytest.fixture
+def data(source):
+    """/data of the first file, to be changed."""
+    with h5py.File(source / f"{FIRST}.h5", "r+") as file:
+        yield file["data"]
+
+
+def rgb(path):
+    return cv2.imread(str(path))[..., ::-1]
+
+
+def test_the_tenth_grasp_comes_after_the_ninth_and_pictures_are_kept_as_they_are(source, tmp_path):
+    recording = import_feeling_of_success(source, tmp_path / "out")
+    assert [grasp.grasp_id for grasp in recording.grasps][9:11] == [f"{FIRST}-i9", f"{FIRST}-i10"]
+    grasp = recording.grasps[3]
+    want = {"photo": 60, "touch_a": 66, "touch_b": 71, "touch_a_before": 65, "touch_b_after": 72}
+    for column, seed in want.items():
+        size = (18, 32) if column == "photo" else (32, 24)
+        np.testing.assert_array_equal(rgb(tmp_path / "out" / grasp.images()[column]), pixels(seed, size))
+
+
+def test_what_slipped_is_told_and_no_matcher_is_trained_on_it(source, tmp_path):
+    """Of the seeds 0, 20, ... 220 and 1000, 100 divides 0, 100, 200 and 1000."""
+    import_feeling_of_success(source, tmp_path / "out")
+    failed = [one.grasp.grasp_id for one in load_attempts(tmp_path / "out") if not one.held]
+    assert failed == [f"{FIRST}-i0", f"{FIRST}-i5", f"{FIRST}-i10", "calandra_corl2017_001-i0"]
+    assert len(load_grasps(tmp_path / "out")) == 9
+
+
+def test_grasps_of_one_object_in_a_row_are_a_sequence(source, tmp_path):
+    recording = import_feeling_of_success(source, tmp_path / "out")
+    assert [grasp.sequence_id for grasp in recording.grasps] == ["soda_can-1"] * 10 + ["lemon-2"] * 2 + ["soda_can-3"]
+
+
+def changed(source, tmp_path):
+    """What is skipped of the first file."""
+    return import_feeling_of_success(source, tmp_path / "out").info["skipped"]
+
+
+def test_a_grasp_that_lacks_a_picture_or_a_name_is_skipped(source, data, tmp_path):
+    del data["i3"]["gelsightB_during"]
+    del data["i4"].attrs["is_gripping"]
+    data.file.close()
+    assert changed(source, tmp_path) == {
+        "its gelsightB_during is missing": 1,
+        "its object_name or is_gripping is missing": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 4), np.uint8), 3]
+)
+def test_what_is_no_picture_is_skipped(source, data, tmp_path, wrong):
+    del data["i3"]["kinectA_rgb_before"]
+    data["i3"]["kinectA_rgb_before"] = wrong
+    data.file.close()
+    assert changed(source, tmp_path) == {"its kinectA_rgb_before is not a picture of 8-bit colours": 1}
+
+
+def test_a_picture_of_absurd_size_is_not_read(source, data, tmp_path):
+    del data["i3"]["kinectA_rgb_before"]
+    data["i3"].create_dataset("kinectA_rgb_before", (1_000_000, 1_000_000, 3), np.uint8, chunks=(64, 64, 3))
+    data.file.close()
+    assert changed(source, tmp_path) == {"its kinectA_rgb_before is not a picture of 8-bit colours": 1}
+
+
+@pytest.mark.parametrize("how", ["link", "external", "soft"])
+def test_what_lies_in_other_files_is_not_followed(source, data, tmp_path, how):
+    (tmp_path / "secret").write_bytes(bytes(range(48)))
+    del data["i3"]["kinectA_rgb_before"]
+    if how == "link":
+        data["i3"]["kinectA_rgb_before"] = h5py.ExternalLink(str(source / "other.h5"), "/x")
+    elif how == "soft":
+        data["i3"]["kinectA_rgb_before"] = h5py.SoftLink("/data/i4/kinectA_rgb_before")
+    else:
+        data["i3"].create_dataset(
+            "kinectA_rgb_before", (4, 4, 3), np.uint8, external=[(str(tmp_path / "secret"), 0, 48)]
+        )
+    data.file.close()
+    assert changed(source, tmp_path) == {"its kinectA_rgb_before is missing": 1}
+
+
+@pytest.mark.slow
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=300), st.booleans())
+def test_a_damaged_file_costs_grasps_and_no_traceback(source, tmp_path, changes, at_its_head):
+    path = source / "calandra_corl2017_001.h5"
+    whole = path.read_bytes()
+    damaged = bytearray(whole)
+    for share, value in changes:
+        damaged[int(share * (min(len(whole), 4096) if at_its_head else len(whole))) - 1] = value
+    path.write_bytes(damaged)
+    with tempfile.TemporaryDirectory(dir=tmp_path) as out:
+        recording = import_feeling_of_success(source, Path(out) / "out")
+    path.write_bytes(whole)
+    assert 12 <= len(recording.grasps) <= feeling_of_success.GRASPS
+
+
+def test_a_file_of_another_version_is_skipped_and_alone_refused(tmp_path):
+    (tmp_path / "src").mkdir()
+    with h5py.File(tmp_path / "src/2016-06-30.hdf5", "w") as file:
+        file["GelSightA_image"] = np.zeros(4, np.uint8)
+    with pytest.raises(ImporterError, match=r"no /data, as files of another version, such as 2016-06-30\.hdf5"):
+        import_feeling_of_success(tmp_path / "src", tmp_path / "out")
+
+
+def test_without_h5py_the_extra_is_named(source, tmp_path, monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(base, "import_module", missing)
+    with pytest.raises(
+        ImporterError, match=r"needs h5py, which is missing; run pip install 'touch-retrieval\[importers\]'"
+    ):
+        import_feeling_of_success(source, tmp_path / "out")
+
+
+def test_compressed_pictures_are_read(tmp_path):
+    (tmp_path / "src").mkdir()
+    with h5py.File(tmp_path / "src/calandra_corl2017_000.h5", "w") as file:
+        feeling_of_success.write_grasp(file.create_group("data"), "i0", 1, b"lemon", compression="gzip", shuffle=True)
+    (grasp,) = import_feeling_of_success(tmp_path / "src", tmp_path / "out").grasps
+    np.testing.assert_array_equal(rgb(tmp_path / "out" / grasp.photo), pixels(1, (18, 32)))
