@@ -18,17 +18,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from retrieval.data.dataset import data_digest, load_grasps
+from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
+from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.metrics.registry import Scored, take
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.config import Config, load_config
 from retrieval.training.features import Features, encode_recording
-from retrieval.training.train import build_matcher
+from retrieval.training.train import labelled_pairs
 
 LINES = ("-", "--", "-.")
 SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}
@@ -46,6 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument(
             f"--init-{side}", default="", help="of one tower alone, from `retrieve train --task relief`"
         )
+    for pictures in ("photos", "touches"):
+        parser.add_argument(f"--{pictures}", default="", help="labelled ones, to be paired and trained on too")
     parser.add_argument("--views", nargs="+", help="ablation: other views of a photo than the preset's")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["late_fusion", "cca"])
@@ -70,6 +73,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     cache = arguments.cache or arguments.out / "features"
     seen, seen_digest = _features(arguments.recording, config, cache, arguments.fingers)
     unseen, unseen_digest = _features(arguments.unseen, config, cache, arguments.fingers)
+    pairs = _encoded(labelled_pairs(config), config, cache, arguments.fingers)
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
     validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
     most = max(arguments.grasps)
@@ -78,11 +82,13 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     points = []
     for count, grasps in asked:
         train = first_grasps(seen.of_objects(pool[:count]), grasps)
+        if pairs:
+            train = train.joined(pairs)
         setting = Setting(config, folder=arguments.out / f"{count}-objects-{grasps}-grasps")
         for name in arguments.methods:
             method = build_method(name, setting)
             method.fit(train, validation)
-            size = {"method": name, "objects": count, "grasps": grasps, "touches": len(train)}
+            size = {"method": name, "objects": count, "grasps": grasps, "touches": len(train), "pairs": len(pairs)}
             points.append(size | judge(method, validation, unseen))
             print(table(points[-1:]).splitlines()[-1], flush=True)
     return {
@@ -104,6 +110,8 @@ def _config(arguments: argparse.Namespace) -> Config:
         init=arguments.init,
         init_photo=arguments.init_photo,
         init_touch=arguments.init_touch,
+        photos=arguments.photos,
+        touches=arguments.touches,
     )
     preprocessing = dataclasses.replace(
         config.preprocessing,
@@ -115,8 +123,12 @@ def _config(arguments: argparse.Namespace) -> Config:
 
 def _features(recording: Path, config: Config, cache: Path, fingers: int) -> tuple[Features, str]:
     grasps = load_grasps(recording)
-    features = encode_recording(grasps, build_matcher(config).eval(), config, cache)
-    return dataclasses.replace(features, touch=features.touch[:, :fingers].copy()), data_digest(grasps)
+    return _encoded(grasps, config, cache, fingers), data_digest(grasps)
+
+
+def _encoded(grasps: Sequence[Grasp], config: Config, cache: Path, fingers: int) -> Features:
+    features = encode_recording(grasps, frozen_matcher(config), config, cache)
+    return dataclasses.replace(features, touch=features.touch[:, :fingers].copy())
 
 
 def first_grasps(features: Features, most: int) -> Features:

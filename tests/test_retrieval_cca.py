@@ -8,6 +8,7 @@ import scipy.linalg
 from sklearn.cross_decomposition import CCA
 
 from retrieval.errors import BadInput, NumericalError
+from retrieval.methods import cca
 from retrieval.methods.base import Setting
 from retrieval.methods.cca import Canonical, Cca, canonical, cosine, decompose, unit_rows
 from retrieval.methods.plsca import Plsca
@@ -71,6 +72,29 @@ def test_planted_correlations_are_recovered():
     a, b = variates(found, x, y)
     np.testing.assert_allclose([correlation(a[:, i], b[:, i]) for i in range(4)], rhos, atol=1e-6)
     np.testing.assert_allclose(a.T @ a / len(a), np.eye(10), atol=1e-6)  # uncorrelated, variance 1
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.1])
+def test_many_items_of_few_directions_give_what_the_whole_decomposition_gives(monkeypatch, ridge):
+    x, y = linked([0.95, 0.9, 0.8, 0.3])
+    x, y = np.column_stack([x, x[:, :3]]), np.column_stack([y, np.ones(len(y))])  # 12 and 10 directions of 15 and 11
+    whole = paired(x, y, ridge)
+    monkeypatch.setattr(cca, "MOST_ROWS", 100)
+    found = paired(x, y, ridge)
+    np.testing.assert_allclose(found.correlations, whole.correlations, atol=1e-6)
+    for mine, theirs in zip(variates(found, x, y), variates(whole, x, y), strict=True):
+        np.testing.assert_allclose(np.abs(mine[:, :4]), np.abs(theirs[:, :4]), atol=1e-5)
+
+
+def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
+    monkeypatch.setattr(cca, "MOST_ROWS", 100)
+    monkeypatch.setattr(cca, "LEADING", 3)
+    x = np.random.default_rng(0).standard_normal((200, 3)) @ np.random.default_rng(1).standard_normal((3, 8))
+    x += 1e-3 * np.random.default_rng(2).standard_normal(x.shape)
+    view = decompose(x)
+    assert view.rank == 3
+    np.testing.assert_allclose(view.left.T @ view.left, np.eye(3), atol=1e-9)
+    assert np.abs(Standardiser.fit(x)(x) - (view.left * view.singular) @ view.right).max() < 0.02
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.1])

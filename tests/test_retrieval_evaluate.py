@@ -21,6 +21,7 @@ from retrieval.training.features import Features
 from retrieval.training.train import Trainer, train
 from tests import synthetic
 from tests.conftest import TINY
+from tests.labelled import label_recording
 
 TRAINING = dataclasses.replace(TINY.training, freeze_towers=True, validation_fraction=0.2, test_fraction=0.34)
 CONFIG = dataclasses.replace(TINY, training=TRAINING)
@@ -66,7 +67,8 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert results["recording"]["objects"] == 18
     assert results["recording"]["grasps"] == 72
     assert results["setting"]["seeds"] == [0, 1]
-    assert results["setting"]["features"] | {"digest": ""} == {"touch": 256, "photo": 256, "fingers": 2, "digest": ""}
+    features = {"touch": 256, "photo": 256, "fingers": 2, "digest": "", "pairs": 0}
+    assert results["setting"]["features"] | {"digest": ""} == features
     assert [len(results["split"][part]) for part in ("train", "validation", "test")] == [8, 4, 6]
     assert list(results["methods"]) == list(FEW)
     assert set(results["controls"]) == {"shuffled", "before", "blurred"}
@@ -74,6 +76,25 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert results["audit"]["clean"]
     summary = results["methods"]["late_fusion"]["measures"]["guesses_k5"]
     assert (summary["objects"], summary["queries"], len(summary["value"])) == (6, 24, 5)
+
+
+def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_nothing(run, cache, tmp_path):
+    apart = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(5, seed=7), 1)
+    training = dataclasses.replace(CONFIG.training, **label_recording(apart, tmp_path))
+    config = dataclasses.replace(CONFIG, training=training)
+    fitted_on = []
+    with pytest.MonkeyPatch.context() as patch:
+        fit = Method.fit
+        patch.setattr(Method, "fit", lambda self, *parts: fitted_on.append(parts) or fit(self, *parts))
+        results = run(tmp_path / "report", config=config, methods=("cca", "late_fusion"))
+    assert results["setting"]["features"]["pairs"] == 5
+    assert results["setting"]["config"]["training"]["photos"] == "photos"  # where it lay is nobody's concern
+    assert len(fitted_on) == 5  # two methods, three controls
+    for fitted, validation in fitted_on:
+        assert len({name for name in fitted.object_ids if name.startswith("like ")}) == 5
+        assert len(set(fitted.object_ids)) == 8 + 5
+        assert not any(name.startswith("like ") for name in validation.object_ids)
+    assert not any("like" in name for part in ("train", "validation", "test") for name in results["split"][part])
 
 
 def test_each_measure_has_its_interval_and_ten_candidates_need_ten_objects(made):

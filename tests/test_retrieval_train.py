@@ -23,6 +23,7 @@ from retrieval.training.judgement import with_verdicts
 from retrieval.training.step import batch_loss, shuffle_fingers
 from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
 from tests.conftest import TINY
+from tests.labelled import label_recording
 from tests.waiting import running, until
 
 CPU = torch.device("cpu")
@@ -53,6 +54,21 @@ def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, mo
     with trainer.features as features:
         trainer.loss(features.prepare(trainer.matcher, batch).result())
     assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
+
+
+def test_labelled_pairs_train_and_never_validate(recording, tmp_path):
+    config = with_training(TINY, **label_recording(recording, tmp_path))
+    trainer, alone = (trainer_for(recording, tmp_path / "m.safetensors", each) for each in (config, TINY))
+    assert len(trainer.sampler.objects) == len(alone.sampler.objects) + 12
+    assert {name for name in trainer.sampler.objects if not name.startswith("like ")} == set(alone.sampler.objects)
+    assert trainer.validation.grasps == alone.validation.grasps
+    assert trainer.data_digest != alone.data_digest
+    assert trainer.split == alone.split
+
+
+def test_labelled_photos_without_touches_are_refused():
+    with pytest.raises(ConfigError, match="labelled photos are paired with labelled touches"):
+        with_training(TINY, photos="photos")
 
 
 def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
@@ -363,6 +379,7 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.training.step import batch_loss
 from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY
+from tests.labelled import label_recording
 from tests.test_retrieval_train import with_training
 
 torch.set_num_threads(1)

@@ -10,7 +10,6 @@ from robot.importers.vt60 import import_vt60
 from tests.data import touch_data
 from tests.miniatures import vt60
 
-
 pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
 
 

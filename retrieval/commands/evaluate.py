@@ -12,6 +12,8 @@ from retrieval.commands.options import (
     InitPhoto,
     InitTouch,
     Json,
+    LabelledPhotos,
+    LabelledTouches,
     Recording,
     read_split,
     training_config,
@@ -39,6 +41,8 @@ def evaluate(
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     init_photo: InitPhoto = None,
     init_touch: InitTouch = None,
+    photos: LabelledPhotos = None,
+    touches: LabelledTouches = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
     seeds: Annotated[int, typer.Option(help="trainings of each method")] = 1,
     seed: Annotated[
@@ -63,7 +67,14 @@ def evaluate(
             recording,
             out,
             config=training_config(
-                preset, iterations, init=init, init_photo=init_photo, init_touch=init_touch, seed=seed
+                preset,
+                iterations,
+                init=init,
+                init_photo=init_photo,
+                init_touch=init_touch,
+                photos=photos,
+                touches=touches,
+                seed=seed,
             ),
             preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
             methods=methods.split(",") if methods else tuple(METHODS),

@@ -25,6 +25,14 @@ Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
 Model = Annotated[str | None, typer.Option(help=f"checkpoint (default: {DEFAULT_MODEL})")]
 InitPhoto = Annotated[str | None, typer.Option(help=INIT_OF)]
 InitTouch = Annotated[str | None, typer.Option(help=INIT_OF)]
+LabelledPhotos = Annotated[
+    str | None,
+    typer.Option("--photos", help="labelled photos (`collect --photos-only`) to train on too, with --touches"),
+]
+LabelledTouches = Annotated[
+    str | None,
+    typer.Option("--touches", help="labelled touches (`collect --touches-only`) to pair with them by labels"),
+]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
 
 _BETWEEN = "\0"  # which no word of a command line holds

@@ -5,7 +5,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from retrieval.commands.options import INIT, SPLIT, InitPhoto, InitTouch, read_split, training_config
+from retrieval.commands.options import (
+    INIT,
+    SPLIT,
+    InitPhoto,
+    InitTouch,
+    LabelledPhotos,
+    LabelledTouches,
+    read_split,
+    training_config,
+)
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 
@@ -29,6 +38,8 @@ def train(
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     init_photo: InitPhoto = None,
     init_touch: InitTouch = None,
+    photos: LabelledPhotos = None,
+    touches: LabelledTouches = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the configuration's")] = None,
     seed: Annotated[
         int | None, typer.Option(help="seed of split, pairs and weights, instead of the configuration's")
@@ -37,7 +48,7 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
 ) -> None:
     """Train a matcher, a tower that sees relief, or a gate for `collect`."""
-    inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
+    inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
     if task == "grasp-success":
         for name, value in {"config": config, "split": split, "resume": resume, **inits}.items():
             if value:
@@ -46,8 +57,10 @@ def train(
         _train_gate(recording, out, iterations, seed)
         return
     if task == "relief":
-        if split or init_photo or init_touch:
-            raise BadInput("--task relief needs no split, and makes what --init-photo and --init-touch take")
+        if split or init_photo or init_touch or photos or touches:
+            raise BadInput(
+                "--task relief needs no split and no pairs, and makes what --init-photo and --init-touch take"
+            )
         _train_relief(recording, out, config, init, iterations, seed, resume)
         return
     from retrieval.search import defaults

@@ -13,17 +13,20 @@ from retrieval.errors import DatasetError
 KINDS = ("photo", "touch")
 FAMILIES = ("relief", "shape")
 SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
+LEAST_MM = 0.05
+"""An amplitude below this is as none."""
 
 
 @dataclass(frozen=True)
 class LabelledPicture:
     """A photo, or one finger's gel image with the untouched gel, and what the object that it shows or feels is.
 
-    families: its kind of `FAMILIES`, in their order. sizes: of its relief, `SIZES` in their order; the amplitude of a
-    smooth object is 0.
+    finger: whose gel image it is; None for a photo. families: its kind of `FAMILIES`, in their order. sizes: of its
+    relief, `SIZES` in their order; the amplitude of a smooth object is 0.
     """
 
     file: Path
+    finger: str | None
     before: Path | None
     object_id: str
     families: tuple[str, ...]
@@ -33,6 +36,12 @@ class LabelledPicture:
     def is_smooth(self) -> bool:
         """Whether it wears no relief; its pitch, aspect and sharpness then mean nothing."""
         return self.sizes[SIZES.index("amplitude_mm")] == 0
+
+    @property
+    def learnt_sizes(self) -> tuple[float, ...]:
+        """`sizes` as they are learnt and compared: what is a ratio of scales by its logarithm."""
+        pitch, amplitude, aspect, sharpness = self.sizes
+        return math.log(pitch), math.log(max(amplitude, LEAST_MM)), math.log(aspect), sharpness
 
 
 def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
@@ -57,7 +66,9 @@ def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
         sizes = tuple(float(row[name]) for name in SIZES)
         before = folder / row["before_file_name"] if "before_file_name" in row else None
         families = tuple(str(row[name]) for name in FAMILIES)
-        found = LabelledPicture(folder / row["file_name"], before, str(row["object_id"]), families, sizes)
+        found = LabelledPicture(
+            folder / row["file_name"], row.get("finger"), before, str(row["object_id"]), families, sizes
+        )
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(f"{folder}/metadata.jsonl, line {number}, is no labelled picture: {error!r}") from error
     pitch, amplitude, aspect, sharpness = sizes

@@ -3,6 +3,7 @@
 import dataclasses
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,13 @@ def control_experiments(experiment: Experiment, material: Material, cache: Path,
         if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue
         towers = material.matcher, material.config
-        features = encode_recording(
-            grasps, *towers, cache, variant=variant, photos_of=experiment.features, quiet=experiment.quiet
-        )
+        shown = partial(encode_recording, cache=cache, variant=variant, quiet=experiment.quiet)
         experiments[variant] = dataclasses.replace(
-            unfitted, folder=folder / variant, features=features, queries=queries
+            unfitted,
+            folder=folder / variant,
+            features=shown(grasps, *towers, photos_of=experiment.features),
+            pairs=experiment.pairs and shown(material.pairs, *towers, photos_of=experiment.pairs),
+            queries=queries,
         )
     return experiments
 

@@ -29,14 +29,16 @@ SEEDLESS = frozenset({"cca", "plsca", "constant"})
 class Experiment:
     """What methods are fitted on and asked, and the folder where fits and predictions lie.
 
-    checkpoint: a whole model, which late fusion and what shares its weights then are; None: they are fitted.
-    shuffled: touches are permuted among the objects of each part before fitting, so that nothing can be learned.
+    pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
+    and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
+    each part before fitting, so that nothing can be learned.
     """
 
     folder: Path
     config: Config
     split: Split
     features: Features
+    pairs: Features | None
     queries: Queries
     checkpoint: Checkpoint | None
     shuffled: bool
@@ -74,6 +76,7 @@ class Experiment:
             "method": name,
             "seed": seed,
             "features": self.features.digest,
+            "pairs": self.pairs.digest if self.pairs else None,
             "queries": self.queries.digest,
             "split": self.split.to_dict(),
             "config": self.config.to_dict(),
@@ -88,6 +91,8 @@ class Experiment:
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))
+        if self.pairs:
+            train = train.joined(self.pairs)
         if self.shuffled:
             train, validation = _shuffled(train, seed), _shuffled(validation, seed)
         start = time.perf_counter()

@@ -13,21 +13,23 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writ
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.finish import finish, unfinished
-from retrieval.training.train import Trainer
+from retrieval.training.train import Trainer, labelled_pairs
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
     """The recording, its split, and a matcher whose towers make the features.
 
-    split_from: in words. checkpoint: the whole model where there is one, which late fusion then is; None where towers
-    are frozen and only heads are to be fitted. config: what these heads are fitted with.
+    pairs: labelled ones, which train beside the split's training objects. split_from: in words. checkpoint: the whole
+    model where there is one, which late fusion then is; None where towers are frozen and only heads are to be fitted.
+    config: what these heads are fitted with.
     """
 
     name: str
     source: str
     digest: str
     grasps: list[Grasp]
+    pairs: list[Grasp]
     split: Split
     split_from: str
     config: Config
@@ -58,6 +60,7 @@ def prepare(
         source=recording_source(recording),
         digest=digest,
         grasps=grasps,
+        pairs=labelled_pairs(config),
         split=split,
         split_from=split_from,
         config=config,
@@ -69,7 +72,14 @@ def prepare(
 def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
     """The configuration of heads on a model's towers; these are there already, wherever their first weights lay."""
     training = dataclasses.replace(
-        checkpoint.config.training, init="random", iterations=config.training.iterations, freeze_towers=True
+        checkpoint.config.training,
+        init="random",
+        init_photo="",
+        init_touch="",
+        photos=config.training.photos,
+        touches=config.training.touches,
+        iterations=config.training.iterations,
+        freeze_towers=True,
     )
     return dataclasses.replace(checkpoint.config, training=training)
 

@@ -4,6 +4,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -92,11 +93,13 @@ def _experiments(
     material: Material, out: Path, cache: Path, seed: int, quiet: bool
 ) -> tuple[Experiment, dict[str, Experiment]]:
     """The experiment of the evaluation, and those of the controls."""
+    shown = partial(encode_recording, matcher=material.matcher, config=material.config, cache=cache, quiet=quiet)
     experiment = Experiment(
         folder=out,
         config=material.config,
         split=material.split,
-        features=encode_recording(material.grasps, material.matcher, material.config, cache, quiet=quiet),
+        features=shown(material.grasps),
+        pairs=shown(material.pairs) if material.pairs else None,
         queries=draw_queries(material.grasps, material.split, seed),
         checkpoint=material.checkpoint,
         shuffled=False,
@@ -129,6 +132,7 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
                 "photo": features.photo.shape[1],
                 "fingers": features.touch.shape[1],
                 "digest": features.digest,
+                "pairs": len(experiment.pairs) if experiment.pairs else 0,
             },
         },
     }
@@ -137,7 +141,8 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
 def _without_paths(config: Config) -> dict[str, Any]:
     """Where the first weights lay on this machine concerns nobody; the features' digest says what they were."""
     tables = config.to_dict()
-    tables["training"]["init"] = Path(tables["training"]["init"]).name
+    for name in ("init", "init_photo", "init_touch", "photos", "touches"):
+        tables["training"][name] = Path(tables["training"][name]).name
     return tables
 
 

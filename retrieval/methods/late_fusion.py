@@ -67,7 +67,7 @@ def trained_checkpoint(setting: Setting, train: Features, validation: Features) 
     objects = [tuple(sorted(set(part.object_ids))) for part in (train, validation)]
     split = Split(setting.seed, train=objects[0], validation=objects[1], test=())
     with _folder(setting.folder) as folder:
-        done, known = folder / f"late_fusion-{setting.seed}.safetensors", _both(train, validation)
+        done, known = folder / f"late_fusion-{setting.seed}.safetensors", train.joined(validation)
         trainer = Trainer(_config(setting, train), split, grasps, unfinished(done), SOURCE, known)
         _require_fit(trainer.matcher, known)
         towers = frozen_matcher(setting.config)
@@ -85,7 +85,10 @@ def frozen_matcher(config: Config) -> Matcher:
 
 def _config(setting: Setting, train: Features) -> Config:
     matcher = dataclasses.replace(setting.config.matcher, fingers=train.touch.shape[1])
-    training = dataclasses.replace(setting.config.training, seed=setting.seed, freeze_towers=True)
+    # Labelled pairs are among the features.
+    training = dataclasses.replace(
+        setting.config.training, seed=setting.seed, freeze_towers=True, photos="", touches=""
+    )
     return dataclasses.replace(setting.config, matcher=matcher, training=training).without_pruner()
 
 
@@ -93,15 +96,6 @@ def _grasps(features: Features) -> Iterator[Grasp]:
     """Grasps to draw pairs from; their files are names, which nobody opens."""
     for grasp_id, object_id in zip(features.grasp_ids, features.object_ids, strict=True):
         yield Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
-
-
-def _both(train: Features, validation: Features) -> Features:
-    return Features(
-        train.grasp_ids + validation.grasp_ids,
-        train.object_ids + validation.object_ids,
-        np.concatenate([train.touch, validation.touch]),
-        np.concatenate([train.photo, validation.photo]),
-    )
 
 
 @contextmanager

@@ -51,21 +51,25 @@ class TrainingConfig:
     """How a matcher is trained.
 
     init: "random", "imagenet" or the path of a state dict. init_touch, init_photo: the same for one tower alone, where
-    they are not empty (`retrieval.training.relief` makes such weights). iterations: optimiser steps. touches_per_batch
-    times (positives_per_touch + negatives_per_touch) pairs make a batch. weights: of the losses that are added to the
-    match loss (`retrieval.model.losses.LOSSES`), in files `contrastive_weight` and so on; 0 for each is exactly the
-    paper's loss, and without "contrastive" the embeddings stay untrained. shuffle_fingers: feed the fingers of a touch
-    in a random order, as gripping the other way round would; not in the paper. negatives: "dataset" draws a touch's
-    from all photos of other objects, as in the paper; "batch" from the photos that stand in the batch anyway, half as
-    many to encode (`PairSampler`); "auto" is "batch" where towers are trained. freeze_batch_norm: keep the batch
-    statistics of the initial weights. freeze_towers: train only what comes after the towers; every image is then
-    encoded once for the whole training. distil_steps: steps of teaching the pruner after training, where the matcher
-    has one (`retrieval.training.distil`). validation_fraction, test_fraction: shares of the objects.
+    they are not empty (`retrieval.training.relief` makes such weights). photos, touches: folders of labelled pictures
+    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pairs`);
+    both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
+    pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
+    files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without "contrastive" the
+    embeddings stay untrained. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way
+    round would; not in the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the
+    paper; "batch" from the photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is
+    "batch" where towers are trained. freeze_batch_norm: keep the batch statistics of the initial weights.
+    freeze_towers: train only what comes after the towers; every image is then encoded once for the whole training.
+    distil_steps: steps of teaching the pruner after training, where the matcher has one (`retrieval.training.distil`).
+    validation_fraction, test_fraction: shares of the objects.
     """
 
     init: str = "imagenet"
     init_touch: str = ""
     init_photo: str = ""
+    photos: str = ""
+    touches: str = ""
     iterations: int = 26_000
     touches_per_batch: int = 6
     positives_per_touch: int = 4
@@ -103,6 +107,10 @@ class TrainingConfig:
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
             _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
+        _require(
+            bool(self.photos) == bool(self.touches),
+            f"labelled photos are paired with labelled touches; got photos {self.photos!r}, touches {self.touches!r}",
+        )
         held_out = (self.validation_fraction, self.test_fraction)
         _require(
             min(held_out) >= 0 and sum(held_out) < 1,

@@ -87,6 +87,15 @@ class Features:
         wanted = set(object_ids)
         return self.select(np.array([row for row, name in enumerate(self.object_ids) if name in wanted], np.int64))
 
+    def joined(self, others: "Features") -> "Features":
+        """These grasps, then those of `others`."""
+        return Features(
+            self.grasp_ids + others.grasp_ids,
+            self.object_ids + others.object_ids,
+            np.concatenate([self.touch, others.touch]),
+            np.concatenate([self.photo, others.photo]),
+        )
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 over ids and features: equal exactly when the same is fitted on."""

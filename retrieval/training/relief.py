@@ -7,10 +7,9 @@ matcher's (`init_photo`, `init_touch`), whose head is trained on felt objects as
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +38,10 @@ HEAD_FASTER = 5.0
 """The head, which begins at zero, learns so many times faster than the tower."""
 VALIDATION, MOST_VALIDATED = 0.05, 400
 SAVE_EVERY = 200
+BACKGROUNDS = ("none", "difference+0.5")
+"""Policies under which touches are seen, in turns: the weights serve matchers of both."""
 VISIBLE = 0.8
 """Share of a photo's side that a step sees; a gel is seen whole."""
-LEAST_MM = 0.05
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,10 @@ def train_relief(
 ) -> ReliefReport:
     """Train a tower of `config` on the pictures in `folder` and write its weights to `out` (.safetensors).
 
-    Photos are seen as the view "grey" or "zoom" shows them, touches as the matcher sees them (`config.preprocessing`);
-    the first weights are `config.training.init`. resume: go on from the state beside `out`. Ctrl-C keeps a state and
-    raises Interrupted. Raises DatasetError, ConfigError, CheckpointError.
+    Photos are seen as the view "grey" or "zoom" shows them, touches with and without their background, whichever of
+    both the matcher wants (`config.preprocessing`, by which the report judges); the first weights are
+    `config.training.init`. resume: go on from the state beside `out`. Ctrl-C keeps a state and raises Interrupted.
+    Raises DatasetError, ConfigError, CheckpointError.
     """
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
@@ -114,7 +115,7 @@ class ReliefTraining:
         self.families = [sorted({each.families[place] for each in self.pictures}) for place in range(len(FAMILIES))]
         if len(self.families[0]) < 2:
             raise DatasetError(f"relief can be learned from two families and more; got {', '.join(self.families[0])}")
-        sizes = np.array([_sizes(each) for each in self.pictures if not each.is_smooth])
+        sizes = np.array([each.learnt_sizes for each in self.pictures if not each.is_smooth])
         self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
         torch.manual_seed(seed)
         self.tower = build_tower(config.matcher.tower, config.matcher.tower_output)
@@ -129,20 +130,25 @@ class ReliefTraining:
         self.optimizer = torch.optim.AdamW(
             [{"params": self.tower.parameters()}, {"params": self.head.parameters()}], weight_decay=WEIGHT_DECAY
         )
-        self._kept: dict[Path, NDArray[np.uint8]] = {}
+        self._kept: dict[Path, list[NDArray[np.uint8]]] = {}
 
-    def _load(self, picture: LabelledPicture) -> NDArray[np.float32]:
+    def _load(self, picture: LabelledPicture) -> list[NDArray[np.float32]]:
+        """As the matcher sees the picture; a touch also as a matcher of another policy for the background would."""
         settings = self.config.preprocessing
-        if self.kind == "touch":
-            return settings.load_touch(picture.file, picture.before)
-        return Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(picture.file)
+        if self.kind == "photo":
+            return [Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(picture.file)]
+        policies = dict.fromkeys((settings.background, *BACKGROUNDS))
+        return [replace(settings, background=policy).load_touch(picture.file, picture.before) for policy in policies]
 
-    def _images(self, pictures: Sequence[LabelledPicture]) -> Tensor:
-        """(B, 3, H, W); a picture is read once, and kept in 8 bits."""
+    def _images(self, pictures: Sequence[LabelledPicture], rng: np.random.Generator | None = None) -> Tensor:
+        """(B, 3, H, W); a picture is read once, and kept in 8 bits. rng: draws how each touch is seen."""
+        seen = []
         for picture in pictures:
             if picture.file not in self._kept:
-                self._kept[picture.file] = np.rint(255 * self._load(picture)).astype(np.uint8)
-        return to_batch([to_float(self._kept[picture.file]) for picture in pictures])
+                self._kept[picture.file] = [np.rint(255 * form).astype(np.uint8) for form in self._load(picture)]
+            forms = self._kept[picture.file]
+            seen.append(to_float(forms[rng.integers(len(forms)) if rng else 0]))
+        return to_batch(seen)
 
     def run(self, state: Path, bar: Bar, stopped: Callable[[], bool]) -> None:
         """Train from the current step to the last, keeping the state now and then."""
@@ -170,7 +176,7 @@ class ReliefTraining:
     def _batch(self, step: int) -> tuple[list[LabelledPicture], Tensor]:
         rng = np.random.default_rng([self.config.training.seed, 2, step])
         chosen = [self.pictures[row] for row in rng.integers(len(self.pictures), size=BATCH)]
-        return chosen, augmented(self._images(chosen), self.kind, rng)
+        return chosen, augmented(self._images(chosen, rng), self.kind, rng)
 
     def _loss(self, batch: tuple[list[LabelledPicture], Tensor]) -> Tensor:
         pictures, images = batch
@@ -196,7 +202,7 @@ class ReliefTraining:
         return torch.split(readings, [*map(len, self.families), len(SIZES)], dim=1)
 
     def _wanted(self, pictures: Sequence[LabelledPicture]) -> Tensor:
-        sizes = (np.array([_sizes(each) for each in pictures]) - self.mean) / self.deviation
+        sizes = (np.array([each.learnt_sizes for each in pictures]) - self.mean) / self.deviation
         return torch.from_numpy(sizes.astype(np.float32)).to(self.device)
 
     @torch.inference_mode()
@@ -299,12 +305,6 @@ def _sampled(images: Tensor, maps: Tensor, shown: float) -> Tensor:
     side = [max(round(shown * length), 1) for length in images.shape[2:]]
     grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
     return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
-
-
-def _sizes(picture: LabelledPicture) -> tuple[float, ...]:
-    """As they are learnt: what is a ratio of scales by its logarithm."""
-    pitch, amplitude, aspect, sharpness = picture.sizes
-    return math.log(pitch), math.log(max(amplitude, LEAST_MM)), math.log(aspect), sharpness
 
 
 def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:

@@ -28,6 +28,7 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
+from retrieval.data.labelled_pairs import pair_by_label
 from retrieval.errors import CheckpointError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
@@ -110,7 +111,8 @@ class Trainer:
         """known: features of all these grasps, for frozen towers; then they are the data, and no image is read."""
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
-        self.data_digest = known.digest if known else data_digest(grasps)
+        pairs = labelled_pairs(config)
+        self.data_digest = known.digest if known else data_digest([*grasps, *pairs])
         self.device = default_device()
         torch.manual_seed(settings.seed)
         self.unpruned = config.without_pruner()
@@ -119,17 +121,17 @@ class Trainer:
         trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        self.sampler = self._sampler("train", grasps)
-        self.validation = self._sampler("validation", grasps).every_touch() if split.validation else None
+        self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
+        held_out = split.select(grasps, "validation")
+        self.validation = self._sampler(held_out).every_touch() if split.validation else None
         self.features: FeatureSource = TrainedFeatures(config, self.device)
         if settings.freeze_towers:
             self.features = FrozenFeatures(config, self.device, by_image(grasps, known, self.device) if known else {})
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
 
-    def _sampler(self, part: str, grasps: list[Grasp]) -> PairSampler:
+    def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
-        chosen = self.split.select(grasps, part)
         # Features that are kept cost nothing to draw from all objects.
         shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
         return PairSampler(
@@ -317,6 +319,12 @@ class Trainer:
 
 FROZEN = ("touch_tower.", "photo_tower.")
 """How the names of weights begin that stand still where towers are frozen."""
+
+
+def labelled_pairs(config: Config) -> list[Grasp]:
+    """What the configured folders of labelled pictures add to the training objects; nothing without them."""
+    photos, touches = config.training.photos, config.training.touches
+    return pair_by_label(Path(photos), Path(touches), config.matcher.fingers) if photos else []
 
 
 def build_matcher(config: Config) -> Matcher:
