@@ -1,6 +1,8 @@
 """The checkpoint that comes with the package: how it was made, and how good it is on objects that it never saw.
 
-    python -m tests.shipped make FOLDER --init WEIGHTS   collect on the simulated rig, train, and store as float16 in
+    python -m tests.shipped make FOLDER --init WEIGHTS   collect grasps, photos and presses of other objects each on the
+                                                         simulated rig, teach both towers relief, train the matcher,
+                                                         and store it as float16 in
                                                          FOLDER/simulated-mobilenet.safetensors
     python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
                                                          recording and the features that `make` left in FOLDER
@@ -27,7 +29,7 @@ import robot.rig
 from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.methods.base import Setting
-from retrieval.methods.late_fusion import trained_checkpoint
+from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import load_config
 from retrieval.model.encode import default_device, one_thread
@@ -36,11 +38,13 @@ from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, by_image, encode_recording
 from retrieval.training.judgement import with_verdicts
-from retrieval.training.train import build_matcher
+from retrieval.training.train import labelled_pairs
 
 # Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
 SEED_TRAINED, SEED_SCORED = 10_000, 30_000
-RIG = Path(__file__).with_name("shipped_rig.toml")
+SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
+RIG, TOUCH_RIG = (Path(__file__).with_name(name) for name in ("shipped_rig.toml", "shipped_touches.toml"))
+PRESET = "relief"
 VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
 VERDICT_GRASPS = 4
@@ -58,9 +62,12 @@ def main(argv: list[str] | None = None) -> int:
     make = jobs.add_parser("make", help="collect and train the checkpoint that comes with the package")
     make.add_argument("folder", type=Path)
     make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
-    make.add_argument("--objects", type=int, default=1400)
-    make.add_argument("--grasps", type=int, default=4)
-    make.add_argument("--iterations", type=int, default=1500)
+    make.add_argument("--objects", type=int, default=500, help="felt and photographed")
+    make.add_argument("--grasps", type=int, default=4, help="of each of them")
+    make.add_argument("--photos", type=int, default=10_000, help="objects that are only photographed")
+    make.add_argument("--touches", type=int, default=6_641, help="objects that are only pressed")
+    make.add_argument("--steps", type=int, default=2500, help="of teaching each tower relief")
+    make.add_argument("--iterations", type=int, default=2000, help="of training the head")
     pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
     pruner.add_argument("folder", type=Path)
     pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
@@ -80,21 +87,50 @@ def main(argv: list[str] | None = None) -> int:
 
 def make_shipped(arguments: argparse.Namespace) -> int:
     """Collect, encode and train; what is there already is gone on with."""
-    recording = arguments.folder / "recording"
-    if code := collect(recording, arguments, SEED_TRAINED):
+    folder = arguments.folder
+    recording = folder / "recording"
+    code = collect(recording, arguments, SEED_TRAINED) or teach_towers(arguments)
+    if code:
         return code
-    grasps = load_grasps(recording)
-    config = load_config("mobilenet")
-    training = dataclasses.replace(config.training, init=str(arguments.init), iterations=arguments.iterations)
+    config = load_config(PRESET)
+    training = dataclasses.replace(
+        config.training.of_steps(arguments.iterations),
+        init=str(arguments.init),
+        init_photo=str(folder / "photo-tower.safetensors"),
+        init_touch=str(folder / "touch-tower.safetensors"),
+        photos=str(folder / "photos"),
+        touches=str(folder / "touches"),
+    )
     config = dataclasses.replace(config, training=training)
-    features = encode_recording(grasps, build_matcher(config).eval(), config, arguments.folder / "features")
+    grasps, towers = load_grasps(recording), frozen_matcher(config)
+    features, pairs = (
+        encode_recording(part, towers, config, folder / "features") for part in (grasps, labelled_pairs(config))
+    )
     split = draw_split(grasps, train=None, validation=VALIDATION)
-    parts = (features.of_objects(split.train), features.of_objects(split.validation))
-    made = trained_checkpoint(Setting(config, folder=arguments.folder, quiet=False), *parts)
-    about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
-    made = dataclasses.replace(made, provenance=made.provenance | about)
-    made = taught(made, features, DISTIL_STEPS)
-    store(judging(made, grasps, features), arguments.folder / defaults.SHIPPED)
+    train, validation = features.of_objects(split.train).joined(pairs), features.of_objects(split.validation)
+    made = trained_checkpoint(Setting(config, folder=folder, quiet=False), train, validation)
+    about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
+    # The split names whom a recording may not be judged on; no recording holds the pairs.
+    made = dataclasses.replace(made, provenance=made.provenance | about, split=split)
+    made = taught(made, train, validation, DISTIL_STEPS)
+    store(judging(made, grasps, features), folder / defaults.SHIPPED)
+    return 0
+
+
+def teach_towers(arguments: argparse.Namespace) -> int:
+    """Photograph and press objects of two other worlds, and teach each tower what it sees there."""
+    for side, pictures, seed, rig in (
+        ("photo", "photos", SEED_PHOTOS, "sim"),
+        ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
+    ):
+        folder, tower = arguments.folder / pictures, arguments.folder / f"{side}-tower.safetensors"
+        size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
+        code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
+        if not code and not tower.exists():
+            how = ("--config", PRESET, "--init", arguments.init, "--iterations", arguments.steps)
+            code = retrieve("train", folder, "--task", "relief", *how, "--out", tower)
+        if code:
+            return code
     return 0
 
 
@@ -132,24 +168,27 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     shipped = load_checkpoint(defaults.shipped_model())
     grasps = load_grasps(arguments.folder / "recording")
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    store(taught(shipped, features, arguments.steps), arguments.folder / defaults.SHIPPED)
+    assert shipped.split is not None
+    train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
+    store(taught(shipped, train, validation, arguments.steps), arguments.folder / defaults.SHIPPED)
     return 0
 
 
-def taught(made: Checkpoint, features: Features, steps: int) -> Checkpoint:
+def taught(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
     """A checkpoint with a pruner of the preset's width."""
-    assert made.split is not None
-    matcher = dataclasses.replace(made.config.matcher, pruner_width=load_config("mobilenet").matcher.pruner_width)
+    matcher = dataclasses.replace(made.config.matcher, pruner_width=load_config(PRESET).matcher.pruner_width)
     training = dataclasses.replace(made.config.training, distil_steps=steps)
     config = dataclasses.replace(made.config, matcher=matcher, training=training)
-    parts = (features.of_objects(part) for part in (made.split.train, made.split.validation))
     with one_thread():  # as training on features that stand still
-        return distil.with_pruner(made, config, *(distil.feature_halves(made.matcher, part) for part in parts))
+        halves = (distil.feature_halves(made.matcher, part) for part in (train, validation))
+        return distil.with_pruner(made, config, *halves)
 
 
 def store(made: Checkpoint, out: Path) -> None:
     """Write a checkpoint once more, as float16; where its first weights lay on this machine concerns nobody."""
-    training = dataclasses.replace(made.config.training, init="imagenet")
+    training = dataclasses.replace(
+        made.config.training, init="imagenet", init_photo="", init_touch="", photos="", touches=""
+    )
     made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
     store_checkpoint(made, out, float16=True)
 

@@ -13,7 +13,7 @@ RIBS = {"relief": "ribs", "shape": "tube", "pitch_mm": 4.0, "amplitude_mm": 1.0,
 
 def write(folder: Path, kind: str, *labels: dict[str, object]) -> Path:
     """Lines of pictures that nobody opens; a touch is of the fingers a and b unless its label says which."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     (folder / "pictures.json").write_text(json.dumps({"kind": kind}))
     rows = []
     for number, label in enumerate(labels):
@@ -38,21 +38,27 @@ def names(found):
     return {(grasp.touches[0].name[0], grasp.photo.name[0]) for grasp in found}
 
 
-def test_each_press_and_each_photo_finds_what_is_nearest_in_sizes_among_those_of_its_relief_and_shape(tmp_path):
+def test_each_press_and_each_photo_finds_what_is_nearest_in_sizes_among_those_of_its_relief(tmp_path):
     photos = [
         {"pitch_mm": 8.0},
         {"pitch_mm": 4.2},
-        {"shape": "box"},
         {"relief": "waves"},
+        {"relief": "layers"},
         {"pitch_mm": 4.3, "amplitude_mm": 3.0},
     ]
     found = pairs(tmp_path, photos, [{}, {"pitch_mm": 7.0}])
-    assert names(found) == {("0", "1"), ("1", "0"), ("0", "4")}  # 4: no press has chosen it
+    assert names(found) == {("0", "1"), ("1", "0"), ("0", "4")}  # no press has chosen photo 4
     first = found[0]
     assert (first.photo.name, first.object_id) == ("1.png", "like photo-1")
     assert [file.name for file in first.touches] == ["0-a.png", "0-b.png"]
     assert [file.name for file in first.backgrounds] == ["0-a-before.png", "0-b-before.png"]
     assert len({grasp.grasp_id for grasp in found}) == 3
+
+
+def test_another_shape_is_taken_where_its_own_is_far_in_sizes_or_missing(tmp_path):
+    alike, far = {"shape": "box", "pitch_mm": 4.1}, {"pitch_mm": 5.0}
+    assert ("0", "1") in names(pairs(tmp_path, [alike, far, {"pitch_mm": 9.0}], [{}]))
+    assert names(pairs(tmp_path / "b", [alike], [{}])) == {("0", "0")}
 
 
 def test_two_presses_with_one_photo_are_grasps_of_one_object(tmp_path):
@@ -62,7 +68,7 @@ def test_two_presses_with_one_photo_are_grasps_of_one_object(tmp_path):
 
 
 def test_what_looks_like_nothing_pressed_and_what_one_finger_missed_is_left_out(tmp_path):
-    found = pairs(tmp_path, [{}, {"shape": "box"}], [{}, {"relief": "waves"}, {"fingers": "b"}])
+    found = pairs(tmp_path, [{}, {"relief": "layers"}], [{}, {"relief": "waves"}, {"fingers": "b"}])
     assert names(found) == {("0", "0")}
 
 

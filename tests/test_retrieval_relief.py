@@ -65,6 +65,20 @@ def test_families_are_told_apart_on_objects_that_were_held_out(quick, tmp_path, 
     assert report.sizes["sharpness"] == 0.0  # nothing varies
 
 
+def test_a_touch_is_seen_with_its_background_and_without_and_judged_as_the_matcher_sees_it(tmp_path):
+    kind, pictures = load_labelled(write_pictures(tmp_path / "pictures", "touch"))
+    for policy in ("difference+0.5", "none"):
+        settings = dataclasses.replace(CONFIG.preprocessing, background=policy)
+        training = relief.ReliefTraining(kind, pictures, dataclasses.replace(CONFIG, preprocessing=settings), 1)
+        judged = training._images(pictures[:1])
+        wanted = settings.load_touch(pictures[0].file, pictures[0].before)
+        assert np.abs(judged[0].permute(1, 2, 0).numpy() - wanted).max() < 1 / 255
+        seen = training._images(pictures[:1] * 40, np.random.default_rng(0))
+        same = [torch.equal(one, judged[0]) for one in seen]
+        assert 10 < sum(same) < 30
+        assert len({float(one.mean()) for one in seen}) == 2
+
+
 @pytest.mark.parametrize("side", ["photo", "touch"])
 def test_the_weights_begin_the_tower_of_their_side_alone(quick, tmp_path, side):
     folder, out = write_pictures(tmp_path / "pictures", side), tmp_path / "tower.safetensors"

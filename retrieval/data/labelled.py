@@ -33,6 +33,16 @@ class LabelledPicture:
     sizes: tuple[float, ...]
 
     @property
+    def relief(self) -> str:
+        """The family of its relief."""
+        return self.families[FAMILIES.index("relief")]
+
+    @property
+    def shape(self) -> str:
+        """The family of its body."""
+        return self.families[FAMILIES.index("shape")]
+
+    @property
     def is_smooth(self) -> bool:
         """Whether it wears no relief; its pitch, aspect and sharpness then mean nothing."""
         return self.sizes[SIZES.index("amplitude_mm")] == 0

@@ -19,6 +19,7 @@ from retrieval.errors import DatasetError
 WEIGHTS = (2.0, 1.0, 1.0, 0.5)
 """Of the squared differences in `LabelledPicture.learnt_sizes`, each in standard deviations; a pitch is felt and
 seen best."""
+OTHER_SHAPE = 3.0
 
 
 def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
@@ -26,10 +27,10 @@ def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
     with the press of the object most like the photographed one.
 
     photos, touches: folders that `retrieve collect --photos-only` and `--touches-only` wrote. fingers: gel
-    images of one touch; where it is 1, each finger's press is a touch of its own. Like is of the same families and
-    nearest in sizes; where no object is of the same families, a picture is left out. The photographed object names the
-    grasp's object, `like <object_id>`, so that two presses with one photo are of one object.
-    Raises DatasetError for folders of the wrong kind or where nothing pairs.
+    images of one touch; where it is 1, each finger's press is a touch of its own. Like is of the same relief and
+    nearest in sizes, another shape being as far as OTHER_SHAPE; where no object has the relief, a picture is left out.
+    The photographed object names the grasp's object, `like <object_id>`, so that two presses with one photo are of one
+    object. Raises DatasetError for folders of the wrong kind or where nothing pairs.
     """
     photographed, pressed = _of_kind(photos, "photo"), _of_kind(touches, "touch")
     of_object: dict[str, list[LabelledPicture]] = defaultdict(list)
@@ -41,7 +42,7 @@ def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
         raise DatasetError(f"no object in {touches} was pressed by {fingers} fingers, as the recording's were grasped")
     grasps = [_grasp(whole[row], photographed[match]) for row, match in _pairs([one[0] for one in whole], photographed)]
     if not grasps:
-        raise DatasetError(f"no object in {touches} has the relief and the shape of one in {photos}; collect more")
+        raise DatasetError(f"no object in {touches} has the relief of one in {photos}; collect more")
     return grasps
 
 
@@ -54,15 +55,17 @@ def _of_kind(folder: Path, kind: str) -> list[LabelledPicture]:
 
 def _pairs(pressed: list[LabelledPicture], photographed: list[LabelledPicture]) -> list[tuple[int, int]]:
     """(row of the press, row of the photo), in order."""
-    rows_of: dict[tuple[str, ...], tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
+    rows_of: dict[str, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
     for side, pictures in enumerate((pressed, photographed)):
         for row, picture in enumerate(pictures):
-            rows_of[picture.families][side].append(row)
+            rows_of[picture.relief][side].append(row)
+    shapes = [np.array([each.shape for each in pictures]) for pictures in (pressed, photographed)]
     felt, seen = _scaled(pressed, photographed), _scaled(photographed, photographed)
     pairs: set[tuple[int, int]] = set()
     for presses, photos in rows_of.values():
         if presses and photos:
-            apart = cdist(felt[presses], seen[photos])
+            other = shapes[0][presses][:, None] != shapes[1][photos]
+            apart = np.hypot(cdist(felt[presses], seen[photos]), OTHER_SHAPE * other)
             pairs |= {(press, photos[match]) for press, match in zip(presses, apart.argmin(1), strict=True)}
             pairs |= {(presses[match], photo) for photo, match in zip(photos, apart.argmin(0), strict=True)}
     return sorted(pairs)
