@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from retrieval.search.neighbours import Neighbour as Neighbour
     from retrieval.search.neighbours import nearest_photos as nearest_photos
     from retrieval.search.searcher import Searcher as Searcher
+    from retrieval.serve.client import Client as Client
 
     open = Searcher.open
 
@@ -39,6 +40,7 @@ _PLACES = {
     "BadInput": "errors:BadInput",
     "BuildReport": "search.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
+    "Client": "serve.client:Client",
     "Encoded": "model.touches:Encoded",
     "Match": "search.answer:Match",
     "Neighbour": "search.neighbours:Neighbour",

@@ -25,7 +25,7 @@ PACKAGES = (retrieval, robot, indexes)
 PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
 COMMANDS = PAGE.with_name("commands.md")
 DATA_SETS = PAGE.with_name("datasets.md")
-MADE_BY_HAND = (robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
+MADE_BY_HAND = (retrieval.Client, robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
 """Classes that a user makes an object of; all others come out of a function."""
 HEAD = """# Reference
 

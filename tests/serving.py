@@ -1,6 +1,8 @@
 """A service for tests: in this process, or as the command on a port of its own."""
 
+import queue
 import re
+import signal
 import sys
 import threading
 from contextlib import contextmanager
@@ -8,6 +10,7 @@ from contextlib import contextmanager
 from fastapi.testclient import TestClient
 
 from retrieval.serve.app import create_app
+from retrieval.serve.run import Server, configured
 from retrieval.serve.settings import ServiceSettings
 from tests.waiting import running
 
@@ -18,6 +21,22 @@ def service(index, beside=None, recorder=None, trials=None, **settings):
     app = create_app(ServiceSettings(index=index, **settings), beside, recorder, trials)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
+
+
+@contextmanager
+def listening(index, beside=None, recorder=None, trials=None, **settings):
+    """Address of the application on a port of its own, served by a thread, and its parts."""
+    app = create_app(ServiceSettings(index=index, port=0, **settings), beside, recorder, trials)
+    ports = queue.Queue()
+    server = Server(configured(app), app.state.service, ports.put)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{ports.get(timeout=60)}", app.state.service
+    finally:
+        server.handle_exit(signal.SIGTERM, None)
+        thread.join(60)
+        assert not thread.is_alive()
 
 
 @contextmanager

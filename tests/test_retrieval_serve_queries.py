@@ -85,7 +85,7 @@ def test_a_body_of_the_wrong_form_is_told_by_place(client, body, said):
 
 def test_what_is_no_picture_and_a_missing_finger_are_told_in_our_sentences(client, grasps):
     told = problem(client.post("/v1/query", json={"touches": [["aGk=", "aGk="]]}), 422, "bad-image")
-    assert told.startswith("grasp 1, finger 1: not a PNG, JPEG, BMP")
+    assert told.startswith("grasp 1, finger a: not a PNG, JPEG, BMP")
     told = problem(client.post("/v1/query", json={"touches": [encoded(grasps)[0][:1]]}), 422, "bad-input")
     assert "this model takes 2 gel image(s) for one touch; got 1" in told
     told = problem(client.post("/v1/query", **form([grasps[0][:1]])), 422, "bad-input")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.errors import BadInput
 from retrieval.model.judge import NO_CONTACT, NOT_A_GEL
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
@@ -78,6 +79,19 @@ class QueryResult:
     def top(self) -> Match | None:
         """The best object; None where nothing was ranked."""
         return self.results[0] if self.results else None
+
+    @classmethod
+    def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
+        """Inverse of `to_dict`. Raises BadInput for another document."""
+        try:
+            catalogue, asked = Path(document["index"]["catalogue"]), document["query"]
+            matches = [Match(**match, photo_path=catalogue / match["photo"]) for match in document["results"]]
+            others = {
+                name: document[name] for name in ("index", "timing_ms", "verdict", "none_probability", "posterior")
+            }
+            return cls(touches=asked["touches"], grasps=asked["grasps"], results=matches, **others)
+        except (KeyError, TypeError) as error:
+            raise BadInput(f"this is not the document of `retrieve query --json`: {error!r}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """The document of `retrieve query --json`."""

@@ -93,7 +93,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     """Opens the index; ends when what is in flight is done, which the server waits for."""
     parts: Service = app.state.service
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
-    await asyncio.to_thread(parts.generations.open)
+    if not parts.generations.ready:
+        await asyncio.to_thread(parts.generations.open)
     work = [*parts.queue.workers(), parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
     running = [asyncio.ensure_future(one) for one in work]
     try:

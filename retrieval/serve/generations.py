@@ -67,6 +67,11 @@ class Generations:
         self._current: Opened | None = None
 
     @property
+    def ready(self) -> bool:
+        """Whether one is open."""
+        return self._current is not None
+
+    @property
     def current(self) -> Opened:
         """What answers now. Raises Problem before anything could be opened."""
         if self._current is None:

@@ -61,6 +61,11 @@ class Queue:
         """Let go of the threads."""
         self._threads.shutdown()
 
+    @property
+    def held(self) -> int:
+        """Requests that wait or are in work."""
+        return self._held
+
     def require_room(self) -> None:
         """Raises Problem where one more request would not be held; asked before its body is read."""
         if self._held >= self._settings.queue:

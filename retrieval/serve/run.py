@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -9,6 +10,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
+from retrieval.errors import BadInput
 from retrieval.serve.service import Service
 
 KEEP_ALIVE_S = 5
@@ -22,9 +24,9 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._parts, self._say_started = parts, started
 
-    async def startup(self, sockets: object = None) -> None:
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen, and say at which port."""
-        await super().startup(sockets)  # type: ignore[arg-type]
+        await super().startup(sockets)
         if self.started:
             self._say_started(self.servers[0].sockets[0].getsockname()[1])
 
@@ -48,10 +50,24 @@ class Server(uvicorn.Server):
 
 
 def serve(app: FastAPI, started: Callable[[int], object]) -> None:
-    """Serve until SIGTERM or Ctrl-C; `started` is told the port as soon as it listens."""
+    """Serve until SIGTERM or Ctrl-C; `started` is told the port as soon as it listens. Raises BadInput where it cannot
+    listen, and the errors of `Searcher.open`."""
     parts: Service = app.state.service
-    settings = parts.settings
-    config = uvicorn.Config(
+    parts.generations.open()
+    host, port = parts.settings.host, parts.settings.port
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.create_server(address[:2], family=family)
+    except OSError as error:
+        raise BadInput(f"{host}, port {port}, cannot be listened on: {error.strerror or error}") from error
+    with listening:
+        Server(configured(app), parts, started).run([listening])
+
+
+def configured(app: FastAPI) -> uvicorn.Config:
+    """How the application is served."""
+    settings = app.state.service.settings
+    return uvicorn.Config(
         app,
         host=settings.host,
         port=settings.port,
@@ -64,4 +80,3 @@ def serve(app: FastAPI, started: Callable[[int], object]) -> None:
         timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=round(settings.deadline_s) + 5,
     )
-    Server(config, parts, started).run()

@@ -9,6 +9,7 @@ import base64
 import binascii
 from collections.abc import Sequence
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, WithJsonSchema
@@ -244,11 +245,11 @@ def check_pictures(touches: Sequence[Sequence[bytes]], background: Sequence[byte
     """The pixels of all pictures, by their headers. Raises ImageError for what is no picture, and Problem for pictures
     that are too large or too many."""
     named = [
-        (f"{of}grasp {number}, finger {place}", data)
+        (f"{of}grasp {number}, finger {_letter(place)}", data)
         for number, grasp in enumerate(touches, start=1)
-        for place, data in enumerate(grasp, start=1)
+        for place, data in enumerate(grasp)
     ]
-    named += [(f"{of}background of finger {place}", data) for place, data in enumerate(background or (), start=1)]
+    named += [(f"{of}background of finger {_letter(place)}", data) for place, data in enumerate(background or ())]
     if len(named) > MAX_PICTURES:
         raise Problem("bad-input", f"a request may hold at most {MAX_PICTURES} pictures; got {len(named)}")
     total = 0
@@ -264,3 +265,7 @@ def check_pictures(touches: Sequence[Sequence[bytes]], background: Sequence[byte
             "too-large", f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; got {total:,}"
         )
     return total
+
+
+def _letter(place: int) -> str:
+    return ascii_lowercase[place] if place < len(ascii_lowercase) else str(place + 1)

@@ -1,0 +1,204 @@
+"""The same `query` as an opened index has, of an index on another machine."""
+
+import base64
+import io
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from PIL import Image
+
+from retrieval.data.images import read_bytes
+from retrieval.errors import BadInput, ImageError, RetrievalError
+from retrieval.model.posterior import NONE_PRIOR
+from retrieval.model.touches import AnyImage, AnyTouches, GivenImage, read_grasps
+from retrieval.search.answer import Match, QueryResult
+
+try:
+    import httpx
+except ImportError as missing:
+    raise BadInput("a client needs httpx; run: pip install 'touch-retrieval[serve]'") from missing
+
+_AS_PNG = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
+_REFUSED = frozenset({"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"})
+
+
+class Client:
+    """A service of `retrieve serve`, asked as a `Searcher` is: a robot's code does not change when the index moves.
+
+    url: where it listens. token: what it asks for, where it listens to other machines. timeout_s: for one answer,
+    waiting for a place in the queue included. Any number of threads may use it. `close` it, or use it by `with`.
+
+    >>> with retrieval.Client("http://127.0.0.1:1") as client:
+    ...     client.query(["a.png", "b.png"])
+    Traceback (most recent call last):
+    retrieval.errors.RetrievalError: http://127.0.0.1:1 cannot be reached (...); is `retrieve serve` running there?
+    """
+
+    def __init__(
+        self, url: str = "http://127.0.0.1:8000", *, token: str | None = None, timeout_s: float = 60.0
+    ) -> None:
+        headers = {} if token is None else {"authorization": f"Bearer {token}"}
+        self.url, self._timeout_s = url, timeout_s
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=timeout_s)
+        self._fingers: int | None = None
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def query(
+        self,
+        touches: AnyTouches,
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> QueryResult:
+        """`Searcher.query`, answered there. Paths are of this machine, `Match.photo_path` is of the other: `photo` gets
+        the picture. Raises what `Searcher.query` raises, and RetrievalError where no answer can be had."""
+        return self._ask("query", touches, background, top, candidates, none_prior)[0]
+
+    def query_growing(
+        self,
+        touches: AnyTouches,
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> list[QueryResult]:
+        """`Searcher.query_growing`, answered there; see `query`."""
+        return self._ask("query/growing", touches, background, top, candidates, none_prior)
+
+    def query_many(
+        self,
+        objects: Sequence[AnyTouches],
+        *,
+        background: Sequence[AnyImage] | None = None,
+        top: int = 10,
+        candidates: int | None = None,
+        none_prior: float = NONE_PRIOR,
+    ) -> list[QueryResult]:
+        """`Searcher.query_many`, answered there; see `query`."""
+        if not objects:
+            return []
+        asked = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
+        body = self._body(background, top, candidates, none_prior)
+        answers = self._post("query/batch", {"objects": [_encoded(grasps) for grasps in asked], **body})["answers"]
+        return [_result(answer, grasps) for answer, grasps in zip(answers, asked, strict=True)]
+
+    def photo(self, match: Match) -> bytes:
+        """The file of a match's photo. Raises BadInput where it is gone."""
+        return self._send("GET", f"photos/{match.photo}").content
+
+    def _ask(
+        self,
+        path: str,
+        touches: AnyTouches,
+        background: Sequence[AnyImage] | None,
+        top: int,
+        candidates: int | None,
+        none_prior: float,
+    ) -> list[QueryResult]:
+        grasps = self._grasps(touches)
+        body = self._body(background, top, candidates, none_prior)
+        answer = self._post(path, {"touches": _encoded(grasps), **body})
+        return [_result(one, grasps) for one in answer.get("answers", [answer])]
+
+    def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
+        if self._fingers is None:
+            self._fingers = int(self._send("GET", "index").json()["fingers"])
+        return read_grasps(touches, self._fingers, of=of)
+
+    def _body(
+        self, background: Sequence[AnyImage] | None, top: int, candidates: int | None, none_prior: float
+    ) -> dict[str, Any]:
+        frames = None
+        if background is not None:
+            frames = [_base64(GivenImage(image, f"background {n}")) for n, image in enumerate(background, start=1)]
+        return {"background": frames, "top": top, "candidates": candidates, "none_prior": none_prior}
+
+    def _post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+        answer: dict[str, Any] = self._send("POST", path, json=body).json()
+        return answer
+
+    def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
+        """The response; where the service is busy, it is asked again when it says so, until the time is over."""
+        until = time.monotonic() + self._timeout_s
+        while True:
+            try:
+                response = self._http.request(method, f"/v1/{path}", **request)
+            except (httpx.HTTPError, httpx.InvalidURL) as error:
+                raise RetrievalError(
+                    f"{self.url} cannot be reached ({error}); is `retrieve serve` running there?"
+                ) from error
+            pause = float(response.headers.get("retry-after", "1"))
+            if response.status_code not in (429, 503) or time.monotonic() + pause > until:
+                break
+            time.sleep(pause)
+        if response.is_error:
+            raise _error(response)
+        return response
+
+
+def _error(response: httpx.Response) -> RetrievalError:
+    """What a problem document means in Python."""
+    try:
+        problem = response.json()
+        kind, detail = problem["type"].rpartition(":")[2], problem["detail"]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return RetrievalError(f"{response.url} answered {response.status_code}, and not as `retrieve serve` does")
+    if kind == "bad-image":
+        name, _, reason = detail.partition(": ")
+        return ImageError(name, reason)
+    return BadInput(detail) if kind in _REFUSED else RetrievalError(detail)
+
+
+def _result(answer: dict[str, Any], grasps: list[list[GivenImage]]) -> QueryResult:
+    """The answer, whose images are called as they were given here."""
+    result = QueryResult.from_dict(answer)
+    names = [[image.name for image in grasp] for grasp in grasps]
+    return replace(result, touches=names[: len(result.touches)])
+
+
+def _encoded(grasps: list[list[GivenImage]]) -> list[list[str]]:
+    return [[_base64(image) for image in grasp] for grasp in grasps]
+
+
+def _base64(given: GivenImage) -> str:
+    return base64.b64encode(_file(given)).decode("ascii")
+
+
+def _file(given: GivenImage) -> bytes:
+    """An image as a file that reads as the same numbers there. Raises ImageError."""
+    image = given.image
+    if isinstance(image, bytes | bytearray | memoryview):
+        return bytes(image)
+    if isinstance(image, Image.Image) and image.mode in _AS_PNG:
+        return _png(image, given.name)
+    if isinstance(image, Image.Image | np.ndarray):
+        return _png(Image.fromarray(np.rint(255 * given.read()).astype(np.uint8)), given.name)
+    return read_bytes(os.fspath(image))
+
+
+def _png(image: Image.Image, name: str) -> bytes:
+    file = io.BytesIO()
+    try:
+        image.save(file, "PNG", compress_level=1, exif=image.getexif())
+    except OSError as error:  # the file behind it is damaged
+        raise ImageError(name, f"damaged or truncated: {error}") from error
+    return file.getvalue()

@@ -1,0 +1,399 @@
+"""How the service holds under load, in ratios of one run: `python -m tests.service_load [--full] [--only NAME ...]`.
+
+Everything runs against an index of simulated objects that is made first, with the shipped checkpoint. Small by default;
+--full takes what was asked for: 20 minutes of load, 100 generations, 20 ends, 1,000 hostile bodies, 1,000 kills.
+"""
+
+import argparse
+import asyncio
+import base64
+import os
+import random
+import shutil
+import signal
+import socket
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+
+from retrieval.data.dataset import load_grasps
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.serve.app import create_app
+from retrieval.serve.run import Server, configured
+from retrieval.serve.settings import ServiceSettings
+from robot.recording.folder import RecordingWriter
+from robot.sim.rig import SimRig
+from tests.serving import command, listening
+from tests.test_retrieval_serve_uploads import HEAD, png
+
+SEED = 20_000
+QUEUE = 8
+
+
+class Bench:
+    """A catalogue of simulated objects, its index, and the body of a query for it."""
+
+    def __init__(self, folder, objects=12):
+        self.folder, self.catalogue, self.index = folder, folder / "catalog", folder / "index"
+        rig = SimRig(SEED)
+        self.names = rig.object_ids(objects)
+        for name in self.names:
+            self.show(rig, name, 2)
+        self.spare = rig.object_ids(objects + 1)[-1]
+        felt = next(felt for number in range(99) if (felt := rig.press(self.names[0], 500 + number)))
+        self.touch = [encoded(".png", felt[f"touch_{finger}"]) for finger in "ab"]
+        self.body = {"touches": [[base64.b64encode(image).decode() for image in self.touch]]}
+        self.rig, self.model = rig, load_checkpoint(shipped_model())
+        build_index(self.catalogue, self.model, self.index, quiet=True)
+
+    def show(self, rig, name, photos):
+        """Photos of an object, into the catalogue."""
+        (self.catalogue / name).mkdir(parents=True)
+        for number in range(photos):
+            rig.prepare(name, number)
+            (self.catalogue / name / f"{number}.jpg").write_bytes(encoded(".jpg", rig.world.now().image("photo")))
+
+    def next_generation(self, index):
+        """One object more, or less, in turn."""
+        if (self.catalogue / self.spare).exists():
+            shutil.rmtree(self.catalogue / self.spare)
+        else:
+            self.show(self.rig, self.spare, 1)
+        build_index(self.catalogue, self.model, index, quiet=True)
+
+
+def encoded(ending, pixels):
+    return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes())
+
+
+def resident_mb(pid):
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def ms(seconds, share=0.5):
+    return 1e3 * float(np.quantile(seconds, share))
+
+
+def say(name, measured, asked=""):
+    print(f"{name:12} {measured}" + (f"   [asked: {asked}]" if asked else ""), flush=True)
+
+
+# What is measured -----------------------------------------------------------------------------------------------------
+
+
+def paired(bench, full):
+    """HTTP against the bare query on the same open index, in turn."""
+    with listening(bench.index) as (url, parts), httpx.Client(base_url=url, timeout=60) as client:
+        searcher = parts.generations.current.searcher
+        bare, http = [], []
+        for number in range(400 if full else 60):
+            start = time.perf_counter()
+            searcher.query([bench.touch])
+            between = time.perf_counter()
+            assert client.post("/v1/query", json=bench.body).status_code == 200
+            if number >= 10:  # what is made at first is made by then
+                bare.append(between - start)
+                http.append(time.perf_counter() - between)
+    allowed = 1.1 * ms(bare) + 5
+    say(
+        "paired",
+        f"bare p50 {ms(bare):.1f} ms, HTTP p50 {ms(http):.1f} ms: {ms(http) / ms(bare):.2f} x, "
+        f"{ms(http) - ms(bare):+.1f} ms; of what is allowed {ms(http) / allowed:.2f}",
+        "at most 1.1 x + 5 ms",
+    )
+
+
+async def _load(url, body, clients, seconds):
+    """Latencies of accepted queries, and statuses; a client that is told to come again does so when it was told."""
+    taken, statuses, until = [], Counter(), time.monotonic() + seconds
+
+    async def ask(client):
+        while time.monotonic() < until:
+            start = time.perf_counter()
+            response = await client.post("/v1/query", json=body)
+            statuses[response.status_code] += 1
+            if response.status_code == 429:
+                await asyncio.sleep(float(response.headers["retry-after"]))
+            else:
+                taken.append(time.perf_counter() - start)
+
+    limits = httpx.Limits(max_connections=None)
+    async with httpx.AsyncClient(base_url=url, timeout=120, limits=limits) as client:
+        await asyncio.gather(*(ask(client) for _ in range(clients)))
+    return taken, statuses
+
+
+def clients(bench, full):
+    """32 clients against 8, in turn, and what the accepted ones wait."""
+    seconds, rates, waits, statuses = (30 if full else 8), {8: [], 32: []}, {8: [], 32: []}, Counter()
+    options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", QUEUE)
+    with command(*options) as (_, url, _), httpx.Client(base_url=url, timeout=60) as client:
+        bare = []
+        for _ in range(30):
+            start = time.perf_counter()
+            told = client.post("/v1/query", json=bench.body).json()["timing_ms"]["total"]
+            bare.append((told / 1e3, time.perf_counter() - start))
+        for _ in range(3 if full else 2):
+            for count in (8, 32):
+                taken, seen = asyncio.run(_load(url, bench.body, count, seconds))
+                rates[count].append(len(taken) / seconds)
+                waits[count] += taken
+                statuses += seen
+    alone = statistics.median(told for told, _ in bare[5:])
+    rate = {count: statistics.mean(found) for count, found in rates.items()}
+    say(
+        "clients",
+        f"32 clients {rate[32]:.1f}/s, 8 clients {rate[8]:.1f}/s: {rate[32] / rate[8]:.2f} x; accepted p95 of 32 "
+        f"{ms(waits[32], 0.95) / 1e3 / alone:.1f} x the bare query ({1e3 * alone:.0f} ms) with a queue of {QUEUE}; "
+        f"statuses {dict(statuses)}",
+        f"0.9 x; {QUEUE + 1} x; the rest 429",
+    )
+
+
+def memory(bench, full):
+    """Memory of the process over minutes of load, the history kept."""
+    seconds, found = (1200 if full else 40), []
+    with command("--index", bench.index, "--port", "0", "--history", bench.folder / "kept") as (process, url, _):
+        asyncio.run(_load(url, bench.body, 4, 10))
+        ended = time.monotonic() + seconds
+        load = threading.Thread(target=lambda: asyncio.run(_load(url, bench.body, 8, seconds)))
+        load.start()
+        while time.monotonic() < ended:
+            found.append(resident_mb(process.pid))
+            time.sleep(1)
+        load.join()
+    third = len(found) // 3
+    first, last = statistics.median(found[:third]), statistics.median(found[-third:])
+    say("memory", f"{seconds} s: first third {first:.0f} MB, last third {last:.0f} MB: {last - first:+.1f} MB", "flat")
+
+
+def reloads(bench, full):
+    """New generations under load: failed requests, and answers whose parts are of two."""
+    wanted, own = (100 if full else 5), bench.folder / "reloaded"
+    shutil.copytree(bench.index, own)
+    objects, answers, failures, ended = {}, Counter(), [], threading.Event()
+    with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as askers:
+
+        def ask():
+            with httpx.Client(base_url=url, timeout=60) as client:
+                while not ended.is_set():
+                    response = client.post("/v1/query", json={**bench.body, "top": 100, "none_prior": 0.5})
+                    if response.status_code != 200:
+                        failures.append(response.text)
+                        continue
+                    told = response.json()
+                    answers[told["index"]["generation"], told["index"]["objects"]] += 1
+                    # A grasp without contact is not ranked.
+                    if told["results"] and len(told["results"]) != told["index"]["objects"]:
+                        failures.append(told)
+
+        asking = [askers.submit(ask) for _ in range(3)]
+        for _ in range(wanted):
+            bench.next_generation(own)
+            name = (own / "CURRENT").read_text().strip()
+            while parts.generations.current.name != name:
+                time.sleep(0.02)
+            objects[name] = parts.generations.current.searcher.objects.count
+        ended.set()
+        for one in asking:
+            one.result()
+    mixed = sum(count for (name, seen), count in answers.items() if objects.get(name, len(bench.names)) != seen)
+    say(
+        "reloads",
+        f"{wanted} generations taken up, {sum(answers.values())} answers of {len(answers)} generations, "
+        f"{len(failures)} failed, {mixed} of two generations",
+        "0 failed, 0 mixed",
+    )
+
+
+def ends(bench, full):
+    """SIGTERM with requests in flight."""
+    rounds, lost, answered = (20 if full else 3), [], 0
+    for _ in range(rounds):
+        options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", "32")
+        with command(*options) as (process, url, _), ThreadPoolExecutor(8) as askers:
+            httpx.post(f"{url}/v1/query", json=bench.body, timeout=60)
+            sent = threading.Semaphore(0)
+            flying = [askers.submit(_raw_query, url, bench.body, sent) for _ in range(8)]
+            for _ in flying:
+                sent.acquire(timeout=30)
+            time.sleep(0.05)  # of the eight, some wait and one is in work
+            process.send_signal(signal.SIGTERM)
+            found = [one.result(timeout=60) for one in flying]
+            code = process.wait(60)
+            answered += sum(data.startswith(b"HTTP/1.1 200") and data.endswith(b"}") for data in found)
+            lost += [data[:40] for data in found if not data.startswith(b"HTTP/1.1 200")] + [code] * (code != 0)
+    say("ends", f"{rounds} SIGTERMs: {answered} of {8 * rounds} in flight answered, lost: {lost[:3]}", "none lost")
+
+
+def _raw_query(url, body, sent):
+    request = httpx.Request("POST", f"{url}/v1/query", json=body)
+    head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
+    with _line(url) as line:
+        line.sendall(f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + request.content)
+        sent.release()
+        data = b""
+        with suppress(ConnectionError):
+            while more := line.recv(65536):
+                data += more
+        return data
+
+
+def _line(url):
+    host, port = url.removeprefix("http://").split(":")
+    return socket.create_connection((host, int(port)), timeout=60)
+
+
+BODY_S = 0.3
+"""A slow body is given up after so long here; 10 s where nothing is said."""
+
+
+def hostile(bench, full):
+    """Junk, bombs, half bodies, slow bodies, wrong types, 2 GB announced."""
+    count, draw = (1000 if full else 120), random.Random(0)
+    kinds = ("junk", "json", "bomb", "half", "slow", "type", "announced", "chunked", "form", "deep")
+    taken, wrong, statuses = {kind: [] for kind in kinds}, [], Counter()
+    settings = ServiceSettings(index=bench.index, port=0, body_s=BODY_S)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        _serve(settings, None, writer)
+    try:
+        url = os.read(reader, 100).decode()
+        httpx.post(f"{url}/v1/query", json=bench.body, timeout=60)
+        before, most = resident_mb(child), 0.0
+        for number in range(count):
+            kind = kinds[number % len(kinds)]
+            start = time.perf_counter()
+            status = _attack(url, kind, draw)
+            taken[kind].append(time.perf_counter() - start)
+            statuses[status] += 1
+            if status is not None and not 400 <= status < 500:
+                wrong.append((kind, status))
+            most = max(most, resident_mb(child))
+        alive = httpx.post(f"{url}/v1/query", json=bench.body, timeout=60).status_code
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    slowest = {kind: round(1e3 * max(found)) for kind, found in taken.items()}
+    every = [one for found in taken.values() for one in found]
+    say(
+        "hostile",
+        f"{count} bodies: statuses {dict(statuses)} (None: left before an answer), not 4xx {wrong[:3]}; p99 "
+        f"{ms(every, 0.99):.0f} ms, slowest by kind {slowest} ms; memory {most - before:+.0f} MB; then {alive}",
+        f"4xx in under 500 ms (slow bodies have {BODY_S} s here), within 100 MB, alive",
+    )
+
+
+def _attack(url, kind, draw):
+    """Status of the answer; None where the attacker left."""
+    junk = draw.randbytes(draw.choice((0, 10, 10_000, 1_000_000)))
+    as_json = {"content-type": "application/json"}
+    bomb = base64.b64encode(png(draw.randrange(5000, 2**31), draw.randrange(5000, 2**31))).decode()
+    whole = {
+        "junk": lambda: {"content": junk, "headers": as_json},
+        "json": lambda: {"json": {"touches": [[base64.b64encode(junk).decode()] * 2]}},
+        "bomb": lambda: {"json": {"touches": [[bomb, bomb]]}},
+        "type": lambda: {"content": junk, "headers": {"content-type": draw.choice(("text/xml", "image/png", ""))}},
+        "form": lambda: {"files": [("gelsight", ("../../x", junk)) for _ in range(draw.randrange(1, 40))]},
+        "deep": lambda: {"content": b"[" * draw.randrange(1, 1_000_000), "headers": as_json},
+    }
+    if kind in whole:
+        return httpx.post(f"{url}/v1/query", timeout=60, **whole[kind]()).status_code
+    head = HEAD.format(kind="application/json").encode()
+    with _line(url) as line:
+        if kind == "announced":
+            line.sendall(head + b"content-length: %d\r\n\r\n" % (2 * 2**30))
+        elif kind == "chunked":
+            with suppress(OSError):
+                line.sendall(head + b"transfer-encoding: chunked\r\n\r\n")
+                for _ in range(400):
+                    line.sendall(b"10000\r\n" + b"x" * 65536 + b"\r\n")
+        else:
+            line.sendall(head + b"content-length: 1000\r\n\r\n{")
+            if kind == "half":
+                return None
+        try:
+            return int(line.recv(65536).split(b" ", 2)[1])
+        except (ConnectionError, IndexError):
+            return None
+
+
+def _serve(settings, folder, writer):
+    """In a fork: serve, tell the address through the pipe, and never return."""
+    try:
+        recorder = folder and RecordingWriter(folder / "recording", {"source": "said", "sensor": "simulated"})
+        app = create_app(settings, None, recorder)
+        port = lambda bound: os.write(writer, f"http://127.0.0.1:{bound}".encode())  # noqa: E731
+        Server(configured(app), app.state.service, port).run()
+    finally:
+        os._exit(0)
+
+
+def kills(bench, full):
+    """SIGKILL while people speak; the service is a fork, so that it starts at once."""
+    rounds, folder, draw, acknowledged = (1000 if full else 20), bench.folder / "killed", random.Random(0), []
+    for _ in range(rounds):
+        reader, writer = os.pipe()
+        child = os.fork()
+        if not child:
+            _serve(ServiceSettings(index=bench.index, port=0, history=folder), folder, writer)
+        os.close(writer)
+        url = os.read(reader, 100).decode()
+        os.close(reader)
+        killer = threading.Timer(draw.uniform(0.05, 0.6), os.kill, (child, signal.SIGKILL))
+        with httpx.Client(base_url=url, timeout=30) as client, suppress(httpx.HTTPError):
+            for number in range(10_000):
+                query = client.post("/v1/query", json=bench.body).headers["x-query-id"]
+                if not number:
+                    killer.start()
+                word = {"query": query, "said": "object", "object_id": bench.names[0]}
+                if client.post("/v1/feedback", json=word).status_code == 201:
+                    acknowledged.append(query)
+        killer.join()
+        os.waitpid(child, 0)
+    with (
+        RecordingWriter(folder / "recording", {"source": "said", "sensor": "simulated"}) as recorder,
+        listening(bench.index, None, recorder, history=folder) as (url, parts),
+    ):
+        httpx.get(f"{url}/v1/history", timeout=60)
+        kept = Counter(name for name, _ in parts.keeping.store.recordable())
+    recorded = Counter(grasp.sequence_id for grasp in load_grasps(folder / "recording"))
+    lost = [name for name in acknowledged if kept[name] != 1 or recorded[name] != 1]
+    say(
+        "kills",
+        f"{rounds} SIGKILLs, {len(acknowledged)} words acknowledged, {len(kept)} kept, {len(recorded)} recorded, "
+        f"{len(lost)} lost or twice",
+        "each there, once",
+    )
+
+
+PARTS = {one.__name__: one for one in (paired, clients, memory, reloads, ends, hostile, kills)}
+
+
+def main():
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--full", action="store_true", help="as much as was asked for")
+    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS), help="parts")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder))
+        for name in asked.only:
+            PARTS[name](bench, asked.full)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

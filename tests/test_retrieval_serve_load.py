@@ -1,0 +1,249 @@
+"""Many at once, askers who leave, deadlines, windows, new generations of the index, and the end."""
+
+import base64
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import httpx
+import pytest
+
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.serve.service import Bench
+from tests import synthetic
+from tests.serving import command, listening, problem
+from tests.waiting import until
+
+
+@pytest.fixture(scope="module")
+def body(touch):
+    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
+
+
+class Held:
+    """An encoder that waits until it may go on, and counts the grasps of each call."""
+
+    def __init__(self, encoder):
+        self.encoder, self.calls, self.go = encoder, [], threading.Event()
+
+    @property
+    def name(self):
+        return self.encoder.name
+
+    def encode(self, touches):
+        self.calls.append(len(touches))
+        assert self.go.wait(30)
+        return self.encoder.encode(touches)
+
+
+@contextmanager
+def held(index, **settings):
+    """A service whose encoder is held: its address, the encoder, and its parts."""
+    with listening(index, **settings) as (url, parts), ThreadPoolExecutor(16) as askers:
+        searcher = parts.generations.current.searcher
+        encoder = searcher.reader.encoder = Held(searcher.reader.encoder)
+        try:
+            yield url, encoder, parts, askers
+        finally:
+            encoder.go.set()
+
+
+def value(url, name):
+    """A number of /metrics; 0 where it was never counted."""
+    lines = httpx.get(f"{url}/metrics").text.splitlines()
+    return next((float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith(f"{name} ")), 0.0)
+
+
+def asked(url, body, **more):
+    return httpx.post(f"{url}/v1/query", json={**body, **more}, timeout=60)
+
+
+def test_beyond_the_queue_requests_are_told_to_come_again_and_the_others_are_answered(index, body):
+    with held(index, queue=3) as (url, encoder, parts, askers):
+        first = [askers.submit(asked, url, body) for _ in range(3)]
+        until(lambda: parts.queue.held == 3)
+        for _ in range(4):
+            refused = asked(url, body)
+            assert problem(refused, 429, "busy") == "3 requests are held already; come again"
+            assert refused.headers["retry-after"] == "1"
+        assert httpx.get(f"{url}/readyz").status_code == 200  # who does not ask the model is not held up
+        encoder.go.set()
+        assert [one.result().status_code for one in first] == [200] * 3
+        assert asked(url, body).status_code == 200
+        assert value(url, 'retrieve_dropped_total{why="busy"}') == 4
+
+
+def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
+    with held(index) as (url, encoder, parts, askers):
+        first = askers.submit(asked, url, body)
+        until(lambda: encoder.calls == [1])
+        assert problem(asked(url, body, deadline_ms=50), 504, "late") == "no answer within 50 ms"
+        with pytest.raises(httpx.ReadTimeout):  # the client closes its connection then
+            httpx.post(f"{url}/v1/query", json=body, timeout=0.5)
+        until(lambda: value(url, 'retrieve_dropped_total{why="left"}') == 1)
+        last = askers.submit(asked, url, body)
+        until(lambda: parts.queue.held == 2)
+        encoder.go.set()
+        assert (first.result().status_code, last.result().status_code) == (200, 200)
+        assert encoder.calls == [1, 1]
+
+
+def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_none(index, body):
+    short = {"touches": [body["touches"][0][:1]]}  # a finger too few
+    with held(index, batch_ms=1000, batch_most=3) as (url, encoder, _, askers):
+        encoder.go.set()
+        good = [askers.submit(asked, url, body) for _ in range(3)]
+        assert [one.result().status_code for one in good] == [200] * 3
+        assert sorted(encoder.calls) == [3]
+        mixed = [askers.submit(asked, url, one) for one in (body, short, body)]
+        assert [one.result().status_code for one in mixed] == [200, 422, 200]
+        assert value(url, "retrieve_batch_queries_count") == 2
+        other = [askers.submit(asked, url, body, top=top) for top in (2, 3)]
+        assert [len(one.result().json()["results"]) for one in other] == [2, 3]
+
+
+# Generations ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def grown(catalogue, index, tmp_path, model):
+    """A copy of the index, and what builds the next generation of it: with one object more or less, in turn."""
+    photos, own = tmp_path / "catalog", tmp_path / "index"
+    shutil.copytree(catalogue, photos)
+    shutil.copytree(index, own)
+    checkpoint, extra = load_checkpoint(model), synthetic.make_objects(1, seed=77)
+
+    def build():
+        folder = photos / extra[0].object_id
+        if folder.exists():
+            shutil.rmtree(folder)
+        else:
+            synthetic.write_catalogue(photos, extra)
+        build_index(photos, checkpoint, own, quiet=True)
+
+    return own, build
+
+
+def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
+    own, build = grown
+    objects, ended, failures = {"gen-000001": 8}, threading.Event(), []
+
+    def ask(url):
+        while not ended.is_set():
+            response = asked(url, body, top=100)
+            document = response.json()
+            seen = document["index"]["generation"], document["index"]["objects"], len(document["results"])
+            if response.status_code != 200 or seen[1] != seen[2]:
+                failures.append(document)
+            answers.add(seen[:2])
+
+    answers = set()
+    with listening(own, poll_s=0.05) as (url, _), ThreadPoolExecutor(2) as askers:
+        asking = [askers.submit(ask, url) for _ in range(2)]
+        for number in (2, 3):
+            build()
+            objects[f"gen-{number:06}"] = 9 if number == 2 else 8
+            until(lambda: any(seen[0] == f"gen-{number:06}" for seen in list(answers)), 60)  # noqa: B023
+        ended.set()
+        for one in asking:
+            one.result()
+    assert not failures
+    assert dict(sorted(answers)) == objects
+
+
+def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
+    own, build = grown
+    with listening(own, poll_s=0.05) as (url, _):
+        build()
+        until(lambda: asked(url, body).json()["index"]["generation"] == "gen-000002", 60)
+        (own / "CURRENT").write_text("gen-000009\n")
+        until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
+        assert asked(url, body).json()["index"]["generation"] == "gen-000002"
+
+
+def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
+    line = [sys.executable, "-m", "retrieval", "serve", "--index", str(tmp_path), "--port", "0", "--no-history"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"retrieve serve: {tmp_path}: there is no index here")
+
+
+# The end -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
+def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign, tmp_path):
+    with (
+        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "kept") as (process, url, _),
+        ThreadPoolExecutor(12) as askers,
+    ):
+        asked(url, body)
+        connected = threading.Semaphore(0)
+
+        def ask():
+            host, port = url.removeprefix("http://").split(":")
+            with socket.create_connection((host, int(port))) as line:
+                text = httpx.Request("POST", f"{url}/v1/query", json=body)
+                head = "".join(f"{name}: {value}\r\n" for name, value in text.headers.items())
+                line.sendall(f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + text.content)
+                connected.release()
+                data = b""
+                while more := line.recv(65536):
+                    data += more
+                return data
+
+        answers = [askers.submit(ask) for _ in range(12)]
+        for _ in answers:
+            connected.acquire(timeout=30)
+        held_now = value(url, "retrieve_held_requests")
+        process.send_signal(sign)
+        found = [one.result(timeout=60) for one in answers]
+        assert process.wait(60) == 0
+        assert held_now <= 12
+        assert [data.split(b" ", 2)[1] for data in found] == [b"200"] * 12
+        assert all(data.endswith(b"}") for data in found)
+
+
+def test_a_stream_ends_when_the_service_does(index):
+    pictures = iter(range(10**6))
+    beside = Bench({"a": lambda: b"picture %d" % next(pictures)})
+    with (
+        listening(index, beside) as (url, parts),
+        httpx.stream("GET", f"{url}/v1/sensors/a/stream", params={"rate": 30}, timeout=30) as stream,
+    ):
+        parts_seen = b""
+        chunks = stream.iter_raw()
+        while b"picture 3" not in parts_seen:
+            parts_seen += next(chunks)
+        parts.stopping.set()
+        rest = b"".join(chunks)  # ends
+    assert stream.headers["content-type"] == "multipart/x-mixed-replace; boundary=picture"
+    assert b"--picture\r\ncontent-type: image/jpeg\r\ncontent-length: 9\r\n\r\npicture 0\r\n" in parts_seen
+    assert len(rest) < 10_000
+
+
+def status(address):
+    with httpx.stream("GET", address, timeout=30) as stream:
+        return stream.status_code
+
+
+def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
+    beside = Bench({"a": lambda: b"picture", "b": lambda: 1 / 0})
+    with listening(index, beside, streams=1) as (url, _):
+        address = f"{url}/v1/sensors/a/stream"
+        with httpx.stream("GET", address, timeout=30) as stream:
+            chunks = stream.iter_raw()
+            assert b"picture" in next(chunks)
+            with httpx.stream("GET", address, timeout=30) as refused:
+                refused.read()
+            problem(refused, 429, "busy")
+        until(lambda: status(address) == 200)
+        assert httpx.get(f"{url}/v1/sensors/a/frame").content == b"picture"
+        assert problem(httpx.get(f"{url}/v1/sensors/b/frame"), 500, "failed") == "sensor b: division by zero"
+        problem(httpx.get(f"{url}/v1/sensors/c/frame"), 404, "unknown")
