@@ -21,6 +21,8 @@ from tests.miniatures import encoded, picture, pixels
 from tests.reference import DATA_SETS, data_sets
 
 PICTURES = {".png", ".jpg"}
+SAID_BY_THE_SOURCE = ("folder", "lerobot", "open-x-tactile")
+"""Which sensor it was, and the like, differs from source to source."""
 
 pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
 
@@ -56,7 +58,7 @@ def test_a_data_set_becomes_a_recording_that_says_what_it_is(name, source, tmp_p
     facts = data_set_of(name)
     for key in ("source", "licence", "citation", "sensor", "fingers", "background"):
         assert recording.info[key]
-        assert recording.info[key] == getattr(facts, key) or name == "folder"
+        assert recording.info[key] == getattr(facts, key) or name in SAID_BY_THE_SOURCE
     assert {len(grasp.touches) for grasp in recording.grasps} == {recording.info["fingers"]}
     for grasp in recording.grasps:
         assert all(cv2.imread(str(recording.folder / path)) is not None for path in grasp.images().values())

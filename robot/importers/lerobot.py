@@ -1,0 +1,264 @@
+"""LeRobot data sets, version 3: robot episodes with gel cameras among their cameras; and our own exports.
+
+Read with pyarrow and PyAV, without lerobot.
+
+    meta/info.json    meta/tasks.parquet    meta/episodes/chunk-000/file-000.parquet
+    data/chunk-000/file-000.parquet         rows of steps; pictures too where a camera is not a video
+    videos/<key>/chunk-000/file-000.mp4     a camera, the episodes of a file one after the other
+
+The option `touch` names the gel cameras, comma between them, `photo` the camera that sees the object; without them gel
+cameras are those called so (touch, tactile, gel, digit), and the photo is of the first other one. An episode gives one
+grasp: its first step is the untouched gel and the photo, the step whose gel images differ most from it is the touch.
+Its task counts as its object, and an episode is a sequence, unless the episodes say otherwise, as those that
+`retrieve export-recording` writes, whose fields are taken back.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of
+from robot.importers.episodes import ENDINGS, Episode, Picture, Step
+from robot.recording.folder import Recording
+from robot.storage import content_of, object_of
+
+DATA_SET = DataSet(
+    source="LeRobot data set",
+    licence="as the data set's card says",
+    citation="see the data set's own card",
+    sensor="as the cameras are called",
+    rig="as info.json says",
+    expects="`meta/info.json` of a LeRobot data set, version 3",
+    fingers=0,
+    background="the first step of each episode",
+    traps=(
+        "A task counts as one object unless the episodes name objects; a task that names several objects does not tell "
+        "them apart.",
+        "The touch of an episode is its step that differs most from the first, which a change of light may be too.",
+        "Videos are not lossless: fine relief may be gone.",
+    ),
+    unverified=("that the first step of an episode is without contact",),
+)
+_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_PATHS = {"data_path": f"data/{_PLACE}.parquet", "video_path": "videos/{video_key}/" + f"{_PLACE}.mp4"}
+_GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
+_FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
+_MOMENTS = tuple(ENDINGS)
+_WHAT = "a LeRobot data set"
+_MOST_PIXELS = 50_000_000
+
+_Row = dict[str, Any]
+
+
+def import_lerobot(
+    src: Path, out: Path, progress: Progress | None = None, *, touch: str = "", photo: str = ""
+) -> Recording:
+    """Import the episodes below `src`. Raises ImporterError without pyarrow or av, and for another version."""
+    src = Path(src)
+    if not (src / "meta" / "info.json").is_file():
+        raise DATA_SET.refusal(src, "there is no such file")
+    library("pyarrow", _WHAT)
+    library("av", _WHAT)
+    source = _Source(src, touch, photo)
+    rows = list(source.episodes(("episode_index", "object_id", "tasks")))
+    return import_items(
+        replace(DATA_SET, fingers=len(source.touch), **source.said()),
+        source.items(),
+        out,
+        total=len(rows),
+        progress=progress,
+        published=Published({}, source.splits([_object(row) for row in rows])),
+    )
+
+
+class _Source:
+    """A data set on disk: its cameras, and its episodes as grasps."""
+
+    def __init__(self, src: Path, touch: str, photo: str) -> None:
+        self.src = src
+        self.info = object_of(content_of(src / "meta" / "info.json", ImporterError), ImporterError)
+        version = str(self.info.get("codebase_version"))
+        if not re.fullmatch(r"v3(\.\d+)*", version):
+            raise ImporterError(f"{src} must be of LeRobot's version 3, and is of {version}; convert it with lerobot")
+        for key, known in _PATHS.items():
+            if self.info.get(key) not in (known, None):
+                raise ImporterError(f"{src}: {key} of info.json must be {known}, got {str(self.info[key])[:80]!r}")
+        features = self.info.get("features")
+        kinds = {
+            str(name): about["dtype"]
+            for name, about in (features.items() if isinstance(features, dict) else ())
+            if isinstance(about, dict) and about.get("dtype") in ("video", "image")
+        }
+        self._kinds: dict[str, str] = kinds
+        self.touch = [name.strip() for name in touch.split(",")] if touch else sorted(filter(_GEL.search, kinds))
+        self.photo = photo or next((name for name in kinds if name not in self.touch), "")
+        if not self.touch or any(name not in kinds for name in (*self.touch, self.photo)):
+            raise ImporterError(
+                f"{src} must have a camera for the photo and gel cameras; say which by --option photo=... touch=..., "
+                f"of these: {', '.join(kinds) or 'none'}"
+            )
+        if len(self.touch) > 26 or any("/" in name or ".." in name for name in kinds):
+            raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera with a path for a name")
+        try:
+            self._fps = float(self.info["fps"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ImporterError(f"{src}: info.json must say fps") from error
+        self._has_moments = isinstance(features, dict) and "moment" in features
+
+    def said(self) -> dict[str, Any]:
+        """What our own export, or the data set, says of where it comes from, and of its sensors."""
+        found = self.info.get("recording")
+        own = found if isinstance(found, dict) else {"rig": self.info.get("robot_type")}
+        texts = {key: own.get(key) for key in ("source", "licence", "citation", "rig", "sensor")}
+        return {"sensor": ", ".join(self.touch)} | {key: text for key, text in texts.items() if isinstance(text, str)}
+
+    def splits(self, objects: Sequence[str]) -> dict[str, dict[str, list[str]]]:
+        """The split of info.json, "0:80" for each part, where it has several parts."""
+        said = self.info.get("splits")
+        ranges = {
+            str(part): (int(found[1]), int(found[2]))
+            for part, text in (said.items() if isinstance(said, dict) else ())
+            if (found := re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)))
+        }
+        parts = {part: sorted(set(objects[start:stop])) for part, (start, stop) in ranges.items()}
+        return {"published": parts} if len(parts) > 1 else {}
+
+    # Episodes ----------------------------------------------------------------------------------------------
+
+    def episodes(self, columns: Sequence[str]) -> Iterator[_Row]:
+        """Rows of meta/episodes, those of `columns` that are there; a few in memory. Raises ImporterError."""
+        paths = sorted((self.src / "meta" / "episodes").glob("*/*.parquet"))
+        if not paths:
+            raise ImporterError(f"{self.src} must hold meta/episodes/chunk-000/file-000.parquet")
+        for path in paths:
+            with _readable(path):
+                file = library("pyarrow.parquet", _WHAT).ParquetFile(path)
+                known = [name for name in columns if name in file.schema_arrow.names]
+                for batch in file.iter_batches(256, columns=known):
+                    yield from batch.to_pylist()
+
+    def items(self) -> Iterator[Item | Skip]:
+        """A grasp of each episode."""
+        keys = (self.photo, *self.touch)
+        columns = [f"videos/{key}/{what}" for key in keys for what in ("chunk_index", "file_index", "from_timestamp")]
+        own = ("grasp_id", "object_id", "sequence_id", *_FIELDS)
+        for row in self.episodes(
+            ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index", *own, *columns)
+        ):
+            number = row.get("episode_index")
+            name = name_of(str(row.get("grasp_id") or f"episode-{number}"))
+            if not isinstance(number, int) or not isinstance(row.get("length"), int):
+                yield Skip("its episode has no number or no length", name)
+                continue
+            fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
+            sequence = row.get("sequence_id") or f"episode-{number}"
+            pictures = Episode(partial(self._steps, row), len(self.touch), self._moments(row))
+            yield Item(name, _object(row), pictures.images(), {"sequence_id": str(sequence), **fields})
+
+    def _moments(self, row: _Row) -> list[str] | None:
+        if not self._has_moments:
+            return None
+        try:
+            said = [
+                moment for episode, moment in self._steps_of(_place(row, "data")) if episode == row["episode_index"]
+            ]
+        except ImporterError:
+            return None
+        known = len(set(said)) == len(said) == row["length"] and set(said) <= set(range(len(_MOMENTS)))
+        return [_MOMENTS[moment] for moment in said] if known and 1 in said else None
+
+    def _steps_of(self, place: str) -> list[tuple[int, int]]:
+        """(episode_index, moment) of the steps of one file, of which the last is kept."""
+        if self._file[0] != place:
+            path = self.src / f"data/{place}.parquet"
+            with _readable(path):
+                table = library("pyarrow.parquet", _WHAT).read_table(path, columns=["episode_index", "moment"])
+                self._file = (place, list(zip(*(column.to_pylist() for column in table.columns), strict=True)))
+        return self._file[1]
+
+    @cached_property
+    def _file(self) -> tuple[str, list[tuple[int, int]]]:
+        return "", []
+
+    # Pictures ----------------------------------------------------------------------------------------------
+
+    def _steps(self, row: _Row) -> Iterator[Step]:
+        cameras = [self._frames(key, row) for key in (self.photo, *self.touch)]
+        for pictures in zip(*cameras, strict=False):
+            yield pictures[0], pictures[1:]
+
+    def _frames(self, key: str, row: _Row) -> Iterator[Picture]:
+        """The pictures of one camera through an episode. Raises ImporterError."""
+        if self._kinds[key] == "image":
+            return self._stored(key, row)
+        return self._filmed(key, row)
+
+    def _filmed(self, key: str, row: _Row) -> Iterator[Picture]:
+        av = library("av", _WHAT)
+        path = self.src / f"videos/{key}/{_place(row, f'videos/{key}')}.mp4"
+        start = row.get(f"videos/{key}/from_timestamp")
+        if not isinstance(start, float) or not path.is_file():
+            raise ImporterError("its video is missing")
+        end = start + (row["length"] - 0.5) / self._fps
+        try:
+            with av.open(str(path)) as film:
+                stream = film.streams.video[0]
+                if stream.codec_context.width * stream.codec_context.height > _MOST_PIXELS:
+                    raise ImporterError(f"its video has more than {_MOST_PIXELS} pixels")
+                film.seek(int(start / stream.time_base), stream=stream)
+                for frame in film.decode(stream):
+                    if frame.time is not None and frame.time >= start - 0.5 / self._fps:
+                        if frame.time >= end:
+                            return
+                        yield frame.to_ndarray(format="rgb24")
+        except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+            raise ImporterError("its video cannot be decoded") from error
+
+    def _stored(self, key: str, row: _Row) -> Iterator[Picture]:
+        """Pictures that stand in the rows of steps as PNG or JPEG."""
+        path = self.src / f"data/{_place(row, 'data')}.parquet"
+        dataset = library("pyarrow.dataset", _WHAT)
+        with _readable(path):
+            wanted = dataset.field("episode_index") == row["episode_index"]
+            for batch in dataset.dataset(path).to_batches(
+                columns=[key], filter=wanted, batch_size=16, batch_readahead=1
+            ):
+                for cell in batch.column(0).to_pylist():
+                    data = cell.get("bytes") if isinstance(cell, dict) else None
+                    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+                    if image is None:
+                        raise ImporterError("a picture of its episode cannot be decoded")
+                    yield np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+
+
+def _object(row: _Row) -> str:
+    tasks = row.get("tasks")
+    said = row.get("object_id") or ((tasks[0] if tasks else None) if isinstance(tasks, list) else tasks)
+    return str(said or "unknown")
+
+
+def _place(row: _Row, what: str) -> str:
+    """The chunk and file of an episode's data or video. Raises ImporterError."""
+    place = {key: row.get(f"{what}/{key}") for key in ("chunk_index", "file_index")}
+    if not all(isinstance(number, int) and number >= 0 for number in place.values()):
+        raise ImporterError(f"its episode does not say in which file its {what.split('/')[0]} stand")
+    return _PLACE.format(**place)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn what pyarrow says of a damaged file into an ImporterError."""
+    pa = library("pyarrow", _WHAT)
+    try:
+        yield
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        raise ImporterError(f"{path} cannot be read: {json.dumps(str(error)[:200])}") from error

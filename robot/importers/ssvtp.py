@@ -1,0 +1,97 @@
+"""SSVTP: touches of a DIGIT on a robot and photos of the same places, on cloths, ropes and other soft things.
+
+As TVL (tactile-vlm.github.io) ships it, with captions.
+
+    ssvtp/
+        images_tac/image_<n>_tac.jpg    images_rgb/image_<n>_rgb.jpg    text/labels_<n>.txt
+        train.csv (url,tactile,caption)    test.csv (url,caption)
+
+A pair is an object of its own: nothing says which pairs are of one thing. Pairs were taken one after the other, so
+`block` of them in a row are one sequence, a surrogate. `tac_background.png`, which stands in TVL's code and not in the
+data set, is the untouched gel of all pairs where it was put beside the folders.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Images, Item, Progress, Published, Skip, import_items, numbered
+from robot.importers.row_splits import RowSplit
+from robot.importers.tvl import LICENCE, csv_rows
+from robot.recording.folder import Recording, Shared
+
+DATA_SET = DataSet(
+    source="tactile-vlm.github.io, SSVTP",
+    licence=LICENCE,
+    citation="Kerr, Huang, Wilcox, Hoque, Ichnowski, Calandra, Goldberg, Self-Supervised Visuo-Tactile Pretraining to "
+    "Locate and Follow Garment Features, RSS 2023",
+    sensor="DIGIT",
+    rig="robot arm, camera and sensor on its wrist",
+    expects="`images_tac/image_<n>_tac.jpg` and `images_rgb/image_<n>_rgb.jpg`, or `ssvtp` with them in it",
+    background="one frame for all grasps",
+    traps=(
+        "Each pair counts as an object, with one grasp; neighbouring pairs may show overlapping places of one thing. "
+        "Blocks of pairs in a row are one sequence: a surrogate, for nothing says where a thing begins.",
+        "The one frame of the untouched gel is older than most touches: what drifted since stays in the difference.",
+    ),
+    unverified=("that pairs are numbered in the order in which they were taken", "sizes of the photos"),
+)
+_TOUCH = re.compile(r"image_(\d{1,9})_tac\.(jpg|jpeg|png)", re.IGNORECASE)
+_URL = re.compile(r".*image_(\d{1,9})_rgb\.\w+")
+
+
+def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, block: int = 50) -> Recording:
+    """Import the pairs below `src`. Raises ImporterError where there is none."""
+    if block < 1:
+        raise ImporterError(f"block must be 1 or more pairs, got {block}")
+    root = Path(src) / "ssvtp" if (Path(src) / "ssvtp").is_dir() else Path(src)
+    touches = numbered(root / "images_tac", _TOUCH)
+    if not touches:
+        raise DATA_SET.refusal(Path(src), "images_tac/ has no such file, or is not there")
+    known = {int(match[1]) for match, _ in touches}
+    split, captions = RowSplit("published"), dict[str, dict[str, Any]]()
+    for side in ("train", "test"):
+        for row in csv_rows(root / f"{side}.csv"):
+            url = _URL.fullmatch(row.get("url") or "")
+            if url and int(url[1]) in known:
+                number = int(url[1])
+                split.add(side, _object(number), _sequence(number, block))
+                captions[_object(number)] = {"caption": row.get("caption")}
+    splits, said = split.settle()
+    background = root / "tac_background.png"
+    facts = replace(DATA_SET, traps=(*DATA_SET.traps, *said))
+    return import_items(
+        facts if background.is_file() else replace(facts, background="none"),
+        _items(root, touches, background, block),
+        out,
+        total=len(touches),
+        progress=progress,
+        published=Published(captions, splits),
+    )
+
+
+def _object(number: int) -> str:
+    return f"pair-{number}"
+
+
+def _sequence(number: int, block: int) -> str:
+    return f"block-{number // block}"
+
+
+def _items(
+    root: Path, touches: list[tuple[re.Match[str], Path]], background: Path, block: int
+) -> Iterator[Item | Skip]:
+    for match, touch in touches:
+        number = int(match[1])
+        photo = next((path for suffix in ("jpg", "png") if (path := _photo(root, match[1], suffix)).exists()), None)
+        images: Images = {"photo": photo or _photo(root, match[1], "jpg"), "touch_a": touch}
+        if background.is_file():
+            images = {**images, "touch_a_before": Shared("untouched", background)}
+        yield Item(_object(number), _object(number), images, {"sequence_id": _sequence(number, block)})
+
+
+def _photo(root: Path, number: str, suffix: str) -> Path:
+    return root / "images_rgb" / f"image_{number}_rgb.{suffix}"

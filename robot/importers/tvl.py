@@ -1,0 +1,143 @@
+"""TVL, the part HCT: touches of a DIGIT and photos, both held by hand, outdoors and indoors, with captions.
+
+    hct/data1|data2|data3/
+        train.csv  test.csv  contact.json  not_contact.json
+        <k>-<time>/tactile/<frame>.jpg  vision/<frame>.jpg        the same name is one moment
+        <k>-<time>/tactile_bg_latent.jpg                          the untouched gel of this folder
+
+A timestamp folder is one contact with one thing: object and sequence, `<data>-<k>-<time>`. Frames are those that
+contact.json names, or all that stand in both folders where there is none. A frame that not_contact.json names, such
+as one whose gel is in the air, is no grasp.
+"""
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Images, Item, Progress, Published, Skip, folders, import_items, name_of
+from robot.importers.row_splits import RowSplit
+from robot.recording.folder import Recording, Shared
+
+CITATION = (
+    "Fu, Datta, Huang, Panitch, Drake, Ortiz, Mukadam, Lambeta, Calandra, Goldberg, A Touch, Vision, and Language "
+    "Dataset for Multimodal Alignment, ICML 2024"
+)
+LICENCE = "as the data set's card on Hugging Face says (mlfu7/Touch-Vision-Language-Dataset)"
+DATA_SET = DataSet(
+    source="tactile-vlm.github.io, HCT",
+    licence=LICENCE,
+    citation=CITATION,
+    sensor="DIGIT",
+    rig="by hand, webcam beside the sensor",
+    expects="`hct/data1/<k>-<time>/{tactile,vision}/<frame>.jpg`, or be `hct` itself",
+    background="one frame a contact",
+    traps=(
+        "Frames of one timestamp folder are neighbours in a video, and the authors' validation rows are drawn from the "
+        "training rows frame by frame: the nearest neighbour by raw pixels names the folder. Here a folder is one "
+        "object and one sequence, so that no split of objects parts it.",
+        "In the first upload `tactile` and `vision` were exchanged in some folders: run `retrieve check`, which names "
+        "them.",
+        "The photo is of the moment of the touch, with the sensor in it.",
+    ),
+    unverified=("sizes of the photos", "that the paths of contact.json and of the CSV files begin at their own folder"),
+)
+_MOST_JSON = 256 * 2**20
+
+
+def import_tvl(src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    """Import the contacts below `src`. Raises ImporterError where there is none."""
+    root = Path(src) / "hct" if (Path(src) / "hct").is_dir() else Path(src)
+    parts = [part for part in (folders(root) if root.is_dir() else []) if part.name.startswith("data")]
+    contacts = [contact for part in parts for contact in folders(part) if (contact / "tactile").is_dir()]
+    if not contacts:
+        raise DATA_SET.refusal(Path(src), "no folder with tactile/ in it was found")
+    split, objects = RowSplit("published"), dict[str, dict[str, Any]]()
+    known = {_name(contact) for contact in contacts}
+    for part in parts:
+        for side in ("train", "test"):
+            for row in csv_rows(part / f"{side}.csv"):
+                object_id = f"{part.name}-{(row.get('url') or '').split('/')[0]}"
+                if object_id in known:
+                    split.add(side, object_id, object_id)
+                    objects.setdefault(object_id, {"caption": row.get("caption")})
+    splits, said = split.settle()
+    named = _Named(parts)
+    return import_items(
+        replace(DATA_SET, traps=(*DATA_SET.traps, *said)),
+        _items(contacts, named),
+        out,
+        total=sum(len(named.frames(contact)) for contact in contacts),
+        progress=progress,
+        published=Published(objects, splits),
+    )
+
+
+def _name(contact: Path) -> str:
+    return f"{contact.parent.name}-{contact.name}"
+
+
+def _items(contacts: list[Path], named: "_Named") -> Iterator[Item | Skip]:
+    for contact in contacts:
+        background = contact / "tactile_bg_latent.jpg"
+        untouched = Shared(name_of(contact.parent.name, contact.name, "untouched"), background)
+        for frame in named.frames(contact):
+            images: Images = {"photo": contact / "vision" / frame, "touch_a": contact / "tactile" / frame}
+            if background.is_file():
+                images = {**images, "touch_a_before": untouched}
+            grasp_id = name_of(contact.parent.name, contact.name, Path(frame).stem)
+            yield Item(grasp_id, _name(contact), images, {"sequence_id": _name(contact)})
+
+
+class _Named:
+    """The frames that contact.json names, or else all that both folders of a contact hold."""
+
+    def __init__(self, parts: list[Path]) -> None:
+        self._contact = {part: _listed(part / "contact.json") for part in parts}
+        self._other = {part: _listed(part / "not_contact.json") or {} for part in parts}
+
+    def frames(self, contact: Path) -> list[str]:
+        """File names, in order of their frame numbers."""
+        listed = self._contact[contact.parent]
+        found = {path.name for path in (contact / "tactile").iterdir() if path.suffix.lower() in (".jpg", ".png")}
+        wanted = found if listed is None else listed.get(contact.name, set())
+        return sorted(wanted - self._other[contact.parent].get(contact.name, set()), key=_number)
+
+
+def _number(name: str) -> tuple[int, str]:
+    head = name.split("-")[0]
+    return (int(head) if head.isdecimal() and len(head) < 19 else -1, name)
+
+
+def _listed(path: Path) -> dict[str, set[str]] | None:
+    """contact.json: folder -> names of its tactile files; None where there is no such file. Raises ImporterError."""
+    if not path.exists():
+        return None
+    try:
+        with open(path, "rb") as file:
+            found = json.loads(file.read(_MOST_JSON))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ImporterError(f"{path} cannot be read: {error}") from error
+    tactile = found.get("tactile") if isinstance(found, dict) else None
+    if not isinstance(tactile, list) or not all(isinstance(each, str) for each in tactile):
+        raise ImporterError(f"{path} must hold lists of paths under vision, tactile and background")
+    names: dict[str, set[str]] = {}
+    for each in tactile:
+        folder, _, name = ["", "", *each.split("/")][-3:]
+        names.setdefault(folder, set()).add(name)
+    return names
+
+
+def csv_rows(path: Path) -> Iterator[dict[str, str | None]]:
+    """Rows of a CSV file with a header, one after the other; none where there is no such file. Raises ImporterError."""
+    if not path.exists():
+        return
+    try:
+        with open(path, encoding="utf-8", errors="replace", newline="") as file:
+            for row in csv.DictReader(file, skipinitialspace=True):
+                yield {str(key): value for key, value in row.items() if key is not None}
+    except (OSError, csv.Error) as error:
+        raise ImporterError(f"{path} cannot be read: {error}") from error

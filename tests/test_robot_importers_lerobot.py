@@ -1,0 +1,172 @@
+"""LeRobot: what is its own; what holds of every importer stands in test_robot_importers."""
+
+import json
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.errors import ImporterError
+from robot.exporters import load_exporter
+from robot.importers.episodes import Episode
+from robot.importers.lerobot import import_lerobot
+from robot.recording.folder import read_recording
+from tests import synthetic
+from tests.miniatures import pixels
+
+pytest.importorskip("av")
+pytest.importorskip("pyarrow")
+
+from tests.miniatures import lerobot
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
+@pytest.fixture
+def source(tmp_path):
+    lerobot.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+def picture(recording, path):
+    return cv2.imread(str(recording.folder / path)).astype(float)
+
+
+def rms(one, other):
+    return float(np.sqrt(np.mean((one - other) ** 2)))
+
+
+def change(source, **changes):
+    path = source / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_an_episode_is_a_sequence_its_task_the_object_and_gel_cameras_are_the_fingers(source, tmp_path):
+    recording = import_lerobot(source, tmp_path / "out")
+    assert [(grasp.object_id, grasp.sequence_id) for grasp in recording.grasps] == [
+        (lerobot.TASKS[episode % 2], f"episode-{episode}") for episode in range(4)
+    ]
+    assert all(sorted(grasp.touches) == ["a", "b"] for grasp in recording.grasps)
+    assert recording.info["rig"] == "so100"
+    assert recording.info["sensor"] == "observation.images.left_tactile, observation.images.right_tactile"
+
+
+def test_each_episode_has_its_own_pictures_of_films_and_of_rows(source, tmp_path):
+    """Videos that hold several episodes, whose frames build on each other."""
+    recording = import_lerobot(source, tmp_path / "out")
+    for episode, grasp in enumerate(recording.grasps):
+        first, pressed = (lerobot.pictures(episode, step) for step in (0, lerobot.PRESSED))
+        for path, seed in (
+            (grasp.photo, first[lerobot.WRIST]),
+            (grasp.touches["a"], pressed[lerobot.LEFT]),
+            (grasp.touches_before["a"], first[lerobot.LEFT]),
+        ):
+            assert rms(picture(recording, path), pixels(seed, lerobot.SIZE).astype(float)) < 4
+        for path, seed in ((grasp.touches["b"], pressed), (grasp.touches_before["b"], first)):
+            assert rms(picture(recording, path), pixels(seed[lerobot.RIGHT], lerobot.SIZE).astype(float)) == 0
+
+
+def test_cameras_are_taken_by_name_and_wrong_ones_list_those_there(source, tmp_path):
+    recording = import_lerobot(source, tmp_path / "one", touch=lerobot.LEFT, photo=lerobot.WRIST)
+    assert recording.info["fingers"] == 1
+    for options in ({"touch": "left"}, {"photo": "front"}):
+        with pytest.raises(ImporterError, match=r"of these: observation\.images\.wrist, observation"):
+            import_lerobot(source, tmp_path / "out", **options)
+
+
+def test_a_recording_comes_back_from_its_export(tmp_path, monkeypatch):
+    monkeypatch.setattr("robot.exporters.lerobot.EPISODES_A_FILE", 4)
+    synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
+    first = read_recording(tmp_path / "r")
+    objects = sorted({grasp.object_id for grasp in first.grasps})
+    parts = {"train": objects[:2], "validation": [], "test": objects[2:]}
+    load_exporter("lerobot")(first, tmp_path / "exported", parts=parts)
+    again = import_lerobot(tmp_path / "exported", tmp_path / "back")
+    plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n")
+    before = {grasp.grasp_id: grasp for grasp in first.grasps}
+    assert set(before) == {grasp.grasp_id for grasp in again.grasps}
+    for grasp in again.grasps:
+        old = before[grasp.grasp_id]
+        assert [getattr(grasp, key) for key in plain] == [getattr(old, key) for key in plain]
+        assert grasp.images().keys() == old.images().keys()
+        for column, path in grasp.images().items():
+            assert rms(picture(again, path), picture(first, old.images()[column])) < 3
+    split = json.loads((tmp_path / "back/splits/published.json").read_text())
+    assert {part: split[part] for part in parts} == parts
+    assert (again.info["sensor"], again.info["source"]) == (first.info["sensor"], first.info["source"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"codebase_version": "v2.1"}, "must be of LeRobot's version 3, and is of v2.1; convert it with lerobot"),
+        ({"video_path": "/etc/{video_key:999999999}"}, "video_path of info.json must be videos/"),
+        ({"fps": None}, "must say fps"),
+        ({"features": []}, "of these: none"),
+        ({"features": {"../touch": {"dtype": "video"}, "photo": {"dtype": "video"}}}, "no camera with a path"),
+    ],
+)
+def test_what_info_json_says_is_checked(source, tmp_path, changes, said):
+    change(source, **changes)
+    with pytest.raises(ImporterError, match=said):
+        import_lerobot(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_video_that_is_missing_costs_its_episodes_and_is_told(source, tmp_path):
+    (source / f"videos/{lerobot.LEFT}/chunk-000/file-000.mp4").unlink()
+    with pytest.raises(ImporterError, match="no grasp could be imported: skipped 4: its video is missing"):
+        import_lerobot(source, tmp_path / "out")
+
+
+# Grasps out of episodes ----------------------------------------------------------------------------------------
+
+
+def steps(count, pressed):
+    for at in range(count):
+        gel = np.full((300, 400, 3), 200 if at == pressed else 100 + at % 3, np.uint8)
+        yield np.full((300, 400, 3), at % 256, np.uint8), [gel]
+
+
+def test_steps_are_looked_at_one_by_one_whatever_the_length_of_an_episode():
+    episode = Episode(lambda: steps(500, 321), 1, None)
+    tracemalloc.start()
+    try:
+        images = {column: source() for column, source in episode.images().items()}
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert images["touch_a"][0, 0, 0] == 200
+    assert (images["touch_a_before"][0, 0, 0], images["photo"][0, 0, 0]) == (100, 0)
+    assert peak < 20 * 360_000  # a picture has 360,000 bytes, the episode 1,000 of them
+
+
+def test_an_episode_is_read_when_its_first_picture_is_asked_for_and_once():
+    calls = []
+
+    def read():
+        calls.append(1)
+        return steps(3, 1)
+
+    images = Episode(read, 1, None).images()
+    assert calls == []
+    for source in images.values():
+        source()
+    assert calls == [1]
+
+
+def test_moments_that_are_said_are_taken_at_their_word():
+    images = Episode(lambda: steps(3, 0), 1, ["before", "during", "after"]).images()
+    assert sorted(images) == ["photo", "touch_a", "touch_a_after", "touch_a_before"]
+    assert [images[column]()[0, 0, 0] for column in ("touch_a_before", "touch_a", "touch_a_after")] == [200, 101, 102]
+
+
+@pytest.mark.parametrize(
+    ("count", "moments", "said"),
+    [(0, None, "its episode is empty"), (1, None, "differs from the first"), (1, ["before", "during"], "1 steps of 2")],
+)
+def test_an_episode_without_a_touch_is_an_error(count, moments, said):
+    images = Episode(lambda: steps(count, 9), 1, moments).images()
+    with pytest.raises(ImporterError, match=said):
+        images["photo"]()

@@ -1,0 +1,174 @@
+"""Open-X-Tactile: what is its own; what holds of every importer stands in test_robot_importers."""
+
+import json
+import shutil
+from contextlib import suppress
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from robot.errors import ImporterError, RobotError
+from robot.exporters import load_exporter
+from robot.importers.open_x_tactile import import_open_x_tactile
+from robot.importers.zarr_store import Store
+from robot.recording.folder import read_recording
+from tests import synthetic
+
+pytest.importorskip("zarr")
+
+from tests.miniatures import open_x_tactile
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
+@pytest.fixture
+def source(tmp_path):
+    open_x_tactile.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+@pytest.fixture
+def store(tmp_path):
+    (tmp_path / "one").mkdir()
+    open_x_tactile.write_store(tmp_path / "one/wipe.zarr", (4, 3))
+    return tmp_path / "one/wipe.zarr"
+
+
+def picture(recording, path):
+    return cv2.imread(str(recording.folder / path))[..., ::-1]
+
+
+def test_a_task_is_an_object_an_episode_a_sequence_and_an_area_a_finger(source, tmp_path):
+    recording = import_open_x_tactile(source, tmp_path / "out")
+    counts = {"insert_plug": 3, "wipe_board": 2}
+    assert [grasp.object_id for grasp in recording.grasps] == [task for task, n in counts.items() for _ in range(n)]
+    assert [grasp.sequence_id for grasp in recording.grasps][:2] == ["insert_plug-000000", "insert_plug-000001"]
+    assert all(sorted(grasp.touches) == ["a", "b"] for grasp in recording.grasps)
+    assert (recording.info["sensor"], recording.info["fingers"]) == ("GelSightMini", 2)
+
+
+def test_the_touch_is_the_step_that_is_most_pressed_and_the_first_step_is_the_untouched_gel(source, tmp_path):
+    recording = import_open_x_tactile(source, tmp_path / "out")
+    steps = open_x_tactile.episode_steps(100, 5)  # the second episode of the first task
+    grasp = recording.grasps[1]
+    assert np.array_equal(picture(recording, grasp.photo), steps[0][0])
+    for area, finger in enumerate("ab"):
+        assert np.array_equal(picture(recording, grasp.touches[finger]), steps[open_x_tactile.PRESSED][1][area])
+        assert np.array_equal(picture(recording, grasp.touches_before[finger]), steps[0][1][area])
+
+
+def test_a_recording_comes_back_from_its_export_as_it_was(tmp_path):
+    synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
+    first = read_recording(tmp_path / "r")
+    objects = sorted({grasp.object_id for grasp in first.grasps})
+    parts = {"train": objects[:2], "validation": [], "test": objects[2:]}
+    load_exporter("open-x-tactile")(first, tmp_path / "zarr", parts=parts)
+    again = import_open_x_tactile(tmp_path / "zarr", tmp_path / "back")
+    plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n")
+    before = {grasp.grasp_id: grasp for grasp in first.grasps}
+    assert set(before) == {grasp.grasp_id for grasp in again.grasps}
+    for grasp in again.grasps:
+        old = before[grasp.grasp_id]
+        assert [getattr(grasp, key) for key in plain] == [getattr(old, key) for key in plain]
+        assert grasp.images().keys() == old.images().keys()
+        for column, path in grasp.images().items():
+            assert np.array_equal(picture(again, path), picture(first, old.images()[column]))
+    split = json.loads((tmp_path / "back/splits/exported.json").read_text())
+    assert {part: split[part] for part in parts} == parts
+    assert (again.info["sensor"], again.info["source"]) == (first.info["sensor"], first.info["source"])
+
+
+def test_another_camera_is_taken_by_its_name_and_an_unknown_one_lists_those_there(store, tmp_path):
+    with pytest.raises(ImporterError, match=r"has no data/camera_ego_rgb; --option camera= one of camera_main_rgb"):
+        import_open_x_tactile(store.parent, tmp_path / "out", camera="camera_ego_rgb")
+    assert len(import_open_x_tactile(store, tmp_path / "out", camera="camera_main_rgb").grasps) == 2
+
+
+def test_a_chunk_that_is_missing_costs_its_episode_and_is_no_black_picture(store, tmp_path):
+    (store / "data/camera_main_rgb/4.0.0.0").unlink()  # the first step of the second episode
+    recording = import_open_x_tactile(store, tmp_path / "out")
+    assert [grasp.grasp_id for grasp in recording.grasps] == ["wipe-000000"]
+    assert recording.info["skipped"] == {"a chunk of wipe.zarr/data/camera_main_rgb is missing": 1}
+
+
+def test_an_episode_in_which_nothing_is_touched_is_no_grasp(store, tmp_path):
+    for path in (store / "data/right_tactile_data_0").glob("[456].*"):
+        path.write_bytes((store / "data/right_tactile_data_0/4.0.0.0.0").read_bytes())
+    assert import_open_x_tactile(store, tmp_path / "out").info["skipped"] == {
+        "no gel image of its episode differs from the first": 1
+    }
+
+
+def forge(store, name, **changes):
+    about = json.loads((store / name / ".zarray").read_text())
+    (store / name / ".zarray").write_text(json.dumps(about | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"filters": [{"id": "pickle"}]}, "without filters"),
+        ({"compressor": {"id": "pickle"}}, "without filters, in one of"),
+        ({"dtype": "|O"}, "which this importer does not read"),
+        ({"dtype": "<f8"}, "which this importer does not read"),
+        ({"chunks": [10**6, 20, 30, 3]}, "too large"),
+        ({"chunks": [0, 20, 30, 3]}, "which is none"),
+        ({"shape": [7, 20, 30]}, "3 axes"),
+        ({"shape": [-7, 20, 30, 3]}, "which is none"),
+        ({"shape": "all"}, "must say shape, chunks and dtype"),
+        ({"zarr_format": 3}, "must be zarr of version 2"),
+    ],
+)
+def test_what_an_array_says_of_itself_is_checked_before_zarr_sees_it(store, tmp_path, changes, said):
+    forge(store, "data/camera_main_rgb", **changes)
+    with pytest.raises(ImporterError, match=said):
+        import_open_x_tactile(store, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+WHOLE = st.integers(-(10**12), 10**12)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.fixed_dictionaries(
+        {},
+        optional={
+            "shape": st.lists(WHOLE, max_size=5) | st.text(max_size=3),
+            "chunks": st.lists(WHOLE, max_size=5) | st.none(),
+            "dtype": st.sampled_from(["|u1", "<U9", "|O", "<M8[ns]", "|V3", [["a", "|u1"]], 3, ""]),
+            "compressor": st.sampled_from([None, {"id": "zlib", "level": -99}, {"id": 3}, "blosc", {}]),
+            "order": st.sampled_from(["C", "F", "X", 1]),
+            "fill_value": st.none() | st.text(max_size=2) | WHOLE,
+            "filters": st.none() | st.lists(st.just({"id": "vlen-utf8"}), max_size=1),
+            "zarr_format": st.sampled_from([1, 2, 3, "2"]),
+        },
+    )
+)
+def test_whatever_an_array_says_it_is_read_or_refused_in_a_sentence(store, changes):
+    before = (store / "data/camera_main_rgb/.zarray").read_text()
+    try:
+        forge(store, "data/camera_main_rgb", **changes)
+        with suppress(RobotError):
+            array = Store(store).array("data/camera_main_rgb", kind="u1")
+            if array.shape:
+                array.step(0)
+    finally:
+        (store / "data/camera_main_rgb/.zarray").write_text(before)
+
+
+@pytest.mark.parametrize("ends", [[3, 3], [5, 4], [4, 99], [0, 4], [-1, 4]])
+def test_ends_of_episodes_that_do_not_rise_within_the_steps_are_refused(tmp_path, ends):
+    (tmp_path / "src").mkdir()
+    more = {"meta/episode_ends": np.array(ends, dtype=np.int64)}
+    open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
+    with pytest.raises(ImporterError, match="episode_ends must rise to at most 7, the number of steps"):
+        import_open_x_tactile(tmp_path / "src", tmp_path / "out")
+
+
+def test_a_zip_of_the_folder_itself_is_read_too(store, tmp_path):
+    shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store.parent, store.name)
+    assert len(import_open_x_tactile(tmp_path / "zip", tmp_path / "out").grasps) == 2
