@@ -62,6 +62,15 @@ def test_a_bottle_empty_and_full_is_one_sequence_which_no_drawn_split_tears(reco
         assert ("02_bottleempty-01" in split.train) == ("08_bottlefull-01" in split.train)
 
 
+def test_the_touch_that_is_the_untouched_frame_itself_is_skipped(source, tmp_path):
+    """As in the published data: `retrieve check` calls such a grasp an error."""
+    (touch,) = (source / "touch/03_ball/01").glob("touch_1_img_4_*")
+    touch.write_bytes((source / "touch/baselineForCalibration.jpg").read_bytes())
+    recording = import_vt60(source, tmp_path / "out")
+    assert len(recording.grasps) == vt60.GRASPS - 1
+    assert "skipped 1: its touch is the no-contact frame itself, such as 03_ball-01-4" in recording.notes
+
+
 def test_photos_without_touches_are_told(recording):
     assert "skipped 1: photos of an object that was not touched, such as 03_ball/07" in recording.notes
 
@@ -82,7 +91,10 @@ def test_half_of_the_data_set_is_refused_with_what_is_missing(source, tmp_path):
 @pytest.mark.slow
 def test_the_real_data_import_whole(tmp_path):
     recording = import_vt60(touch_data("vt60"), tmp_path / "out")
-    assert len(recording.grasps) == 4992
+    assert len(recording.grasps) == 4991
     assert len({grasp.object_id for grasp in recording.grasps}) == 40
     assert len({grasp.sequence_id for grasp in recording.grasps}) == 36
-    assert recording.info["skipped"] == {"photos of an object that was not touched": 3}
+    assert recording.info["skipped"] == {
+        "photos of an object that was not touched": 3,
+        "its touch is the no-contact frame itself": 1,
+    }

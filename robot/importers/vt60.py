@@ -12,6 +12,7 @@ An object was touched in one sitting, which is its sequence; a bottle that is th
 sequence for both, so that no split of objects tears it apart.
 """
 
+import filecmp
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -44,7 +45,10 @@ DATA_SET = DataSet(
     traps=(
         "08_bottlefull and 02_bottleempty are the same bottles, full and empty: no photo tells them apart. They share "
         "a sequence_id, so that drawn splits keep them together; of a gallery leave one of the classes out.",
-        "Many touches are hardly pressed; their difference from the no-contact frame ranks them.",
+        "The no-contact frame is touch 4 of the first stapler, byte for byte (that touch is skipped), and the finger's "
+        "light drifts: the least difference of an object's touches from it is 3 grey levels for that stapler and 17 for "
+        "a ball. So the difference from it names the object, pressed or not; it ranks how hard a touch is pressed only "
+        "within an object.",
         "Objects were touched class by class, so that drift of the finger may name the class, and a touch blurred to "
         "8 x 6 names much of what a whole one does: print that control beside every result.",
     ),
@@ -77,10 +81,10 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
     if not objects:
         raise DATA_SET.refusal(src, "it holds no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg")
     untouched = src / "touch" / "baselineForCalibration.jpg"
-    background = {"touch_a_before": Shared("untouched", untouched)} if untouched.is_file() else {}
+    has_frame = untouched.is_file()
     return import_items(
-        DATA_SET if background else replace(DATA_SET, background="none"),
-        _items(src, objects, background),
+        DATA_SET if has_frame else replace(DATA_SET, background="none"),
+        _items(src, objects, untouched if has_frame else None),
         out,
         total=sum(each.count for each in objects),
         progress=progress,
@@ -104,7 +108,8 @@ def _look(folder: Path) -> _Object:
     return _Object(name_of(kind, instance), folder, vision, len(found), about)
 
 
-def _items(src: Path, objects: list[_Object], background: dict[str, Shared]) -> Iterator[Item | Skip]:
+def _items(src: Path, objects: list[_Object], untouched: Path | None) -> Iterator[Item | Skip]:
+    background = {"touch_a_before": Shared("untouched", untouched)} if untouched else {}
     touched = {each.vision for each in objects}
     for shown in (instance for kind in folders(src / "vision") for instance in folders(kind)):
         if shown not in touched:
@@ -117,6 +122,9 @@ def _items(src: Path, objects: list[_Object], background: dict[str, Shared]) -> 
             name = name_of(each.object_id, match[2])
             if not photos:
                 yield Skip("its object has no photo", name)
+                continue
+            if untouched and filecmp.cmp(touch, untouched, shallow=False):
+                yield Skip("its touch is the no-contact frame itself", name)
                 continue
             photo = photos[number % len(photos)]
             shared = Shared(name_of(each.object_id, photo.stem), photo)
