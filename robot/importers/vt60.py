@@ -46,9 +46,9 @@ DATA_SET = DataSet(
         "08_bottlefull and 02_bottleempty are the same bottles, full and empty: no photo tells them apart. They share "
         "a sequence_id, so that drawn splits keep them together; of a gallery leave one of the classes out.",
         "The no-contact frame is touch 4 of the first stapler, byte for byte (that touch is skipped), and the finger's "
-        "light drifts: the least difference of an object's touches from it is 3 grey levels for that stapler and 17 for "
-        "a ball. So the difference from it names the object, pressed or not; it ranks how hard a touch is pressed only "
-        "within an object.",
+        "light drifts: the least difference of an object's touches from it is 3 grey levels for that stapler and 17 "
+        "for a ball. So the difference from it names the object, pressed or not; it ranks how hard a touch is pressed "
+        "only within an object.",
         "Objects were touched class by class, so that drift of the finger may name the class, and a touch blurred to "
         "8 x 6 names much of what a whole one does: print that control beside every result.",
     ),
