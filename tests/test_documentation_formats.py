@@ -2,6 +2,8 @@
 
 import json
 import re
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.model.stored import read_header
 from retrieval.search.answer import EXIT_CODES
+from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter, read_recording
 from tests.documents import ROOT, text_of
 
@@ -79,3 +82,16 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     check(8, method)
     said = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
     assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_accuracy"])
+
+
+def test_what_a_service_keeps(tmp_path):
+    store = Store(tmp_path / "history.sqlite", 1, 1)
+    store.close()
+    with closing(sqlite3.connect(tmp_path / "history.sqlite")) as database:
+        made = {
+            name: {row[1] for row in database.execute(f"PRAGMA table_info({name})")}
+            for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        }
+    section = text_of(PAGE).partition("## What a service keeps")[2]
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.M)
+    assert {name: set(re.findall(r"`(\w+)`", said)) for name, said in rows} == made

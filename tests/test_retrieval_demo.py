@@ -46,6 +46,29 @@ def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_de
     assert not list(Path(os.environ["XDG_STATE_HOME"]).iterdir())
 
 
+def test_a_demo_that_serves_opens_a_page_that_asks_its_index(finished, capsys, monkeypatch):
+    """Its rig can grasp what the index shows, and its objects are those of the human test."""
+    served, opened = [], []
+
+    def serve(app, started):
+        served.append(app.state.service)
+        started(1234)
+
+    monkeypatch.setattr("retrieval.serve.run.serve", serve)
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished), "--serve"]) == 0
+    assert opened == ["http://127.0.0.1:1234"]
+    assert served[0].settings.index == finished / "index"
+    assert served[0].trials.folder == finished / "recording"
+    names = sorted(path.name for path in (finished / "catalog").iterdir())
+    felt = served[0].bench.grasp(names)
+    assert felt.object_id in names
+    assert [image[:4] for image in (*felt.touches, *felt.background)] == [b"\x89PNG"] * 4
+    assert served[0].bench.sensors["a"]()[:2] == b"\xff\xd8"
+    said = capsys.readouterr().err
+    assert f"$ retrieve serve --index {finished / 'index'} --trials {finished / 'recording'} --open-page" in said
+
+
 def test_a_command_that_is_used_wrongly_ends_the_demo_with_its_exit_code(tmp_path, capsys):
     assert main(["demo", "--objects", "0", "--out", str(tmp_path / "demo")]) == 2
     said = capsys.readouterr().err.splitlines()

@@ -167,6 +167,7 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
         assert asked(url, body).json()["index"]["generation"] == "gen-000002"
 
 
+@pytest.mark.slow
 def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
     line = [sys.executable, "-m", "retrieval", "serve", "--index", str(tmp_path), "--port", "0", "--no-history"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
@@ -177,7 +178,7 @@ def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
 # The end -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign, tmp_path):
     with (
         command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "kept") as (process, url, _),

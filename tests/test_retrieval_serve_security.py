@@ -95,3 +95,13 @@ def test_a_failure_says_nothing_of_the_inside(client, monkeypatch):
     told = problem(response, 500, "failed")
     assert told == "unexpected ZeroDivisionError; the log of the service says more"
     assert response.headers["x-content-type-options"] == "nosniff"
+
+
+def test_the_pages_files_are_looked_up_by_name_and_nothing_else_is(client):
+    whole = client.get("/")
+    assert (whole.status_code, whole.headers["content-type"]) == (200, "text/html; charset=utf-8")
+    assert client.get("/index.html").content == whole.content
+    assert client.get("/", headers={"if-none-match": whole.headers["etag"]}).status_code == 304
+    assert client.head("/").headers["content-length"] == str(len(whole.content))
+    for name in ("settings.py", "%2e%2e/settings.py", "..%2fsettings.py", "/etc/passwd", "index.html%00", "nothing"):
+        problem(client.get(f"/{name}"), 404, "unknown")

@@ -19,6 +19,7 @@ from retrieval.commands.build_index import build_index
 from retrieval.commands.collect import collect
 from retrieval.commands.options import Values
 from retrieval.commands.query import query
+from retrieval.commands.serve import serve as serve_index
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 
@@ -36,11 +37,12 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
     objects: Annotated[int, typer.Option(help="how many objects")] = 20,
     jobs: Annotated[int, typer.Option(help="simulated rigs that work at once")] = 2,
+    serve: Annotated[bool, typer.Option("--serve", help="then open a page that asks the index, until Ctrl-C")] = False,
 ) -> None:
     """The whole job on the simulated rig; ends with an HTML page."""
     from retrieval.data.dataset import load_grasps
 
-    ours = {"recording", "recording-preview.png", "catalog", "index", "state", "query.html"}
+    ours = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
     if out.exists() and (others := {path.name for path in out.iterdir()} - ours):
         raise BadInput(f"{out} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
     with _own_state(out / "state"):
@@ -55,6 +57,8 @@ def demo(
         say(f"in the hand: {in_hand}, an object that the model was never trained on")
         say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
         say(f"look at {out / 'query.html'} and {out / 'recording-preview.png'}")
+        if serve:
+            _run(serve_index, index=str(index), trials=recording, open_page=True)
 
 
 @contextmanager
@@ -76,7 +80,7 @@ def _run(command: Callable[..., object], *arguments: Path, **options: object) ->
     words = [command.__name__.replace("_", "-"), *map(str, arguments)]
     for name, given in options.items():
         for value in given if isinstance(given, list) else [given]:
-            words.append(f"--{name}")
+            words.append(f"--{name.replace('_', '-')}")
             if value is not True:
                 words += value if isinstance(value, Values) else [str(value)]
     say("$ retrieve " + shlex.join(words))

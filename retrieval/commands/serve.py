@@ -1,6 +1,7 @@
 """`retrieve serve`: the answers over HTTP, and a page."""
 
 import os
+import webbrowser
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -43,6 +44,7 @@ def serve(
     workers: Annotated[int, typer.Option(help="requests in work at once")] = 1,
     batch_ms: Annotated[float, typer.Option(help="how long a query waits for others to be encoded with it")] = 0.0,
     deadline: Annotated[float, typer.Option(metavar="SECONDS", help="after which no answer is waited for")] = 30.0,
+    open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
     no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
 ) -> None:
     """Answer over HTTP, and show a page, until Ctrl-C or SIGTERM."""
@@ -73,8 +75,14 @@ def serve(
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
         app = create_app(settings, _bench(rig, path), recorder, trials)
-        shown = f"[{host}]" if ":" in host else host
-        run(app, lambda bound: say(f"listening on http://{shown}:{bound}"))
+
+        def started(bound: int) -> None:
+            address = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
+            say(f"listening on {address}")
+            if open_page:
+                webbrowser.open(address)
+
+        run(app, started)
 
 
 def _recorder(folder: Path, index: Path, closed: ExitStack) -> "RecordingWriter":

@@ -8,11 +8,10 @@ from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
-from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from retrieval.serve import bench, catalogue, errors, health, history, human, queries
+from retrieval.serve import bench, catalogue, errors, health, history, human, page_files, queries
 from retrieval.serve.generations import Generations
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
@@ -29,7 +28,6 @@ from retrieval.serve.trials import Trials
 from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
 from retrieval.version import __version__
 
-PAGE = Path(__file__).parent / "page"
 THREADS = 4
 """That read files and make thumbnails; the model has its own."""
 _BODIES: tuple[type[BaseModel], ...] = (
@@ -80,7 +78,7 @@ def create_app(
     errors.install(app)
     for paths in (queries, catalogue, bench, history, human, health):
         app.include_router(paths.router)
-    app.mount("/", StaticFiles(directory=PAGE, html=True))
+    app.include_router(page_files.router_of())
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimit, seconds=settings.body_s)
     app.add_middleware(Guard, settings=settings)
@@ -137,5 +135,13 @@ def _document(app: FastAPI) -> dict[str, Any]:
             found = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= found.pop("$defs", {})
             schemas[model.__name__] = found
+        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words for what are problems here
+            schemas.pop(name, None)
+        for path in document["paths"].values():
+            for operation in path.values():
+                if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                    operation["responses"] |= {
+                        str(status): said for status, said in errors.problems("bad-input").items()
+                    }
         app.openapi_schema = document
     return app.openapi_schema

@@ -7,9 +7,7 @@ import logging
 from functools import cached_property
 from threading import Lock
 
-from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
-from retrieval.errors import RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.searcher import Searcher
 from retrieval.serve.errors import Problem
@@ -99,6 +97,6 @@ class Generations:
                 failed, again = name, now + _AGAIN_S
                 await asyncio.to_thread(self.open)
                 log.warning("generation %s answers from now on", self.current.name)
-            except (RetrievalError, IndexesError, OSError) as error:
+            except Exception as error:  # whatever is wrong with it
                 self._metrics.reload_failures.inc()
                 log.warning("a new generation cannot be taken up, %s goes on answering: %s", self.current.name, error)

@@ -131,7 +131,11 @@ class Queue:
             for job in jobs:
                 self._metrics.waiting.observe(now - job.began)
             self._metrics.batches.observe(len(jobs))
-            answers = await asyncio.get_running_loop().run_in_executor(self._threads, _answers, opened, jobs)
+            loop = asyncio.get_running_loop()
+            try:
+                answers = await loop.run_in_executor(self._threads, _answers, opened, jobs)
+            except Exception as error:  # a bug, which ends no worker
+                answers = [error] * len(jobs)
             for job, answer in zip(jobs, answers, strict=True):
                 if job.answer.done():
                     continue
