@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from robot.readings import Pose as Pose
     from robot.recording.folder import Recording as Recording
     from robot.recording.folder import RecordingWriter as RecordingWriter
+    from robot.recording.folder import Shared as Shared
     from robot.recording.folder import read_recording as read_recording
     from robot.recording.grasp import RecordedGrasp as RecordedGrasp
     from robot.rig import Rig as Rig
@@ -32,6 +33,7 @@ _PLACES = {
     "RecordingWriter": "recording.folder",
     "Rig": "rig",
     "RobotError": "errors",
+    "Shared": "recording.folder",
     "TactileSensor": "devices",
     "load_importer": "importers",
     "load_rig": "rig",

@@ -171,9 +171,7 @@ def test_the_command_imports_it_and_lists_it(name, source, tmp_path, capsys):
     assert f"{miniature(name).GRASPS} grasps of" in capsys.readouterr().err
     assert main(["import"]) == 0
     assert [title_of(name)] == [
-        line.removeprefix(name).strip().split("; --option")[0]
-        for line in capsys.readouterr().out.splitlines()
-        if line.split()[0] == name
+        line.removeprefix(name).strip() for line in capsys.readouterr().out.splitlines() if line.split()[0] == name
     ]
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from robot.errors import RecordingError, StorageError
 from robot.recording import folder as module
-from robot.recording.folder import RecordedGrasp, RecordingWriter, read_recording
+from robot.recording.folder import RecordedGrasp, RecordingWriter, Shared, read_recording
 
 INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
 ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
@@ -374,6 +374,33 @@ def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
     assert reason in str(caught.value)
     assert list((tmp_path / "images").iterdir()) == []
     assert ids(tmp_path) == []
+
+
+def test_a_shared_image_is_kept_once_and_the_first_of_its_name(tmp_path):
+    for number in (1, 2):  # another writer goes on with it
+        with RecordingWriter(tmp_path / "recording", INFO) as writer:
+            writer.append(str(number), "mug", {**pictures(), "touch_a_before": Shared("rest", pixels(10 * number))})
+    grasps = read_recording(tmp_path / "recording").grasps
+    assert {grasp.touches_before["a"] for grasp in grasps} == {"images/rest_shared.png"}
+    kept = cv2.imread(str(tmp_path / "recording/images/rest_shared.png"))[..., ::-1]
+    np.testing.assert_array_equal(kept, pixels(10))
+
+
+@pytest.mark.parametrize("name", ["", "../rest", "a/b", ".rest", "a" * 200])
+def test_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
+    with RecordingWriter(tmp_path / "recording", INFO) as writer, pytest.raises(RecordingError, match="shared image"):
+        writer.append("1", "mug", {**pictures(), "touch_a_before": Shared(name, pixels())})
+
+
+def test_a_writer_says_more_in_recording_json_but_not_what_grasps_are_held_to(tmp_path):
+    with RecordingWriter(tmp_path / "recording", INFO) as writer:
+        writer.tell(skipped={"it is dark": 2})
+        with pytest.raises(RecordingError, match="sensor of a recording stays as it is"):
+            writer.tell(sensor="DIGIT")
+        with pytest.raises(RecordingError, match="must hold plain JSON"):
+            writer.tell(skipped={1j})
+    info = read_recording(tmp_path / "recording").info
+    assert (info["skipped"], info["sensor"], info["seed"]) == ({"it is dark": 2}, "GelSight", 3)
 
 
 @pytest.mark.parametrize("grasp_id", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])

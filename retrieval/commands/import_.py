@@ -1,5 +1,6 @@
 """`retrieve import`: a public data set, or pictures of one's own, become a recording."""
 
+import shlex
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
@@ -59,12 +60,15 @@ def import_(
 
 
 def _list() -> list[str]:
-    """A line for each data set, with what can be said of it."""
+    """A line for each data set, and one with its options as they are where nothing is said."""
     from robot.importers import IMPORTERS, load_importer, options_of, title_of
 
     lines = []
     width = max(map(len, IMPORTERS)) + 2
     for name in sorted(IMPORTERS):
-        options = [f"{option}={default}" for option, (_, default) in options_of(load_importer(name)).items()]
-        lines.append(f"{name:{width}}{title_of(name)}" + (f"; --option {' '.join(options)}" if options else ""))
+        lines.append(f"{name:{width}}{title_of(name)}")
+        options = [
+            f"{each}={shlex.quote(str(default))}" for each, (_, default) in options_of(load_importer(name)).items()
+        ]
+        lines += [f"{'':{width}}--option {' '.join(options)}"] if options else []
     return lines

@@ -62,7 +62,16 @@ GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 @dataclass(frozen=True)
 class Shared:
     """An image of several grasps, such as one no-contact frame for all: kept once. `name`, a grasp_id in form, tells it
-    from the other shared ones of the recording; of the same name the first is kept."""
+    from the other shared ones of the recording; of the same name the first is kept.
+
+    >>> from pathlib import Path
+    >>> photo = robot.Shared("mug-front", Path("catalog/mug/1.jpg"))
+    >>> with robot.RecordingWriter("shared", {"source": "bench 3", "sensor": "DIGIT"}) as writer:
+    ...     one = writer.append("000001", "mug", {"photo": photo, "touch_a": Path("a.png")})
+    ...     two = writer.append("000002", "mug", {"photo": photo, "touch_a": Path("a2.png")})
+    >>> one.photo == two.photo
+    True
+    """
 
     name: str
     source: ImageSource
