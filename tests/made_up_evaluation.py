@@ -142,6 +142,7 @@ def method(rng, name, grasps, split):
     }
 
 
+CEILINGS = {"touch_to_touch": "felt twice", "photo_to_photo": "seen twice"}
 CONTROLS = {
     "before": "the frame before contact stands in for the touch, in fitting and in judging",
     "blurred": "each gel image reduced to 8 x 6 pixels, in fitting and in judging",
@@ -183,6 +184,16 @@ def made_up(recording, methods=tuple(SKILL), seed=0):
                 },
             }
             for name, what in CONTROLS.items()
+        },
+        "ceilings": {
+            name: {
+                "what": what,
+                "measures": {
+                    "pair_accuracy": summary(rng, 0.9, 0.5),
+                    "guesses_k5": summary(rng, curve(0.8, 5), np.arange(1, 6) / 5),
+                },
+            }
+            for name, what in CEILINGS.items()
         },
         "comparisons": [
             {

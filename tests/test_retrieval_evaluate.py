@@ -4,16 +4,19 @@ import dataclasses
 import json
 import signal
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from retrieval.commands.main import main
-from retrieval.data.dataset import load_grasps, make_split
+from retrieval.data.dataset import Grasp, Split, load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
+from retrieval.evaluation.ceilings import ceiling_experiments, score_ceiling
 from retrieval.evaluation.controls import thinned
 from retrieval.evaluation.experiment import Experiment, _shuffled
+from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.run import evaluate
 from retrieval.methods.base import Method
 from retrieval.model.checkpoint import load_checkpoint
@@ -72,6 +75,7 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert [len(results["split"][part]) for part in ("train", "validation", "test")] == [8, 4, 6]
     assert list(results["methods"]) == list(FEW)
     assert set(results["controls"]) == {"shuffled", "before", "blurred"}
+    assert set(results["ceilings"]) == {"touch_to_touch", "photo_to_photo"}
     assert {(one["a"], one["b"]) for one in results["comparisons"]} == {("late_fusion", name) for name in FEW[1:]}
     assert results["audit"]["clean"]
     summary = results["methods"]["late_fusion"]["measures"]["guesses_k5"]
@@ -89,8 +93,8 @@ def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_
         results = run(tmp_path / "report", config=config, methods=("cca", "late_fusion"))
     assert results["setting"]["features"]["pairs"] == 5
     assert results["setting"]["config"]["training"]["photos"] == "photos"  # where it lay is nobody's concern
-    assert len(fitted_on) == 5  # two methods, three controls
-    for fitted, validation in fitted_on:
+    assert len(fitted_on) == 7  # two methods, three controls, two ceilings
+    for fitted, validation in fitted_on[:5]:
         assert len({name for name in fitted.object_ids if name.startswith("like ")}) == 5
         assert len(set(fitted.object_ids)) == 8 + 5
         assert not any(name.startswith("like ") for name in validation.object_ids)
@@ -211,7 +215,8 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch,
     assert fitted == ["late_fusion", "late_fusion", "prune_rerank", "prune_rerank"]
     monkeypatch.setattr(Experiment, "_fitted", lambda self, *job: fitted.append(job[0]) or real(self, *job))
     assert run(tmp_path / "out", seeds=2) == made[0]
-    assert fitted[4:] == ["cca", "constant", "late_fusion", "late_fusion", "late_fusion"]  # the last are controls
+    assert fitted[4:6] == ["cca", "constant"]
+    assert fitted[6:] == [*["late_fusion"] * 3, "cca", "cca"]  # the controls and the ceilings
 
 
 def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch):
@@ -245,6 +250,34 @@ def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tm
     assert set(results["methods"]["chance"]["reliability"]) == {"pairs"}
 
 
+def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_stays_at_chance(tmp_path):
+    """Photos name the object; touches are noise."""
+    rng = np.random.default_rng(0)
+    names = [f"object-{number:02}" for number in range(24)]
+    owners = tuple(name for name in names for _ in range(6))
+    known = rng.standard_normal((24, 8)).astype(np.float32).repeat(6, axis=0)
+    photo = known + np.float32(0.05) * rng.standard_normal(known.shape).astype(np.float32)
+    touch = rng.standard_normal((144, 1, 8)).astype(np.float32)
+    grasps = [Grasp(str(row), owner, None, Path(f"{row}.png"), (), ()) for row, owner in enumerate(owners)]
+    split = Split(0, tuple(names[:12]), tuple(names[12:16]), tuple(names[16:]))
+    features = Features(tuple(map(str, range(144))), owners, touch, photo)
+    asked = draw_queries(grasps, split, 0)
+    experiment = Experiment(tmp_path, CONFIG, split, features, None, asked, None, shuffled=False, quiet=True)
+    found = {}
+    for name, ceiling in ceiling_experiments(experiment).items():
+        ceiling.predict("cca", 0)
+        found[name] = score_ceiling(name, ceiling, 0, draws=100, seed=0)["measures"]["guesses_k5"]["value"][0]
+    assert found["photo_to_photo"] > 0.99
+    assert found["touch_to_touch"] < 0.4  # chance is .2
+
+
+def test_objects_with_one_photo_have_no_ceiling_of_photos():
+    one = np.zeros((6, 1, 2), np.float32)
+    features = Features(tuple("abcdef"), tuple("xxyyzz"), one, np.arange(3, dtype=np.float32).repeat(2)[:, None])
+    experiment = Experiment(Path(), CONFIG, None, features, None, None, None, shuffled=False, quiet=True)
+    assert set(ceiling_experiments(experiment)) == {"touch_to_touch"}
+
+
 def test_grasps_are_thinned_evenly(grasped):
     grasps = load_grasps(grasped)
     kept = thinned(grasps, 2)
@@ -271,7 +304,7 @@ def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run,
         Method, "fit", lambda self, *parts: no_fits_of_heads.append(type(self).__name__) or real(self, *parts)
     )
     results = run(tmp_path / "out", model=model.path, methods=("late_fusion", "cca"), seeds=2)
-    assert no_fits_of_heads == ["Cca", *["LateFusion"] * 3]  # the latter are the controls
+    assert no_fits_of_heads == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
     assert results["split"] == {**model.split.to_dict(), "from": "the model's own"}
     assert results["setting"]["model"] == model.digest
     assert results["methods"]["late_fusion"]["chosen"] == [

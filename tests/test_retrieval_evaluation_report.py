@@ -194,8 +194,8 @@ def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table_th
     page, text, _ = remake(made, tmp_path, change=change)
     for written in (page, text):
         assert "] †" in written
-        # The headline, the methods side by side, the differences, the controls, and every number.
-        assert written.count("† Fewer than 5 objects: the interval is too narrow.") == 5
+        # The headline, the methods side by side, the differences, the controls, the ceilings, and every number.
+        assert written.count("† Fewer than 5 objects: the interval is too narrow.") == 6
     row = next(line for line in text.splitlines() if line.startswith("| late fusion |"))
     assert row.count("†") == 1  # of its columns only the one from too few objects
 
@@ -218,7 +218,7 @@ def test_what_was_not_measured_is_left_out(made, tmp_path):
             for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "chosen"):
                 method.pop(what)
             method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
-        results |= {"controls": {}, "comparisons": []}
+        results |= {"controls": {}, "ceilings": {}, "comparisons": []}
         results.pop("audit")
 
     _, text, files = remake(made, tmp_path, change=change)
@@ -226,6 +226,7 @@ def test_what_was_not_measured_is_left_out(made, tmp_path):
     for heading in (
         "Guess curves",
         "Controls",
+        "Ceilings",
         "Leakage audit",
         "Object by object",
         "Calibration",

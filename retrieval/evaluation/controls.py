@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 
 from retrieval.data.dataset import Grasp
-from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import MethodScores, summaries
-from retrieval.metrics.registry import take
 from retrieval.training.features import encode_recording
 
-METHOD = "late_fusion"
+CONTROL_METHOD = "late_fusion"
 MEASURED = ("pair_accuracy", "guesses_k5", "guesses_k10")
 CONTROLS = {
     "shuffled": "touches are dealt to other objects before fitting, so that there is nothing to learn",
@@ -63,7 +61,5 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
 
 def score_control(name: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
     """A control's entry of results.json."""
-    judged = MethodScores(experiment.queries, experiment.predictions(METHOD, training_seed), seed)
-    pairs = calibrate_pairs(judged.touches("validation", "validation"), seed=seed)
-    measures = take(judged.scored(pairs), MEASURED)
-    return {"what": CONTROLS[name], "measures": summaries([measures], draws, seed)}
+    judged = MethodScores(experiment.queries, experiment.predictions(CONTROL_METHOD, training_seed), seed)
+    return {"what": CONTROLS[name], "measures": summaries([judged.measures(MEASURED)], draws, seed)}

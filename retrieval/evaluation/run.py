@@ -18,7 +18,8 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
-from retrieval.evaluation.controls import METHOD, control_experiments, score_control
+from retrieval.evaluation.ceilings import CEILING_METHOD, ceiling_experiments, score_ceiling
+from retrieval.evaluation.controls import CONTROL_METHOD, control_experiments, score_control
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
@@ -73,7 +74,10 @@ def evaluate(
             for one in some:
                 experiment.predict(name, one)
         for control in controls.values():
-            control.predict(METHOD, seed)
+            control.predict(CONTROL_METHOD, seed)
+        ceilings = ceiling_experiments(experiment)
+        for ceiling in ceilings.values():
+            ceiling.predict(CEILING_METHOD, seed)
     except Interrupted as error:
         raise Interrupted(f"stopped; what was made is kept in {out}, and the same command goes on with it") from error
     results = {
@@ -82,6 +86,9 @@ def evaluate(
         **_scored(experiment, jobs, seed, quiet),
         "controls": {
             name: score_control(name, control, seed, draws=DRAWS, seed=seed) for name, control in controls.items()
+        },
+        "ceilings": {
+            name: score_ceiling(name, ceiling, seed, draws=DRAWS, seed=seed) for name, ceiling in ceilings.items()
         },
     }
     _write(out / "results.json", results)

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.evaluation.calibrate import Calibrations, KWayTest, calibrate, enough_objects, reliability
+from retrieval.evaluation.calibrate import (
+    Calibrations,
+    KWayTest,
+    calibrate,
+    calibrate_pairs,
+    enough_objects,
+    reliability,
+)
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
@@ -77,6 +84,11 @@ class MethodScores:
             calibration=calibration,
             seed=self.seed,
         )
+
+    def measures(self, names: Iterable[str]) -> Measures:
+        """The metrics of these names, with pairs calibrated on validation objects."""
+        fitted = calibrate_pairs(self.touches("validation", "validation"), seed=self.seed)
+        return take(self.scored(fitted), names)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:

@@ -110,6 +110,16 @@ def controls(builder: Builder) -> Iterator[Block | None]:
         yield tables.controls(builder.results)
 
 
+def ceilings(builder: Builder) -> Iterator[Block | None]:
+    """How much of the object each side knows by itself."""
+    if builder.results.data.get("ceilings"):
+        yield Text(
+            "CCA fitted and asked within one modality. A match of touch and photo is hardly better than the worse of "
+            "both; what lies between that and the result is lost on the way from one to the other."
+        )
+        yield tables.ceilings(builder.results)
+
+
 def audit(builder: Builder) -> Iterator[Block | None]:
     """What the parts of the split share."""
     if not (found := builder.results.data.get("audit")):

@@ -112,6 +112,7 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Full gallery": comparing.gallery,
     "Differences between methods": comparing.comparisons,
     "Controls": comparing.controls,
+    "Ceilings": comparing.ceilings,
     "Leakage audit": comparing.audit,
     "Object by object": looking.objects,
     "What was mistaken for what": looking.confusions,

@@ -163,6 +163,20 @@ def controls(results: Results) -> Table:
     return _explained(Table(header, tuple(rows), words=frozenset({1})))
 
 
+def ceilings(results: Results) -> Table:
+    """CCA between touch and photo, and between two touches or two photos of an object."""
+    keys = ("pair_accuracy", "guesses_k5", "guesses_k10")
+    rows = [
+        (name.replace("_", " "), one["what"], *(with_interval(one["measures"].get(key)) for key in keys))
+        for name, one in results.data["ceilings"].items()
+    ]
+    if "cca" in results.methods:
+        real = (with_interval(results.summary("cca", key)) for key in keys)
+        rows.insert(0, ("touch to photo", "the result of CCA", *real))
+    header = ("ceiling", "what was done", *(f"{measure_label(key)}, %" for key in keys))
+    return _explained(Table(header, tuple(rows), words=frozenset({1})))
+
+
 def rejects(results: Results) -> Table:
     """The decision that the object is in the catalogue."""
     found = {name: results.data["methods"][name]["reject"] for name in results.methods if _has(results, name, "reject")}
