@@ -1,6 +1,7 @@
 """LeRobot: what is its own; what holds of every importer stands in test_robot_importers."""
 
 import json
+import sys
 import tracemalloc
 
 import cv2
@@ -118,6 +119,14 @@ def test_a_video_that_is_missing_costs_its_episodes_and_is_told(source, tmp_path
     (source / f"videos/{lerobot.LEFT}/chunk-000/file-000.mp4").unlink()
     with pytest.raises(ImporterError, match="no grasp could be imported: skipped 4: its video is missing"):
         import_lerobot(source, tmp_path / "out")
+
+
+@pytest.mark.parametrize("package", ["pyarrow", "av"])
+def test_a_missing_package_is_a_sentence_with_the_extra(source, tmp_path, monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImporterError, match=rf"needs {package}, .*pip install 'touch-retrieval\[importers\]'"):
+        import_lerobot(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 # Grasps out of episodes ----------------------------------------------------------------------------------------

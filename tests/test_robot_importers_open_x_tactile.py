@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from contextlib import suppress
 
 import cv2
@@ -167,6 +168,19 @@ def test_ends_of_episodes_that_do_not_rise_within_the_steps_are_refused(tmp_path
     open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
     with pytest.raises(ImporterError, match="episode_ends must rise to at most 7, the number of steps"):
         import_open_x_tactile(tmp_path / "src", tmp_path / "out")
+
+
+def test_a_tar_is_to_be_unpacked_and_zarr_to_be_installed(source, tmp_path, monkeypatch):
+    (tmp_path / "tars").mkdir()
+    (tmp_path / "tars/insert_plug.tar").write_bytes(b"tar")
+    with pytest.raises(ImporterError, match=r"unpack insert_plug\.tar first"):
+        import_open_x_tactile(tmp_path / "tars", tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(
+        ImporterError, match=r"needs zarr, which is missing; run pip install 'touch-retrieval\[importers\]'"
+    ):
+        import_open_x_tactile(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_zip_of_the_folder_itself_is_read_too(store, tmp_path):

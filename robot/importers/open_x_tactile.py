@@ -56,7 +56,9 @@ def import_open_x_tactile(
     src = Path(src)
     paths = sorted(path for path in (src, *(src.glob("*") if src.is_dir() else ())) if _is_store(path))
     if not paths:
-        raise DATA_SET.refusal(src, "there is no such file or folder")
+        packed = sorted(src.glob("*.tar*")) if src.is_dir() else []
+        lacking = f"unpack {packed[0].name} first" if packed else "there is no such file or folder"
+        raise DATA_SET.refusal(src, lacking)
     library("zarr", "Open-X-Tactile")
     tasks = [_Task(Store(path), camera) for path in paths]
     facts = _said(tasks)
