@@ -49,6 +49,7 @@ DATA_SETS_HEAD = """# Data sets
 ```sh
 retrieve import                                             # what can be imported, and the options of each
 retrieve import billets billets/ --out billets-recording/
+retrieve import folder pictures/ --out my-recording/ --option sensor="GelSight Mini" touch='{object}/touch_{n}'
 retrieve check recording/                                   # before anything is trained on it
 ```
 

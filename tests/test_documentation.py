@@ -56,8 +56,8 @@ def of_program(name, *pages):
 
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
-    """Everything that the commands name: catalog/, gel images, recording/, billets/, model.safetensors, rig.toml,
-    mobilenet_v2.pth, tests/shipped_rig.toml."""
+    """Everything that the commands name: catalog/, gel images, recording/, billets/, pictures/, model.safetensors,
+    rig.toml, mobilenet_v2.pth, tests/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copy(model, tmp_path / "model.safetensors")
@@ -70,6 +70,10 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    for name in ("mug", "tin"):
+        (tmp_path / "pictures" / name).mkdir(parents=True)
+        shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
+        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
     (tmp_path / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "shipped_rig.toml", tmp_path / "tests")
     (tmp_path / "points.csv").write_text(POINTS)

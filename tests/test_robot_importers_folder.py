@@ -83,6 +83,13 @@ def test_fingers_are_put_together_and_a_grasp_that_lacks_one_is_told(tmp_path):
     assert recording.info["background"] != "none"
 
 
+def test_of_two_touches_with_the_same_words_the_first_is_taken_and_the_other_told(source, tmp_path):
+    picture(source / "mug/touch_1.jpg", 77)
+    recording = import_folder(source, tmp_path / "out")
+    assert told(recording)[0] == ("mug-1", "mug")
+    assert recording.info["skipped"] == {"another touch has the same words in its path": 1}
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -21,7 +21,6 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from string import ascii_lowercase
@@ -142,24 +141,30 @@ class _Found:
             raise ImporterError(f"{{finger}} must name at most 26 fingers, got {len(names)}, such as {names[:3]}")
         self.fingers = dict(zip(names, ascii_lowercase, strict=False))
         self.has_background = bool(self._frames)
+        self._repeated: list[str] = []
+        self._grasps = self._by_words()
 
-    @cached_property
-    def _grasps(self) -> dict[tuple[str, ...], dict[str, tuple[str, Words]]]:
+    def _by_words(self) -> dict[tuple[str, ...], dict[str, tuple[str, Words]]]:
         """Grasps by their words but the finger's: finger -> (path, words)."""
         grasps: dict[tuple[str, ...], dict[str, tuple[str, Words]]] = defaultdict(dict)
         for path, words in self._touches:
             others = tuple(value for key, value in words.items() if key not in ("object", "finger"))
-            grasps[words["object"], *others][words.get("finger", "")] = path, words
+            by_finger = grasps[words["object"], *others]
+            if words.get("finger", "") in by_finger:
+                self._repeated.append(path)
+            else:
+                by_finger[words.get("finger", "")] = path, words
         return grasps
 
     @property
     def total(self) -> int:
-        return len(self._grasps)
+        return len(self._grasps) + len(self._repeated)
 
     def items(self) -> Iterator[Item | Skip]:
         photos = _Agreeing(self._photos, self._touch.words)
         frames = _Agreeing(self._frames, self._touch.words)
         dealt: Counter[tuple[str, ...]] = Counter()
+        yield from (Skip("another touch has the same words in its path", path) for path in self._repeated)
         for key, by_finger in self._grasps.items():
             name, (_, words) = name_of(*key), next(iter(by_finger.values()))
             choice, which = photos.of(words)
