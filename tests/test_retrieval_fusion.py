@@ -40,6 +40,26 @@ def test_the_logit_from_halves_equals_the_concatenated_forward(name, output):
     torch.testing.assert_close(matcher(touches, photos), ours, rtol=1e-4, atol=1e-4 * float(naive.abs().max()))
 
 
+def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_travels_in_the_halves():
+    torch.manual_seed(0)
+    config = MatcherConfig(tower="small", tower_output="pooled", hidden=64, embedding_dim=16, cosine=True)
+    matcher = Matcher(config).eval()
+    touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
+    with torch.inference_mode():
+        touch = matcher.touch_code(matcher.touch_features(touches))
+        photo = matcher.photo_code(matcher.photo_features(photos))
+        alone, cosine = concatenated_forward(matcher, touches, photos), (touch.embedding * photo.embedding).sum(1)
+        expected = alone + matcher.cosine_scale * cosine
+        assert touch.half.shape == photo.half.shape == (3, config.half) == (3, 64 + 16)
+        torch.testing.assert_close(matcher(touches, photos), expected, rtol=1e-5, atol=1e-5)
+        two = score_halves(matcher.head, touch.half[:2], photo.half.numpy())
+        by_pair = matcher.head(touch.half[:2, None], photo.half[None]).sum(0)
+        torch.testing.assert_close(torch.from_numpy(two), by_pair, rtol=1e-5, atol=1e-5)
+        matcher.cosine_scale.fill_(-1.0)  # a match is never what lies apart
+        touch, photo = matcher.touch_code(torch.rand(3, 512)), matcher.photo_code(torch.rand(3, 256))
+        assert not touch.half[:, 64:].any()
+
+
 def test_the_paper_configuration_has_the_papers_layers():
     matcher = Matcher(MatcherConfig())
     assert matcher.head.touch_half.weight.shape == (1024, 2000)

@@ -25,6 +25,8 @@ CONTROLS = {
 }
 MOST_GRASPS = 12
 """Grasps of an object whose other images are encoded for a control."""
+MOST_PAIRS = 2000
+"""Labelled pairs, of all, whose other images are encoded for a control."""
 
 
 def control_experiments(experiment: Experiment, material: Material, cache: Path, seed: int) -> dict[str, Experiment]:
@@ -32,7 +34,10 @@ def control_experiments(experiment: Experiment, material: Material, cache: Path,
     folder, unfitted = experiment.folder / "controls", dataclasses.replace(experiment, checkpoint=None)
     experiments = {"shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True)}
     grasps = thinned(material.grasps, MOST_GRASPS)
-    queries = draw_queries(grasps, material.split, seed)
+    queries, pairs = (
+        draw_queries(grasps, material.split, seed),
+        material.pairs[:: len(material.pairs) // MOST_PAIRS + 1],
+    )
     for variant in ("before", "blurred"):
         if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue
@@ -42,7 +47,7 @@ def control_experiments(experiment: Experiment, material: Material, cache: Path,
             unfitted,
             folder=folder / variant,
             features=shown(grasps, *towers, photos_of=experiment.features),
-            pairs=experiment.pairs and shown(material.pairs, *towers, photos_of=experiment.pairs),
+            pairs=shown(pairs, *towers, photos_of=experiment.pairs) if pairs else None,
             queries=queries,
         )
     return experiments

@@ -74,9 +74,9 @@ class PruneRerank(LateFusion):
 
     def _parts(self, touch_codes: Array, photo_codes: Array) -> tuple[Array, Array, Array]:
         """Halves of touches and of photos, and cosines (T, N) of their embeddings."""
-        hidden = self._matcher.config.hidden
-        nearness = touch_codes[:, hidden:] @ photo_codes[:, hidden:].T
-        return touch_codes[:, :hidden], np.ascontiguousarray(photo_codes[:, :hidden]), nearness
+        half = self._matcher.config.half
+        nearness = touch_codes[:, half:] @ photo_codes[:, half:].T
+        return touch_codes[:, :half], np.ascontiguousarray(photo_codes[:, :half]), nearness
 
     def _count(self, photos: int) -> int:
         return max(1, round(self.share * photos))

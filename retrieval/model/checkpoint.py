@@ -54,7 +54,7 @@ _DTYPES = {
 class Checkpoint(Stored):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
-    posterior: what its logits mean; None where it was never calibrated. queries: (Q, hidden) halves of touches of
+    posterior: what its logits mean; None where it was never calibrated. queries: (Q, half) halves of touches of
     validation objects, by which an index can measure its own search.
 
     >>> from pathlib import Path
@@ -150,10 +150,10 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         queries = state.pop(_QUERIES, None)
-        hidden = about.config.matcher.hidden
-        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (hidden,)):
+        half = about.config.matcher.half
+        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (half,)):
             raise CheckpointError(
-                f"{_QUERIES} must be float16 (touches, {hidden}); got {queries.dtype} {tuple(queries.shape)}"
+                f"{_QUERIES} must be float16 (touches, {half}); got {queries.dtype} {tuple(queries.shape)}"
             )
         try:
             with torch.device("meta"):  # shapes alone: a header may ask for more memory than there is

@@ -28,6 +28,7 @@ class MatcherConfig:
     training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
     embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the networks that
     make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the contrastive ones.
+    cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does not.
     """
 
     tower: str = "resnet50"
@@ -38,6 +39,12 @@ class MatcherConfig:
     standardise: bool = False
     embedding_dim: int = 128
     pruner_width: int = 0
+    cosine: bool = False
+
+    @property
+    def half(self) -> int:
+        """Numbers in a half: the share of the head's first layer, and the scaled embedding where its cosine counts."""
+        return self.hidden + (self.embedding_dim if self.cosine else 0)
 
     def __post_init__(self) -> None:
         _require(self.pruner_width >= 0, f"pruner_width must be at least 0; got {self.pruner_width}")

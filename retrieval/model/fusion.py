@@ -1,7 +1,9 @@
 """The matcher: two towers, the fusion head that judges a pair, and the projections for candidate search.
 
 The first layer of the head is linear in the concatenation of the modalities, so it is stored as two halves:
-`W [t; v] + b = (W_t t + b) + W_v v`. A photo's half can be computed once, stored, and added to any touch's.
+`W [t; v] + b = (W_t t + b) + W_v v`. A photo's half can be computed once, stored, and added to any touch's. Where the
+cosine of the embeddings counts too (`MatcherConfig.cosine`), a half ends with its embedding times the root of the
+scale, so that halves are still all that is stored of a photo.
 """
 
 import math
@@ -21,11 +23,14 @@ from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.pruner import Pruner
 from retrieval.model.towers import build_tower
 
+COSINE_SCALE_INIT = 4.0
+"""What a cosine of 1 adds to the logit before anything is learned."""
+
 
 class Code(NamedTuple):
     """What the matcher keeps of one image: its share of the head's first layer and its place in the metric space.
 
-    half (B, hidden) and embedding (B, embedding_dim), float32; embeddings have norm 1.
+    half (B, half) and embedding (B, embedding_dim), float32; embeddings have norm 1.
     """
 
     half: Tensor
@@ -51,10 +56,12 @@ class FusionHead(nn.Module):
             nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, touch_half: Tensor, photo_half: Tensor) -> Tensor:
-        """Match logits (P,) of pairs of halves (P, hidden); either side broadcasts from (1, hidden)."""
-        x = self.dropout(functional.relu(touch_half + photo_half))
+        """Match logits (P,) of pairs of halves (P, half); either side broadcasts from (1, half)."""
+        hidden = self.second.in_features
+        x = self.dropout(functional.relu(touch_half[..., :hidden] + photo_half[..., :hidden]))
         x = functional.relu(self.second(x))
-        return self.out(x).squeeze(-1)  # type: ignore[no-any-return]
+        cosine = (touch_half[..., hidden:] * photo_half[..., hidden:]).sum(-1)
+        return self.out(x).squeeze(-1) + cosine  # type: ignore[no-any-return]
 
 
 class Matcher(nn.Module):
@@ -78,7 +85,8 @@ class Matcher(nn.Module):
         norm = partial(nn.BatchNorm1d, affine=False) if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
-        self.pruner = Pruner(config.hidden, config.pruner_width, config.embedding_dim) if config.pruner_width else None
+        self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
+        self.pruner = Pruner(config.half, config.pruner_width, config.embedding_dim) if config.pruner_width else None
         self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.judgement`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
@@ -103,12 +111,17 @@ class Matcher(nn.Module):
     def touch_code(self, features: Tensor) -> Code:
         """Half of touch features, and their embedding by the contrastive projection."""
         features = self.touch_norm(features)
-        return Code(self.head.touch_half(features), _unit(self.touch_projection(features)))
+        return self._code(self.head.touch_half(features), _unit(self.touch_projection(features)))
 
     def photo_code(self, features: Tensor) -> Code:
         """Half of photo features, and their embedding by the contrastive projection."""
         features = self.photo_norm(features)
-        return Code(self.head.photo_half(features), _unit(self.photo_projection(features)))
+        return self._code(self.head.photo_half(features), _unit(self.photo_projection(features)))
+
+    def _code(self, share: Tensor, embedding: Tensor) -> Code:
+        if self.cosine_scale is None:
+            return Code(share, embedding)
+        return Code(torch.cat([share, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
 
     def touch_entry(self, features: Tensor) -> Code:
         """Half and embedding for candidate search of touch features."""
@@ -156,7 +169,7 @@ def score_halves(
     photo_halves: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
-    """`Judge.logits` of a head in PyTorch and touch halves (G, hidden)."""
+    """`Judge.logits` of a head in PyTorch and touch halves (G, half)."""
     return judge_of(head).logits(touch_halves.detach().cpu().numpy(), photo_halves, rows)
 
 

@@ -92,7 +92,8 @@ BLOCK = 2048
 
 @dataclass(frozen=True)
 class Judge:
-    """The layers of a fusion head that follow its halves: `out . relu(second relu(touch + photo) + bias) + out_bias`.
+    """The layers of a fusion head that follow its halves: `out . relu(second relu(touch + photo) + bias) + out_bias`,
+    of the first H numbers; what follows them in a half adds its inner product.
 
     second (H, H), second_bias (H,), out (H,), out_bias (1,), all float32.
     """
@@ -105,9 +106,9 @@ class Judge:
     def logits(self, touch_halves: Floats, photo_halves: Halves, rows: NDArray[np.int64] | None = None) -> Floats:
         """Sum over grasps of the match logits of the photos at `rows` (all where None): (len(rows),).
 
-        touch_halves (G, H) of G grasps of ONE object; photo_halves (N, H) in any float type, memory-mapped or not,
-        read in blocks and computed with in float32. Adding logits takes the grasps as independent given the object,
-        and a flat prior. Raises NumericalError for a NaN or infinite logit: sorting would rank it first.
+        touch_halves (G, half) of G grasps of ONE object; photo_halves (N, half) in any float type, memory-mapped or
+        not, read in blocks and computed with in float32. Adding logits takes the grasps as independent given the
+        object, and a flat prior. Raises NumericalError for a NaN or infinite logit: sorting would rank it first.
         """
         count = len(photo_halves) if rows is None else len(rows)
         scores = np.empty(count, dtype=np.float32)
@@ -123,10 +124,12 @@ class Judge:
         return scores
 
     def _sum_of_logits(self, touch_halves: Floats, photos: Floats) -> Floats:
-        hidden, second = np.empty_like(photos), np.empty((len(photos), len(self.out)), dtype=np.float32)
-        total = np.full(len(photos), len(touch_halves) * self.out_bias[0], dtype=np.float32)
+        width = len(self.out)
+        hidden, second = (np.empty((len(photos), width), dtype=np.float32) for _ in range(2))
+        total: Floats = photos[:, width:] @ touch_halves[:, width:].sum(0)
+        total += len(touch_halves) * self.out_bias[0]
         for touch_half in touch_halves:
-            np.add(photos, touch_half, out=hidden)
+            np.add(photos[:, :width], touch_half[:width], out=hidden)
             np.maximum(hidden, 0, out=hidden)
             np.matmul(hidden, self.second.T, out=second)
             second += self.second_bias

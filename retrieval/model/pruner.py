@@ -21,11 +21,11 @@ class Pruner(nn.Module):
         self._touch, self._photo = (_student(hidden, width, embedding_dim) for _ in range(2))
 
     def touch(self, half: Tensor) -> Tensor:
-        """Embeddings (B, embedding_dim) of norm 1 of touch halves (B, hidden)."""
+        """Embeddings (B, embedding_dim) of norm 1 of touch halves (B, half)."""
         return functional.normalize(self._touch(half), dim=-1, eps=1e-6)
 
     def photo(self, half: Tensor) -> Tensor:
-        """Embeddings (B, embedding_dim) of norm 1 of photo halves (B, hidden)."""
+        """Embeddings (B, embedding_dim) of norm 1 of photo halves (B, half)."""
         return functional.normalize(self._photo(half), dim=-1, eps=1e-6)
 
     def scores(self, touch_halves: Tensor, photo_halves: Tensor) -> Tensor:
@@ -54,7 +54,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, halves: Tensor) -> Self:
-        """Of halves (N, hidden); halves that do not vary are not scaled up."""
+        """Of halves (N, half); halves that do not vary are not scaled up."""
         scale = halves.std(correction=0)
         return cls(halves.mean(0), scale.where(scale > 1e-6, 1.0))
 

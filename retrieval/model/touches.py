@@ -143,7 +143,7 @@ Floats = NDArray[np.float32]
 
 
 class TouchCodes(NamedTuple):
-    """What is made of G grasps, float32: halves (G, hidden), embeddings (G, embedding_dim), and what tells whether they
+    """What is made of G grasps, float32: halves (G, half), embeddings (G, embedding_dim), and what tells whether they
     are touches: readings (G, fingers, 2) of a model with a gel head, levels (G, fingers) of grey by which images differ
     from their no-contact frames, where these were given (`retrieval.model.judge`)."""
 
@@ -166,7 +166,7 @@ class Encoder(Protocol):
 
 class Encoded(NamedTuple):
     """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
-    found, and `halves` (N, hidden), by which it judges pairs. float32.
+    found, and `halves` (N, half), by which it judges pairs. float32.
 
     >>> with retrieval.open("index") as searcher:
     ...     embeddings, halves = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])

@@ -36,7 +36,7 @@ HELD = 256
 
 @dataclass(frozen=True)
 class _Code:
-    """An embedding (d,) and a half (hidden,), and the largest rounding of the half where this index has none yet.
+    """An embedding (d,) and a half (half,), and the largest rounding of the half where this index has none yet.
     resumed: left by a build that was cut off; else the parent has it under another name."""
 
     embedding: NDArray[np.float32]
@@ -58,7 +58,7 @@ class _Found:
 class Part:
     """Photos that follow each other, as many to encode among them as make a batch; what became of them.
 
-    rows: of all that could be read; embeddings (F, d) and halves (F, hidden): of those that the parent does not have
+    rows: of all that could be read; embeddings (F, d) and halves (F, half): of those that the parent does not have
     under their names, of which `embedded` were encoded now, and `resumed` by a build that was cut off.
     """
 
@@ -240,7 +240,7 @@ def layouts(checkpoint: Checkpoint) -> Layouts:
     config = checkpoint.config.matcher
     return {
         "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
-        "halves": (np.dtype(np.float16), (config.hidden,)),
+        "halves": (np.dtype(np.float16), (config.half,)),
         "half_error": (np.dtype(np.float32), ()),
     }
 

@@ -11,7 +11,7 @@ from retrieval.search.defaults import find_model
 
 
 def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> Encoded:
-    """The unit embeddings (N, embedding_dim) and halves (N, hidden) of N photos, in their order, float32.
+    """The unit embeddings (N, embedding_dim) and halves (N, half) of N photos, in their order, float32.
 
     photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first. model: a checkpoint or
     its file; None is the one that `retrieve build-index` takes. The inner product of a touch's embedding

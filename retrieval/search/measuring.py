@@ -99,7 +99,7 @@ class Bench(ABC):
 class WinnerBench(Bench):
     """Touches whose winners are known, to be found among the candidates.
 
-    vectors (S, d), slots (N,) that say which of them is each photo's, and halves (N, hidden), which are read where they
+    vectors (S, d), slots (N,) that say which of them is each photo's, and halves (N, half), which are read where they
     lie. Finding the winners judges every photo for every touch; `quiet` shows no progress.
     """
 
@@ -188,7 +188,7 @@ def can_measure(checkpoint: Checkpoint) -> bool:
 
 @torch.inference_mode()
 def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch.Tensor, Floats]:
-    """Halves (Q, hidden) and unit embeddings (Q, d), float32, of the first `count` touches that the checkpoint keeps.
+    """Halves (Q, half) and unit embeddings (Q, d), float32, of the first `count` touches that the checkpoint keeps.
     Raises BadInput where `can_measure` says that there are none."""
     if checkpoint.queries is None or checkpoint.matcher.pruner is None:
         raise BadInput(f"{checkpoint.path} must keep touches to measure with, and a pruner; train it again")

@@ -40,8 +40,8 @@ def listed_photo(row: dict[str, Any]) -> ListedPhoto:
     return ListedPhoto(object_id, path, metadata)
 
 
-def require_usable(generation: Generation, hidden: int) -> None:
-    """Raise CorruptIndex unless the index says where its catalogue and checkpoint lie, and holds halves of `hidden`
+def require_usable(generation: Generation, half: int) -> None:
+    """Raise CorruptIndex unless the index says where its catalogue and checkpoint lie, and holds halves of `half`
     numbers."""
     about, halves = generation.manifest.about, generation.arrays.get("halves")
     candidates = about.get("candidates")
@@ -50,9 +50,9 @@ def require_usable(generation: Generation, hidden: int) -> None:
         raise CorruptIndex(f"{generation.folder}: its number of candidates must be 1 or more; {AGAIN}")
     if not all(isinstance(about.get(name), str) and "\0" not in about[name] for name in ("catalogue", "checkpoint")):
         raise CorruptIndex(f"{generation.folder}: it must say its catalogue and its checkpoint; {AGAIN}")
-    if halves is None or halves.ndim != 2 or halves.shape[1] != hidden or halves.dtype.kind != "f":
+    if halves is None or halves.ndim != 2 or halves.shape[1] != half or halves.dtype.kind != "f":
         got = "none" if halves is None else f"{halves.dtype} {halves.shape}"
-        raise CorruptIndex(f"{generation.folder}: it must hold halves of {hidden} numbers, holds {got}; {AGAIN}")
+        raise CorruptIndex(f"{generation.folder}: it must hold halves of {half} numbers, holds {got}; {AGAIN}")
 
 
 class JudgedObjects(NamedTuple):

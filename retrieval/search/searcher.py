@@ -96,7 +96,7 @@ class Searcher:
 
             load_checkpoint(stored.path)  # a damaged one says so
         generation.require(fingerprint(stored))
-        require_usable(generation, stored.config.matcher.hidden)
+        require_usable(generation, stored.config.matcher.half)
         encoder = exported_beside(stored) or torch_encoder(stored)
         return cls(Path(index), generation, stored, encoder, read_judge(stored.path))
 
@@ -191,7 +191,7 @@ class Searcher:
         return held._answers(every, spans, background, top, limit, none_prior) if asked else []
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
-        """The unit embeddings (G, embedding_dim) and halves (G, hidden) of G grasps, given as `query` takes them.
+        """The unit embeddings (G, embedding_dim) and halves (G, half) of G grasps, given as `query` takes them.
 
         The inner product with a photo's embedding (`retrieval.embed_photos`) is the score by which candidates are
         found; it orders photos for one touch and is no probability. Match logits are

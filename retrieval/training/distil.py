@@ -54,13 +54,13 @@ def distil(
 ) -> None:
     """Give `matcher` a pruner of `width` hidden units, taught by `matcher.head`; nothing else of it changes.
 
-    touch_halves, photo_halves (N, hidden): of training objects. The same seed gives the same pruner. Raises
+    touch_halves, photo_halves (N, half): of training objects. The same seed gives the same pruner. Raises
     Interrupted once `stopped()`, NumericalError for a loss that is not finite; the matcher is then as it was.
     """
     config = dataclasses.replace(matcher.config, pruner_width=width)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        pruner = Pruner(config.hidden, width, config.embedding_dim).to(touch_halves.device)
+        pruner = Pruner(config.half, width, config.embedding_dim).to(touch_halves.device)
     touch_spread, photo_spread = Spread.of(touch_halves), Spread.of(photo_halves)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
 
@@ -92,7 +92,7 @@ def order_loss(scores: Tensor, logits: Tensor) -> Tensor:
 
 
 def blend(halves: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count, hidden) halves, each between two of `halves` (N, hidden) and nearer to the first."""
+    """(count, hidden) halves, each between two of `halves` (N, half) and nearer to the first."""
     pairs = torch.randint(len(halves), (2, count), generator=generator).to(halves.device)
     share = LEAST_SHARE + (1 - LEAST_SHARE) * torch.rand(count, 1, generator=generator).to(halves.device)
     return torch.lerp(halves[pairs[1]], halves[pairs[0]], share)
@@ -130,7 +130,7 @@ def recorded_halves(
     quiet: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor]:
-    """Halves (N, hidden) of the touches of grasps and of their photos; of `MOST` grasps, drawn by the seed, if there
+    """Halves (N, half) of the touches of grasps and of their photos; of `MOST` grasps, drawn by the seed, if there
     are more."""
     order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(seed))[:MOST]
     drawn = [grasps[row] for row in order.tolist()]
@@ -141,13 +141,13 @@ def recorded_halves(
 
 @torch.inference_mode()
 def feature_halves(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
-    """Halves (G, hidden) of the touches and of the photos of features."""
+    """Halves (G, half) of the touches and of the photos of features."""
     touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
     return matcher.touch_code(touch).half, matcher.photo_code(photo).half
 
 
 def kept_queries(touch_halves: Tensor, seed: int) -> NDArray[np.float16] | None:
-    """Up to QUERIES of touch halves (N, hidden), drawn by the seed, of those that float16 holds; None for none."""
+    """Up to QUERIES of touch halves (N, half), drawn by the seed, of those that float16 holds; None for none."""
     halves = touch_halves.cpu().half()
     halves = halves[torch.isfinite(halves).all(1)]
     chosen = torch.randperm(len(halves), generator=torch.Generator().manual_seed(seed))[:QUERIES]
@@ -165,7 +165,7 @@ def with_pruner(
 ) -> Checkpoint:
     """The checkpoint `made` with the pruner that `config` asks for, its queries and its own measure among the metrics.
 
-    train, validation: touch halves and photo halves (N, hidden) of training objects, and of validation objects where
+    train, validation: touch halves and photo halves (N, half) of training objects, and of validation objects where
     there are any; the pruner is measured by touches of these among the photos of all. The matcher of `made` is taken
     over. Raises as `distil`.
     """

@@ -104,7 +104,7 @@ def _onnx(checkpoint: Checkpoint) -> Encode:
 
 @torch.inference_mode()
 def _halves(matcher: Matcher, images: list[Any]) -> Array:
-    """Halves (B, hidden) of touches, the arithmetic in the type of the matcher's weights."""
+    """Halves (B, half) of touches, the arithmetic in the type of the matcher's weights."""
     features: Tensor = matcher.touch_tower(touch_batch(images).flatten(0, 1))
     return matcher.touch_code(features.reshape(len(images), -1)).half.float().numpy()
 

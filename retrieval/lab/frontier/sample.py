@@ -45,7 +45,7 @@ QUICK = Scale(photos=2000, queries=12, touches=12, repeats=2, quick=True)
 
 @dataclass(frozen=True, eq=False)
 class BlendedCatalogue:
-    """N photos. halves (N, hidden) float16, as an index keeps them. embeddings: name of what made them -> (N, d)."""
+    """N photos. halves (N, half) float16, as an index keeps them. embeddings: name of what made them -> (N, d)."""
 
     halves: NDArray[np.float16]
     embeddings: Mapping[str, Array]
@@ -191,7 +191,7 @@ class Sample:
         return found
 
     def logits(self, half: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
-        """Match logits of one touch, or summed over touches (G, hidden), with photos (N, hidden), at `rows` or all."""
+        """Match logits of one touch, or summed over touches (G, half), with photos (N, half), at `rows` or all."""
         return score_halves(self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(half)), photos, rows)
 
 
