@@ -3,18 +3,22 @@
     python -m tests.scaling RECORDING UNSEEN --out FOLDER --preset mobilenet --init WEIGHTS
 
 RECORDING gives training and validation objects, UNSEEN is a recording of other objects; all of its touches are judged.
-Training sets are nested: 20 objects are among the 80. Writes scaling.json and scaling.png in FOLDER; what is fitted
-already, and features, are used again.
+Training sets are nested: 20 objects are among the 80. With `--photographed 0 1000 10000` (and --photos, --touches) each
+number of felt objects is trained on beside so many photographed ones, paired by their labels with pressed ones, and the
+plot has a line for each. Writes scaling.json and scaling.png in FOLDER; what is fitted already, and features, are used
+again.
 """
 
 import argparse
 import dataclasses
 import json
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -32,6 +36,8 @@ from retrieval.training.features import Features, encode_recording
 from retrieval.training.train import labelled_pairs
 
 LINES = ("-", "--", "-.")
+NONE_FELT = 8
+"""Added to numbers of felt objects where they are plotted, so that none has a place on a logarithmic axis."""
 SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}
 
 
@@ -49,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     for pictures in ("photos", "touches"):
         parser.add_argument(f"--{pictures}", default="", help="labelled ones, to be paired and trained on too")
+    parser.add_argument("--photographed", type=int, nargs="+", help="photographed objects whose pairs are trained on")
     parser.add_argument("--views", nargs="+", help="ablation: other views of a photo than the preset's")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["late_fusion", "cca"])
@@ -63,7 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = measure(arguments)
     (arguments.out / "scaling.json").write_text(json.dumps(found, indent=1, sort_keys=True) + "\n")
     print(table(found["points"]))
-    plot(found["points"]).savefig(arguments.out / "scaling.png", dpi=110)
+    draw = plot if arguments.photographed is None else plot_photographed
+    draw(found["points"]).savefig(arguments.out / "scaling.png", dpi=110)
     return 0
 
 
@@ -73,22 +81,28 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     cache = arguments.cache or arguments.out / "features"
     seen, seen_digest = _features(arguments.recording, config, cache, arguments.fingers)
     unseen, unseen_digest = _features(arguments.unseen, config, cache, arguments.fingers)
-    pairs = _encoded(labelled_pairs(config), config, cache, arguments.fingers)
+    pairs = seen.of_objects(())
+    if config.training.photos:
+        pairs = _encoded(labelled_pairs(config), config, cache, arguments.fingers)
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
     validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
     most = max(arguments.grasps)
     sizes = sorted({min(count, len(pool)) for count in arguments.objects})
     asked = [(count, most) for count in sizes] + [(sizes[-1], grasps) for grasps in arguments.grasps if grasps < most]
+    liked = [str(name) for name in np.random.default_rng(1).permutation(sorted(set(pairs.object_ids)))]
+    beside = sorted({min(count, len(liked)) for count in arguments.photographed or [len(liked)]})
     points = []
-    for count, grasps in asked:
-        train = first_grasps(seen.of_objects(pool[:count]), grasps)
-        if pairs:
-            train = train.joined(pairs)
-        setting = Setting(config, folder=arguments.out / f"{count}-objects-{grasps}-grasps")
+    for (count, grasps), photographed in product(asked, beside):
+        if not count and not photographed:
+            continue
+        felt, paired = first_grasps(seen.of_objects(pool[:count]), grasps), pairs.of_objects(liked[:photographed])
+        train = felt.joined(paired) if count and photographed else felt if count else paired
+        setting = Setting(config, folder=arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed")
         for name in arguments.methods:
             method = build_method(name, setting)
             method.fit(train, validation)
-            size = {"method": name, "objects": count, "grasps": grasps, "touches": len(train), "pairs": len(pairs)}
+            size = {"method": name, "objects": count, "grasps": grasps, "photographed": photographed}
+            size |= {"touches": len(train), "pairs": len(paired)}
             points.append(size | judge(method, validation, unseen))
             print(table(points[-1:]).splitlines()[-1], flush=True)
     return {
@@ -152,12 +166,13 @@ def scores_of(method: Method, features: Features) -> ScoreTable:
 def table(points: Sequence[dict[str, Any]]) -> str:
     """A Markdown table of the points."""
     lines = [
-        "| method | training objects | grasps of each | " + " | ".join(SHOWN.values()) + " |",
-        "|---|---|---|" + "---|" * len(SHOWN),
+        "| method | training objects | grasps of each | photographed | " + " | ".join(SHOWN.values()) + " |",
+        "|---|---|---|---|" + "---|" * len(SHOWN),
     ]
     for point in points:
         cells = [_cell(point[name]) for name in SHOWN]
-        lines.append(f"| {point['method']} | {point['objects']:,} | {point['grasps']} | " + " | ".join(cells) + " |")
+        sizes = (f"{point['objects']:,}", str(point["grasps"]), f"{point['photographed']:,}")
+        lines.append("| " + " | ".join((point["method"], *sizes, *cells)) + " |")
     return "\n".join(lines)
 
 
@@ -175,6 +190,30 @@ def plot(points: Sequence[dict[str, Any]]) -> Figure:
     left.set(xlabel=f"training objects, {grasps} grasps of each", ylabel="share right, unseen objects", ylim=(0, 1))
     right.set(xlabel=f"grasps of each of {objects:,} training objects")
     right.legend(loc="lower right", fontsize="small", facecolor="white", edgecolor="none", framealpha=1)
+    return figure
+
+
+def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
+    """A panel a measure, against felt objects, of the first method; a line for each number of photographed objects."""
+    figure = Figure(figsize=(12, 4.2), layout="constrained")
+    points = [point for point in points if point["method"] == points[0]["method"]]
+    counts = sorted({point["photographed"] for point in points})
+    for axes, (name, label) in zip(figure.subplots(1, 3), SHOWN.items(), strict=True):
+        for number, count in enumerate(counts):
+            own = [point for point in points if point["photographed"] == count]
+            own.sort(key=lambda point: int(point["objects"]))
+            value, low, high = (np.array([each[name][part][0] for each in own]) for part in ("value", "low", "high"))
+            x = np.array([each["objects"] for each in own]) + NONE_FELT
+            colour = colormaps["viridis"](0.9 * number / max(len(counts) - 1, 1))
+            bars = [value - low, high - value]
+            axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, label=f"{count:,} photographed")
+        axes.axhline(points[0][name]["chance"][0], color="black", linestyle=":", linewidth=1)
+        ticks = sorted({point["objects"] for point in points})
+        axes.set(xscale="log", xlabel="felt objects", title=label, ylim=(0, 1))
+        axes.set_xticks([tick + NONE_FELT for tick in ticks], [f"{tick:,}" for tick in ticks])
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    axes.legend(loc="lower right", fontsize="small", facecolor="white", edgecolor="none", framealpha=1)
     return figure
 
 

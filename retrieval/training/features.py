@@ -63,7 +63,7 @@ class Features:
         if self.touch.dtype != np.float32 or self.photo.dtype != np.float32:
             raise BadInput(f"features must be float32; got touch {self.touch.dtype}, photo {self.photo.dtype}")
         for what, part in (("touch", self.touch), ("photo", self.photo)):
-            bad = np.flatnonzero(~np.isfinite(part).reshape(len(part), -1).all(axis=1))
+            bad = np.flatnonzero(~np.isfinite(part).all(axis=tuple(range(1, part.ndim))))
             if len(bad):
                 raise NumericalError(
                     f"{what} features must be finite; grasp {self.grasp_ids[bad[0]]} has a NaN or infinite one: the "
