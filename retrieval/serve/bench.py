@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from indexes.store.rows import key_of
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
@@ -18,16 +19,17 @@ router = APIRouter(tags=["bench"])
 MOST_NAMES = 1000
 """Objects among which one is drawn to be grasped."""
 BOUNDARY = "picture"
+Named = Annotated[str | None, Query(max_length=1000, alias="object", description="close on this object")]
 Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at most")]
 
 
-@router.post("/v1/grasp", responses=problems("unknown", "failed", "not-ready"))
-async def grasp(parts: Parts) -> GraspDocument:
-    """Close the jaws on one of the catalogue's objects, drawn at random."""
+@router.post("/v1/grasp", responses=problems("unknown", "bad-input", "failed", "not-ready"))
+async def grasp(parts: Parts, name: Named = None) -> GraspDocument:
+    """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random."""
     close = parts.bench.grasp
     if close is None:
         raise Problem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
-    names = await run_in_threadpool(_object_ids, parts.generations.current)
+    names = await run_in_threadpool(_object_ids, parts.generations.current, name)
     try:
         felt = await run_in_threadpool(close, names)
     except Exception as error:  # of any rig
@@ -38,9 +40,13 @@ async def grasp(parts: Parts) -> GraspDocument:
     return GraspDocument(object_id=felt.object_id, touches=encoded[0], background=encoded[1] or None)
 
 
-def _object_ids(opened: Opened) -> list[str]:
-    """Names of objects, spread over the catalogue."""
+def _object_ids(opened: Opened, name: str | None) -> list[str]:
+    """Names of objects, spread over the catalogue; the one that is named alone. Raises Problem."""
     rows = opened.generation.rows
+    if name is not None:
+        if not (rows.keys("object_id") == key_of(name)).any():
+            raise Problem("unknown", f"the index has no object {name!r}; /v1/catalogue lists them")
+        return [name]
     step = max(1, len(rows) // MOST_NAMES)
     return sorted({str(rows[number]["object_id"]) for number in range(0, len(rows), step)})
 

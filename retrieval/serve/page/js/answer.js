@@ -1,0 +1,162 @@
+// An answer: the verdict in words, what adds up to 1, and the photos.
+
+import { thumbnailURL } from "./api.js";
+import { h, picture } from "./dom.js";
+import { openDetail } from "./detail.js";
+import { feedbackPanel } from "./feedback.js";
+import { growingPanel } from "./growing.js";
+import { count, percent, verdict } from "./words.js";
+
+const LEAST_SHOWN = 0.0005;
+
+/** The whole panel of an answer. */
+export function answerPanel({ index, answer, id, asked, kept = null }) {
+  const parts = shares(answer);
+  const open = (match) => openDetail({ index, photo: match.photo, objectId: match.object_id, asked });
+  return h(
+    "div",
+    { class: "answer" },
+    verdictBlock(answer, asked.held),
+    index.keeps && id && feedbackPanel(answer, id, kept),
+    parts.length > 0 && answer.none_probability !== null && strip(parts),
+    parts.length > 0 &&
+      h(
+        "ol",
+        { class: "photos", "aria-label": "Objects, most likely first" },
+        parts.map((part) => card(part, answer, open)),
+      ),
+    parts.length > 0 && asked.touches.length > 1 && answer.none_probability !== null && growingPanel(asked),
+    found(answer),
+  );
+}
+
+/** What the probability is shared among: objects shown, none of these, all the others; most likely first. */
+function shares(answer) {
+  const objects = answer.results.map((match) => ({ kind: "object", match, p: match.probability }));
+  if (!objects.length || answer.none_probability === null) return objects;
+  const none = { kind: "none", p: answer.none_probability };
+  const shown = [...objects, none].sort((one, other) => other.p - one.p);
+  const rest = 1 - shown.reduce((sum, part) => sum + part.p, 0);
+  const others = (answer.posterior?.objects ?? 0) - objects.length;
+  if (others > 0) shown.push({ kind: "rest", p: Math.max(0, rest), others });
+  return shown;
+}
+
+function verdictBlock(answer, held) {
+  const said = verdict(answer);
+  const place = held ? answer.results.findIndex((match) => match.object_id === held) : -1;
+  const where =
+    place === 0
+      ? "the first of the ranking"
+      : place > 0
+        ? `number ${place + 1} of the ranking`
+        : "not among those shown";
+  return h(
+    "div",
+    { class: `verdict ${answer.verdict.replaceAll(" ", "-")}` },
+    h("p", { class: "above" }, said.above),
+    h("h2", { class: "claim" }, said.claim),
+    h("p", { class: "below" }, said.below),
+    held && h("p", { class: "held" }, "The jaws closed on ", h("strong", {}, held), `: ${where}.`),
+  );
+}
+
+function name(part) {
+  if (part.kind === "none") return "None of these";
+  if (part.kind === "rest") return count(part.others, "other object");
+  return part.match.object_id;
+}
+
+/** One bar of the width 1, divided; the numbers stand in the cards. */
+function strip(parts) {
+  return h(
+    "div",
+    { class: "strip", "aria-hidden": "true" },
+    parts.map((part) =>
+      h("span", {
+        class: part.kind,
+        style: { "flex-grow": String(part.p) },
+        title: `${name(part)}: ${percent(part.p)}`,
+      }),
+    ),
+  );
+}
+
+function card(part, answer, open) {
+  const { kind, match, p } = part;
+  const first = kind === "object" && match.rank === 1 && ["match", "uncalibrated"].includes(answer.verdict);
+  const chosen = first || (kind === "none" && answer.verdict === "none of these");
+  const text = [
+    h("span", { class: "name" }, name(part)),
+    p !== null &&
+      h(
+        "span",
+        { class: "meter", "data-p": String(p), "aria-hidden": "true" },
+        h("span", { style: { width: `${100 * p}%` } }),
+      ),
+    p !== null && h("span", { class: "p" }, percent(p)),
+    kind === "object" && p === null && h("span", { class: "p faint" }, `match logit ${match.logit.toFixed(2)}`),
+  ];
+  const given = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < LEAST_SHOWN ? " unlikely" : ""}` };
+  if (kind !== "object") {
+    return h(
+      "li",
+      given,
+      h(
+        "div",
+        { class: "tile" },
+        h("div", { class: "blank", "aria-hidden": "true" }, kind === "none" ? "?" : `+${part.others}`),
+        text,
+      ),
+    );
+  }
+  const image = picture(thumbnailURL(match.photo), "", { loading: "lazy" });
+  return h(
+    "li",
+    given,
+    h(
+      "button",
+      { type: "button", class: "tile", onclick: () => open(match) },
+      image,
+      text,
+      h("span", { class: "unseen" }, ", details"),
+    ),
+  );
+}
+
+/** How it was found, for those who ask. */
+function found(answer) {
+  const rows = [
+    ["Index", `${answer.index.generation}, kind ${answer.index.kind}`],
+    ["Model", `${answer.index.model.split("/").at(-1)}, trained on: ${answer.index.trained_on}`],
+    ["Judged", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
+    [
+      "Time",
+      Object.entries(answer.timing_ms)
+        .map(([stage, ms]) => `${stage} ${ms.toFixed(1)} ms`)
+        .join(", "),
+    ],
+  ];
+  const { posterior } = answer;
+  if (posterior) {
+    rows.push([
+      "Before",
+      `none of these ${percent(posterior.none_prior)}; each of ${count(posterior.objects, "object")} alike`,
+    ]);
+    const left = posterior.objects - posterior.judged_objects;
+    if (left)
+      rows.push(["Not judged", `${count(left, "object")}, which share ${percent(posterior.unjudged_probability)}`]);
+  }
+  return h(
+    "details",
+    { class: "found" },
+    h("summary", {}, "How this was found"),
+    h(
+      "dl",
+      {},
+      rows.map(([term, text]) => [h("dt", {}, term), h("dd", {}, text)]),
+    ),
+    posterior &&
+      h("p", { class: "faint" }, "The probabilities of all objects of the catalogue and of none of these add up to 1."),
+  );
+}

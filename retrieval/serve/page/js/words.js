@@ -1,0 +1,65 @@
+// How numbers and verdicts are said.
+
+/** A probability as people read it. */
+export function percent(p) {
+  if (p > 0.999) return "over 99.9 %";
+  if (p < 0.001) return "under 0.1 %";
+  return `${(100 * p).toFixed(1)} %`;
+}
+
+/** "1 photo", "2,000 photos". */
+export function count(number, word) {
+  const more = word.endsWith("ch") ? "es" : "s";
+  return `${number.toLocaleString("en")} ${word}${number === 1 ? "" : more}`;
+}
+
+/** A date and time of this place, from what the service writes. */
+export function moment(text) {
+  return new Date(text).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
+}
+
+/** A verdict in words: what stands above, the name or claim, and the sentence below. */
+export function verdict(answer) {
+  const best = answer.results[0];
+  switch (answer.verdict) {
+    case "match":
+      return {
+        above: "Most likely",
+        claim: best.object_id,
+        below: `Probability ${percent(best.probability)}. That it is none of these: ${percent(answer.none_probability)}.`,
+      };
+    case "none of these":
+      return {
+        above: "Most likely",
+        claim: "None of these",
+        below:
+          `That the catalogue lacks the object has probability ${percent(answer.none_probability)}. ` +
+          "The nearest objects are shown.",
+      };
+    case "no contact":
+      return {
+        above: "Nothing was felt",
+        claim: "No contact",
+        below: "The gels look untouched, so nothing is named. Press the object and take the picture again.",
+      };
+    case "not a gel image":
+      return {
+        above: "Nothing is named",
+        claim: "Not a gel image",
+        below: "What is marked does not look like a gel that the model knows. Is it a photo of the object?",
+      };
+    default:
+      return {
+        above: "Nearest",
+        claim: best.object_id,
+        below: "This model was never calibrated: it ranks the objects and gives no probabilities.",
+      };
+  }
+}
+
+/** What was said of an answer, as a sentence. */
+export function saidWords(said, objectId) {
+  if (said === "right") return "Said to be right";
+  if (said === "none") return "Said to be none of these";
+  return `Said to be ${objectId}`;
+}

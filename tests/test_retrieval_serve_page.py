@@ -1,0 +1,259 @@
+"""The page in a real browser: asking, the answer, an object in detail, live pictures. Each sentence is a click."""
+
+import base64
+import itertools
+
+import pytest
+
+from retrieval.serve.service import Bench, Grasped
+from tests import synthetic
+from tests.browser import address, ask, choose, chromium, gel_files, page, serious
+
+pytestmark = pytest.mark.slow
+JPEG = synthetic._jpeg(synthetic.draw_background(1))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def files(touch, tmp_path_factory):
+    return gel_files(tmp_path_factory.mktemp("gels"), touch)
+
+
+@pytest.fixture(scope="module")
+def touches():
+    """name -> gel images of two grasps, (a, b) each."""
+    objects = synthetic.make_objects(3, seed=9)
+    return {one.object_id: [synthetic._touch_files(one, key, "ab", 8.0, False) for key in (1, 2)] for one in objects}
+
+
+@pytest.fixture(scope="module")
+def bench(touches):
+    """Jaws that close on the object that is named, else on one after the other; the gels of two sensors."""
+    drawn = itertools.cycle(sorted(touches))
+
+    def close(names):
+        name = names[0] if len(names) == 1 else next(drawn)
+        return Grasped(name, list(touches[name][0].values()))
+
+    return Bench({"a": lambda: JPEG, "b": lambda: JPEG}, close)
+
+
+@pytest.fixture(scope="module")
+def url(index, bench):
+    with address(index, bench) as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser, url):
+    with page(browser, url) as found:
+        yield found
+
+
+def test_dropped_gel_images_become_grasps_by_their_names(opened, files):
+    data = [{"name": path.name, "text": base64.b64encode(path.read_bytes()).decode()} for path in reversed(files)]
+    opened.evaluate(
+        """(given) => {
+            const carried = new DataTransfer();
+            for (const {name, text} of given) {
+                const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+                carried.items.add(new File([bytes], name, {type: "image/png"}));
+            }
+            dispatchEvent(new DragEvent("drop", {dataTransfer: carried, bubbles: true, cancelable: true}));
+        }""",
+        data,
+    )
+    assert opened.locator(".grasp legend").all_inner_texts() == ["Grasp 1", "Grasp 2"]
+    assert opened.get_by_alt_text("Gel image").count() == 4
+
+
+def test_pictures_are_removed_completed_and_their_fingers_swapped(opened, files):
+    choose(opened, "Choose gel images", files[:3])
+    ask_button = opened.get_by_role("button", name="Ask", exact=True)
+    assert ask_button.is_disabled()  # finger b of grasp 2 is missing
+    choose(opened, "Choose finger b", files[3:])
+    assert ask_button.is_enabled()
+    sources = lambda: opened.locator(".grasp").first.locator("img").evaluate_all("all => all.map((one) => one.src)")  # noqa: E731
+    before = sources()
+    opened.get_by_role("button", name="Swap fingers of grasp 1").click()
+    assert sources() == before[::-1]
+    opened.get_by_role("button", name="Remove grasp 2").click()
+    opened.get_by_role("button", name="Remove finger a of grasp 1").click()
+    assert opened.get_by_alt_text("Gel image").count() == 1
+    opened.get_by_role("button", name="Start again").click()
+    assert opened.get_by_text("Drop gel images here").is_visible()
+    assert opened.locator(".grasp").count() == 0
+
+
+def test_what_is_no_picture_is_refused_before_it_is_sent(opened, tmp_path):
+    (tmp_path / "notes.txt").write_text("no picture")
+    choose(opened, "Choose gel images", [tmp_path / "notes.txt"])
+    opened.get_by_text("notes.txt is no picture.").wait_for()
+    assert opened.locator(".grasp").count() == 0
+
+
+def test_the_answer_is_photos_with_bars_that_add_up_to_1_none_of_these_among_them(opened, files):
+    ask(opened, files)
+    bars = [float(one) for one in opened.locator("[data-p]").evaluate_all("all => all.map((one) => one.dataset.p)")]
+    assert len(bars) == 9  # eight objects, none of these
+    assert sum(bars) == pytest.approx(1, abs=1e-6)
+    assert bars == sorted(bars, reverse=True)
+    assert opened.locator(".photo .name", has_text="None of these").is_visible()
+    verdicts = ("Most likely", "Nearest", "Nothing was felt", "Nothing is named")
+    assert opened.locator(".above").inner_text() in verdicts
+    assert opened.locator(".photo img").count() == 8
+    assert opened.locator(".photo img").evaluate_all("all => all.every((one) => one.loading === 'lazy')")
+
+
+def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
+    opened.get_by_text("Options").click()
+    opened.get_by_label("Objects to show").fill("3")
+    opened.get_by_label("Objects to show").blur()
+    ask(opened, files[:2])
+    bars = [float(one) for one in opened.locator("[data-p]").evaluate_all("all => all.map((one) => one.dataset.p)")]
+    assert (len(bars), sum(bars)) == (5, pytest.approx(1, abs=1e-6))
+    assert opened.get_by_text("5 other objects").is_visible()
+
+
+def test_a_click_shows_all_photos_of_an_object_beside_the_touch_and_enlarges_them(opened, files):
+    ask(opened, files)
+    name = opened.locator(".photo.object .name").first.inner_text()
+    opened.locator(".photo.object button").first.click()
+    dialog = opened.get_by_role("dialog", name=name)
+    dialog.locator(".film").first.locator("li").nth(2).wait_for()
+    assert dialog.get_by_label("Photos of this object").get_by_role("button").count() == 3
+    assert dialog.get_by_alt_text("Gel image: Grasp 1, finger a").is_visible()
+    dialog.get_by_label("Touch beside the photo").select_option("Grasp 2, finger b")
+    assert dialog.get_by_alt_text("Gel image: Grasp 2, finger b").is_visible()
+    dialog.get_by_role("button", name="Photo 2 of 3").click()
+    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
+    small = dialog.get_by_alt_text(f"Photo {name}/2.jpg").bounding_box()["height"]
+    dialog.get_by_role("button", name="Enlarge the photo").click()
+    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").bounding_box()["height"] > small
+    assert not dialog.get_by_alt_text("Gel image").is_visible()
+    opened.keyboard.press("Escape")
+    assert dialog.count() == 0
+
+
+def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
+    ask(opened, files[:2])
+    opened.locator(".photo.object button").first.click()
+    button = opened.get_by_role("button", name="Where it agrees with the touch")
+    button.click()
+    shade = opened.locator("canvas.map")
+    shade.wait_for()
+    assert shade.get_attribute("data-squares") == "64"
+    read = "one => one.getContext('2d').getImageData(0, 0, one.width, one.height).data.filter((_, n) => n % 4 === 3)"
+    values = shade.evaluate(f"one => {{ const all = ({read})(one); return [Math.min(...all), Math.max(...all)]; }}")
+    assert values[0] < values[1]  # somewhere brighter than elsewhere
+    button.click()
+    assert shade.count() == 0
+
+
+def test_nearest_photos_of_a_photo_lead_on_to_their_objects(opened, files):
+    ask(opened, files[:2])
+    opened.locator(".photo.object button").first.click()
+    near = opened.locator(".alike li button").first
+    near.wait_for()
+    name = near.inner_text()
+    near.click()
+    opened.get_by_role("dialog", name=name).wait_for()
+
+
+def test_grasp_something_closes_the_jaws_and_asks(opened):
+    opened.get_by_role("button", name="Grasp something").click()
+    opened.locator(".answer").wait_for()
+    held = opened.locator(".held strong").inner_text()
+    assert opened.get_by_alt_text("Gel image").count() == 2
+    opened.get_by_role("button", name="Grasp it again").click()
+    opened.locator("legend", has_text="Grasp 2").wait_for()
+    opened.get_by_text("The jaws closed on").wait_for()
+    assert opened.locator(".held strong").inner_text() == held
+
+
+def test_live_sensors_are_shown_and_taken_as_a_touch(opened):
+    opened.get_by_role("button", name="Live sensors").click()
+    live = opened.get_by_alt_text("Live picture of sensor b")
+    live.wait_for()
+    comes = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
+    live.evaluate(comes)
+    assert live.evaluate("one => one.naturalWidth") == 160
+    opened.get_by_role("button", name="Take this touch").click()
+    opened.get_by_alt_text("Gel image, grasp 1, finger b").wait_for()
+    opened.get_by_role("button", name="Close").click()
+    assert live.count() == 0
+
+
+def test_the_browsers_camera_takes_one_finger_after_the_other(opened):
+    opened.get_by_role("button", name="Camera").click()
+    opened.get_by_role("button", name="Take finger a").click()
+    opened.get_by_role("button", name="Take finger b").click()
+    opened.get_by_alt_text("Gel image, grasp 1, finger b").wait_for()
+    assert opened.get_by_role("button", name="Ask", exact=True).is_enabled()
+
+
+def test_what_the_service_cannot_do_has_no_button(browser, index, files):
+    with address(index) as url, page(browser, url) as opened:
+        assert opened.get_by_role("button", name="Grasp something").count() == 0
+        assert opened.get_by_role("button", name="Live sensors").count() == 0
+        ask(opened, files[:2])
+        assert opened.get_by_role("button", name="It was another").count() == 0
+        assert opened.get_by_role("link", name="History").count() == 0
+
+
+def test_the_page_asks_for_the_token_once(browser, index):
+    token = "sixteen letters or more"
+    with address(index, token=token) as url, page(browser, url) as opened:
+        opened.get_by_label("Token", exact=True).last.fill("another one, which is wrong")
+        opened.get_by_role("button", name="Go on").click()
+        opened.get_by_text("this is not the service's token").wait_for()
+        opened.get_by_label("Token", exact=True).last.fill(token)
+        opened.get_by_role("button", name="Go on").click()
+        opened.get_by_role("heading", name="Which object is in the hand?").wait_for()
+        opened.reload()
+        opened.get_by_role("heading", name="Which object is in the hand?").wait_for()
+
+
+def test_what_the_service_refuses_is_said_in_its_own_sentence(opened, tmp_path):
+    (tmp_path / "a.png").write_bytes(b"\x89PNG but no more")
+    choose(opened, "Choose gel images", [tmp_path / "a.png"])
+    choose(opened, "Choose finger b", [tmp_path / "a.png"])
+    opened.get_by_role("button", name="Ask", exact=True).click()
+    opened.get_by_role("alert").get_by_text("grasp 1, finger").wait_for()
+    assert opened.get_by_role("button", name="Try again").is_visible()
+
+
+def test_the_keyboard_alone_asks_and_looks(opened, files):
+    choose(opened, "Choose gel images", files[:2])  # the system's own dialog; Ask has the focus then
+    opened.keyboard.press("Enter")
+    opened.locator(".answer").wait_for()
+    card = opened.locator(".photo.object button").first
+    for _ in range(30):
+        opened.keyboard.press("Tab")
+        if card.evaluate("one => one === document.activeElement"):
+            break
+    opened.keyboard.press("Enter")
+    opened.get_by_role("dialog").wait_for()
+    opened.keyboard.press("Escape")
+    assert card.evaluate("one => one === document.activeElement")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser, url, files, width, scheme):
+    with page(browser, url, width, color_scheme=scheme) as opened:
+        assert serious(opened) == []
+        opened.get_by_text("Options").click()
+        ask(opened, files)
+        opened.get_by_text("How this was found").click()
+        assert serious(opened) == []
+        assert opened.evaluate("document.documentElement.scrollWidth") <= width
+        opened.locator(".photo.object button").first.click()
+        opened.locator(".alike li").first.wait_for()
+        assert serious(opened) == []
+        assert opened.locator("dialog").evaluate("one => one.scrollWidth <= one.clientWidth")
