@@ -1,7 +1,7 @@
-"""How the service holds under load, in ratios of one run: `python -m tests.service_load [--full] [--only NAME ...]`.
+"""How the service holds under load, in ratios of one run: `python -m tests.service_load [--share 1] [--only NAME ...]`.
 
 Everything runs against an index of simulated objects that is made first, with the shipped checkpoint. Small by default;
---full takes what was asked for: 20 minutes of load, 100 generations, 20 ends, 1,000 hostile bodies, 1,000 kills.
+--share 1 takes what was asked for: 20 minutes of load, 100 generations, 20 ends, 1,000 hostile bodies, 1,000 kills.
 """
 
 import argparse
@@ -53,7 +53,7 @@ class Bench:
             self.show(rig, name, 2)
         self.spare = rig.object_ids(objects + 1)[-1]
         felt = next(felt for number in range(99) if (felt := rig.press(self.names[0], 500 + number)))
-        self.touch = [encoded(".png", felt[f"touch_{finger}"]) for finger in "ab"]
+        self.touch = [encoded(".jpg", felt[f"touch_{finger}"]) for finger in "ab"]  # as rigs record them
         self.body = {"touches": [[base64.b64encode(image).decode() for image in self.touch]]}
         self.rig, self.model = rig, load_checkpoint(shipped_model())
         build_index(self.catalogue, self.model, self.index, quiet=True)
@@ -86,6 +86,11 @@ def ms(seconds, share=0.5):
     return 1e3 * float(np.quantile(seconds, share))
 
 
+def of(share, asked, least):
+    """So much of what was asked for, `least` at least."""
+    return max(least, round(share * asked))
+
+
 def say(name, measured, asked=""):
     print(f"{name:12} {measured}" + (f"   [asked: {asked}]" if asked else ""), flush=True)
 
@@ -93,12 +98,12 @@ def say(name, measured, asked=""):
 # What is measured -----------------------------------------------------------------------------------------------------
 
 
-def paired(bench, full):
+def paired(bench, share):
     """HTTP against the bare query on the same open index, in turn."""
     with listening(bench.index) as (url, parts), httpx.Client(base_url=url, timeout=60) as client:
         searcher = parts.generations.current.searcher
         bare, http = [], []
-        for number in range(400 if full else 60):
+        for number in range(10 + of(share, 400, 50)):
             start = time.perf_counter()
             searcher.query([bench.touch])
             between = time.perf_counter()
@@ -135,9 +140,9 @@ async def _load(url, body, clients, seconds):
     return taken, statuses
 
 
-def clients(bench, full):
+def clients(bench, share):
     """32 clients against 8, in turn, and what the accepted ones wait."""
-    seconds, rates, waits, statuses = (30 if full else 8), {8: [], 32: []}, {8: [], 32: []}, Counter()
+    seconds, rates, waits, statuses = of(share, 30, 8), {8: [], 32: []}, {8: [], 32: []}, Counter()
     options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", QUEUE)
     with command(*options) as (_, url, _), httpx.Client(base_url=url, timeout=60) as client:
         bare = []
@@ -145,7 +150,7 @@ def clients(bench, full):
             start = time.perf_counter()
             told = client.post("/v1/query", json=bench.body).json()["timing_ms"]["total"]
             bare.append((told / 1e3, time.perf_counter() - start))
-        for _ in range(3 if full else 2):
+        for _ in range(of(share, 6, 2)):
             for count in (8, 32):
                 taken, seen = asyncio.run(_load(url, bench.body, count, seconds))
                 rates[count].append(len(taken) / seconds)
@@ -162,11 +167,11 @@ def clients(bench, full):
     )
 
 
-def memory(bench, full):
+def memory(bench, share):
     """Memory of the process over minutes of load, the history kept."""
-    seconds, found = (1200 if full else 40), []
+    seconds, found = of(share, 1200, 40), []
     with command("--index", bench.index, "--port", "0", "--history", bench.folder / "kept") as (process, url, _):
-        asyncio.run(_load(url, bench.body, 4, 10))
+        asyncio.run(_load(url, bench.body, 8, 30))  # what is made at first is made by then
         ended = time.monotonic() + seconds
         load = threading.Thread(target=lambda: asyncio.run(_load(url, bench.body, 8, seconds)))
         load.start()
@@ -179,9 +184,9 @@ def memory(bench, full):
     say("memory", f"{seconds} s: first third {first:.0f} MB, last third {last:.0f} MB: {last - first:+.1f} MB", "flat")
 
 
-def reloads(bench, full):
+def reloads(bench, share):
     """New generations under load: failed requests, and answers whose parts are of two."""
-    wanted, own = (100 if full else 5), bench.folder / "reloaded"
+    wanted, own = of(share, 100, 5), bench.folder / "reloaded"
     shutil.copytree(bench.index, own)
     objects, answers, failures, ended = {}, Counter(), [], threading.Event()
     with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as askers:
@@ -218,9 +223,9 @@ def reloads(bench, full):
     )
 
 
-def ends(bench, full):
+def ends(bench, share):
     """SIGTERM with requests in flight."""
-    rounds, lost, answered = (20 if full else 3), [], 0
+    rounds, lost, answered = of(share, 20, 3), [], 0
     for _ in range(rounds):
         options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", "32")
         with command(*options) as (process, url, _), ThreadPoolExecutor(8) as askers:
@@ -260,9 +265,9 @@ BODY_S = 0.3
 """A slow body is given up after so long here; 10 s where nothing is said."""
 
 
-def hostile(bench, full):
+def hostile(bench, share):
     """Junk, bombs, half bodies, slow bodies, wrong types, 2 GB announced."""
-    count, draw = (1000 if full else 120), random.Random(0)
+    count, draw = of(share, 1000, 100), random.Random(0)
     kinds = ("junk", "json", "bomb", "half", "slow", "type", "announced", "chunked", "form", "deep")
     taken, wrong, statuses = {kind: [] for kind in kinds}, [], Counter()
     settings = ServiceSettings(index=bench.index, port=0, body_s=BODY_S)
@@ -342,9 +347,9 @@ def _serve(settings, folder, writer):
         os._exit(0)
 
 
-def kills(bench, full):
+def kills(bench, share):
     """SIGKILL while people speak; the service is a fork, so that it starts at once."""
-    rounds, folder, draw, acknowledged = (1000 if full else 20), bench.folder / "killed", random.Random(0), []
+    rounds, folder, draw, acknowledged = of(share, 1000, 20), bench.folder / "killed", random.Random(0), []
     for _ in range(rounds):
         reader, writer = os.pipe()
         child = os.fork()
@@ -386,13 +391,13 @@ PARTS = {one.__name__: one for one in (paired, clients, memory, reloads, ends, h
 def main():
     """Run the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--full", action="store_true", help="as much as was asked for")
+    parser.add_argument("--share", type=float, default=0.02, help="of what was asked for; 1 takes hours")
     parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS), help="parts")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
         for name in asked.only:
-            PARTS[name](bench, asked.full)
+            PARTS[name](bench, asked.share)
 
 
 if __name__ == "__main__":

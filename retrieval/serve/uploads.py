@@ -211,6 +211,7 @@ async def read_json(request: Request, model: type[Body]) -> Body:
 
 
 async def _from_form(request: Request, fingers: int) -> Asked:
+    await request.body()  # whole before it is parsed: older parsers leave files open where it ends early
     async with request.form(max_files=MAX_PICTURES, max_fields=8, max_part_size=1000) as form:
         pictures: dict[str, list[bytes]] = {"gelsight": [], "background": []}
         said: dict[str, str] = {}
