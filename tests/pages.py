@@ -4,7 +4,7 @@ from html.parser import HTMLParser
 
 
 class Page(HTMLParser):
-    """Tags with their attributes, and the text outside `style`."""
+    """Tags with their attributes, and the text outside `style` and `script`."""
 
     def __init__(self, page):
         super().__init__()
@@ -16,7 +16,7 @@ class Page(HTMLParser):
         self._inside = tag
 
     def handle_data(self, data):
-        if self._inside != "style":
+        if self._inside not in ("style", "script"):
             self.text += data
 
     def all(self, tag):

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from PIL import Image
 
 from retrieval.report.canvas import FIGURE_DPI
-from retrieval.report.pages import data_uri, render
+from retrieval.report.pages import data_uri, render, script
 
 _PAGE_DPI = 96
 
@@ -109,7 +109,7 @@ def to_html(document: Document, folder: Path) -> str:
     def anchor(title: str) -> str:
         return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
-    return render("evaluation.html", document=document, uri=uri, width=width, anchor=anchor)
+    return render("evaluation.html", document=document, uri=uri, width=width, anchor=anchor, script=script("tables.js"))
 
 
 # Markdown --------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import jinja2
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from retrieval.data.images import read_rgb
@@ -23,6 +24,11 @@ def render(name: str, **values: Any) -> str:
     source = (resources.files("retrieval") / "templates" / name).read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(source).render(**values)
+
+
+def script(name: str) -> Markup:
+    """A script of the package, to stand inside a page."""
+    return Markup((resources.files("retrieval") / "templates" / name).read_text("utf-8"))
 
 
 def thumbnail(path: Path, px: int) -> Thumbnail | None:

@@ -123,7 +123,8 @@ export function askView(index) {
       result.replaceChildren(answerPanel({ index, answer, id, asked }));
       const said = verdict(answer);
       announce(`${said.above}: ${said.claim}. ${said.below}`);
-      if (result.getBoundingClientRect().top > innerHeight / 2) result.scrollIntoView();
+      const { top } = result.getBoundingClientRect();
+      if (top < 0 || top > innerHeight / 2) result.scrollIntoView();
     } catch (error) {
       if (!own.signal.aborted) result.replaceChildren(problemCard(error, ask));
     } finally {

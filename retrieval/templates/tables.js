@@ -1,0 +1,50 @@
+// Tables of a report: a click on a heading sorts, words in the field leave the rows that hold all of them.
+const number = (text) => parseFloat(text.replace(/^< /, "").replace("−", "-").replace(/,(?=\d{3})/g, ""));
+
+for (const table of document.querySelectorAll("table")) {
+  const body = table.tBodies[0];
+  const rows = [...body.rows];
+  if (rows.length < 3) continue;
+  const headings = [...table.tHead.rows[0].cells];
+  headings.forEach((heading, column) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.append(...heading.childNodes);
+    button.addEventListener("click", () => sort(column));
+    heading.append(button);
+  });
+
+  // Down, up, and as it was.
+  function sort(column) {
+    const heading = headings[column];
+    const next = { none: "descending", descending: "ascending", ascending: "none" }[heading.ariaSort ?? "none"];
+    headings.forEach((other) => other.removeAttribute("aria-sort"));
+    if (next !== "none") heading.ariaSort = next;
+    const turn = next === "ascending" ? 1 : -1;
+    const cell = (row) => row.cells[column];
+    body.append(...(next === "none" ? rows : [...rows].sort((one, other) => order(cell(one), cell(other), turn))));
+  }
+
+  // Numbers by size, words by letter; what is empty comes last either way.
+  function order(one, other, turn) {
+    const [a, b] = [one, other].map((cell) => cell.textContent.trim());
+    const [x, y] = [number(a), number(b)];
+    if (one.className === "words" || (isNaN(x) && isNaN(y))) return turn * a.localeCompare(b, "en", { numeric: true });
+    if (isNaN(x) || isNaN(y)) return isNaN(x) - isNaN(y);
+    return turn * (x - y);
+  }
+
+  if (rows.length < 6) continue;
+  const field = document.createElement("input");
+  field.type = "search";
+  field.placeholder = `Filter ${rows.length} rows`;
+  field.setAttribute("aria-label", "Filter the rows of this table");
+  field.addEventListener("input", () => {
+    const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
+    for (const row of rows) {
+      const text = row.textContent.toLowerCase();
+      row.hidden = !words.every((word) => text.includes(word));
+    }
+  });
+  table.parentElement.before(field);
+}
