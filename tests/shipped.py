@@ -67,7 +67,7 @@ def main(argv: list[str] | None = None) -> int:
     make.add_argument("--photos", type=int, default=10_000, help="objects that are only photographed")
     make.add_argument("--touches", type=int, default=6_641, help="objects that are only pressed")
     make.add_argument("--steps", type=int, default=2500, help="of teaching each tower relief")
-    make.add_argument("--iterations", type=int, default=2000, help="of training the head")
+    make.add_argument("--iterations", type=int, default=1500, help="of training the head")
     pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
     pruner.add_argument("folder", type=Path)
     pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)

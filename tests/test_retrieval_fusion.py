@@ -10,7 +10,7 @@ from torch.nn import functional
 from retrieval.errors import BadInput, NumericalError
 from retrieval.model import judge
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion import FusionHead, Matcher, score_halves
+from retrieval.model.fusion import FusionHead, Matcher, Standardise, score_halves
 from retrieval.model.towers import TOWERS
 
 
@@ -58,6 +58,28 @@ def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_travels_in_the_halve
         matcher.cosine_scale.fill_(-1.0)  # a match is never what lies apart
         touch, photo = matcher.touch_code(torch.rand(3, 512)), matcher.photo_code(torch.rand(3, 256))
         assert not touch.half[:, 64:].any()
+
+
+def test_a_feature_that_hardly_varies_is_not_scaled_up_where_plain_scaling_follows_its_rounding():
+    torch.manual_seed(0)
+    features = torch.stack([torch.randn(400), 100 + 0.01 * torch.randn(400)], dim=1)
+    ours, plain = Standardise(2), torch.nn.BatchNorm1d(2, affine=False)
+    for norm in (ours, plain):
+        for _ in range(200):
+            norm(features)
+        norm.eval()
+    rounded = features + torch.tensor([0.0, 0.1])  # a thousandth of the mean, as float16 weights give
+    moved = {norm: float((norm(rounded) - norm(features)).abs().max()) for norm in (ours, plain)}
+    assert moved[ours] < 0.06
+    assert moved[plain] > 5
+    torch.testing.assert_close(ours(features)[:, 0], plain(features)[:, 0], rtol=0, atol=0)
+
+
+def test_quiet_features_are_left_quiet_in_training_too():
+    features = torch.stack([torch.randn(64), 100 + 0.01 * torch.randn(64)], dim=1)
+    scaled = Standardise(2)(features).std(0)
+    assert 0.9 < scaled[0] < 1.1
+    assert scaled[1] < 0.01
 
 
 def test_the_paper_configuration_has_the_papers_layers():

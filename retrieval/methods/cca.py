@@ -26,7 +26,7 @@ Matrix = NDArray[np.float64]
 
 RANK_CUT = 1e-7
 """Directions thinner than this share of the widest are the rounding of float32 features."""
-MOST_ROWS, LEADING = 4096, 512
+MOST_ROWS, LEADING = 2048, 512
 """From so many items on only so many directions are kept: all of them take minutes, and a ridge silences the others."""
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
 COMPONENTS = (8, 16, 32, 64, 128, 256)

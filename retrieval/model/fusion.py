@@ -7,7 +7,6 @@ scale, so that halves are still all that is stored of a photo.
 """
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +34,32 @@ class Code(NamedTuple):
 
     half: Tensor
     embedding: Tensor
+
+
+QUIET = 0.02
+"""A feature that varies by less than this share of its mean is not scaled up to vary by 1."""
+
+
+class Standardise(nn.BatchNorm1d):
+    """Each feature centred and scaled by its statistics over the training batches; without parameters.
+
+    A channel that hardly varies around a large mean would be scaled up until the rounding of its weights to float16,
+    a thousandth of the mean, is as large as what it says: quiet features stay quiet.
+    """
+
+    def __init__(self, features: int) -> None:
+        super().__init__(features, affine=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, F) of features (B, F)."""
+        scaled: Tensor = super().forward(features)
+        mean, variance = self.running_mean, self.running_var
+        if self.training:
+            variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
+        assert mean is not None
+        assert variance is not None
+        least = (QUIET * mean).square()
+        return scaled * ((variance + self.eps) / torch.maximum(variance + self.eps, least)).sqrt()
 
 
 class FusionHead(nn.Module):
@@ -81,8 +106,8 @@ class Matcher(nn.Module):
         # After the head, so that their initial weights do not change the paper's.
         self.touch_projection = nn.Linear(touch_features, config.embedding_dim)
         self.photo_projection = nn.Linear(photo_features, config.embedding_dim)
-        # Per feature and without parameters; at use a fixed affine map, so halves stay sums of shares.
-        norm = partial(nn.BatchNorm1d, affine=False) if config.standardise else nn.Identity
+        # At use a fixed affine map, so halves stay sums of shares.
+        norm = Standardise if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
