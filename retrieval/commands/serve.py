@@ -111,6 +111,6 @@ def _token(file: Path | None) -> str | None:
 
 def _bench(rig: str | None, index: Path) -> "Bench | None":
     """What the rig gives the service; without --rig, the simulated one where the index shows its objects."""
-    from retrieval.commands.bench import of_index, of_rig
+    from retrieval.serve.rig import of_index, of_rig
 
     return of_rig(rig, index) if rig else of_index(index)
