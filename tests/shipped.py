@@ -49,6 +49,8 @@ VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
 VERDICT_GRASPS = 4
 """Of each object on which the posterior and the gel check are fitted."""
+FOREIGN = 2800
+"""Pictures that are no gels, from which its check of touches learns: more than a training's own."""
 DISTIL_STEPS = 1500
 """Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
 FITTED = 10
@@ -160,7 +162,7 @@ def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkp
     device = default_device()
     with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
         parts = (made.split.select(grasps, part) for part in ("train", "validation"))
-        return with_verdicts(made, source, *parts)
+        return with_verdicts(made, source, *parts, foreign=FOREIGN)
 
 
 def distil_shipped(arguments: argparse.Namespace) -> int:

@@ -21,7 +21,7 @@ from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
-from retrieval.model.fusion import KINDS, GelHead, Matcher, judge_of
+from retrieval.model.fusion import KINDS, QUIET, GelHead, Matcher, judge_of
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
 from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 from retrieval.training.batches import FeatureSource, recorded_features
@@ -40,7 +40,7 @@ MARGIN = 1.0
 FAINT = 0.02
 """Share of validation touches that may be called untouched: those that hardly press the gel say hardly anything."""
 PENALTY = 0.02
-"""Of the squared weights of the check's linear layer, for features of unit variance."""
+"""Of the squared weights of the check's linear layer, for features of unit variance; less for more pictures."""
 _PIECES = 100
 
 Stopped = Callable[[], bool]
@@ -53,13 +53,14 @@ def with_verdicts(
     train: Sequence[Grasp],
     validation: Sequence[Grasp],
     *,
+    foreign: int = FOREIGN,
     quiet: bool = False,
     stopped: Stopped = lambda: False,
 ) -> Checkpoint:
     """The checkpoint with a posterior and a check of touches, as far as validation grasps can teach them.
 
     A posterior needs three validation objects and another photo of a touch's object, a check of touches needs
-    `FEWEST_GRASPS` validation grasps. The matcher of `made` is taken
+    `FEWEST_GRASPS` validation grasps. foreign: pictures to learn from that are no gels. The matcher of `made` is taken
     over. Raises Interrupted.
     """
     seed, matcher = made.config.training.seed, made.matcher
@@ -73,9 +74,9 @@ def with_verdicts(
         return made
     others, _ = recorded_features(matcher, source, learned, what="check of touches", quiet=quiet, stopped=stopped)
     preprocessing = made.config.preprocessing
-    fitting = Pictures.of(matcher, preprocessing, learned, others, FOREIGN, seed)
-    test = Pictures.of(matcher, preprocessing, judged, touches, FOREIGN // 2, seed + 1)
-    matcher.gel_head = fit_gel_head(fitting)
+    fitting = Pictures.of(matcher, preprocessing, learned, others, foreign, seed)
+    test = Pictures.of(matcher, preprocessing, judged, touches, foreign // 2, seed + 1)
+    matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN / foreign)
     check = fit_gel_check(matcher.gel_head, test, contact_levels(judged))
     return dataclasses.replace(made, gel_check=check)
 
@@ -165,7 +166,7 @@ def _pairs_of_frames(grasps: Iterable[Grasp]) -> Iterator[tuple[tuple[Path, ...]
             yield first.backgrounds, second.backgrounds
 
 
-def fit_gel_head(fitting: Pictures) -> GelHead:
+def fit_gel_head(fitting: Pictures, penalty: float = PENALTY) -> GelHead:
     """Softmax regression on standardised features, kinds alike whatever their numbers, with a penalty on the weights.
 
     Without untouched gels, that kind is never read.
@@ -176,6 +177,7 @@ def fit_gel_head(fitting: Pictures) -> GelHead:
     kinds.append(fitting.foreign.double().numpy())
     x, which = np.concatenate(kinds), np.repeat(np.arange(len(KINDS)), [len(part) for part in kinds])
     centre, spread = x.mean(0), x.std(0)
+    spread = np.maximum(spread, QUIET * np.abs(centre))  # as features are standardised for the matcher
     spread = np.where(spread > 1e-6, spread, 1.0)
     x = (x - centre) / spread
     present = np.array([len(part) > 0 for part in kinds])
@@ -187,8 +189,8 @@ def fit_gel_head(fitting: Pictures) -> GelHead:
         logits = x @ matrix[:-1] + matrix[-1] + absent
         logs = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         slack = weights[:, None] * (np.exp(logs) - targets)
-        value = -float(weights @ (logs * targets).sum(1)) + PENALTY / 2 * float((matrix[:-1] ** 2).sum())
-        return value, np.vstack([x.T @ slack + PENALTY * matrix[:-1], slack.sum(0)]).ravel()
+        value = -float(weights @ (logs * targets).sum(1)) + penalty / 2 * float((matrix[:-1] ** 2).sum())
+        return value, np.vstack([x.T @ slack + penalty * matrix[:-1], slack.sum(0)]).ravel()
 
     found = minimize(loss, np.zeros((x.shape[1] + 1) * len(KINDS)), jac=True, method="L-BFGS-B")
     matrix = found.x.reshape(-1, len(KINDS))
