@@ -21,7 +21,7 @@ def crowd():
     checkpoint = Checkpoint.__new__(Checkpoint)
     object.__setattr__(checkpoint, "matcher", matcher)
     rng = np.random.default_rng(0)
-    photos, touches = (rng.normal(size=(n, config.matcher.hidden)).astype(np.float32) for n in (50, 12))
+    photos, touches = (rng.normal(size=(n, config.matcher.half)).astype(np.float32) for n in (50, 12))
     return scale.Crowd(checkpoint, judge_of(matcher.head), photos, touches)
 
 

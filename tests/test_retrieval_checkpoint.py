@@ -141,7 +141,7 @@ def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
 
 
 def test_what_is_held_is_stored_as_it_was_read(tmp_path):
-    queries = np.ones((2, TINY.matcher.hidden), np.float16)
+    queries = np.ones((2, TINY.matcher.half), np.float16)
     save(tmp_path / "a.safetensors", gel_check=GEL_CHECK, queries=queries)
     store_checkpoint(load_checkpoint(tmp_path / "a.safetensors"), tmp_path / "b.safetensors")
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()

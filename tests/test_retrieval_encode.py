@@ -72,8 +72,9 @@ def test_the_shipped_model_gives_the_halves_and_embeddings_of_its_plain_towers()
     matcher = load_checkpoint(shipped_model()).matcher
     photos = smooth_pictures()
     plain, ours = matcher.photo_entry(matcher.photo_features(to_batch(photos))), encode_photos(matcher, photos)
-    assert float((ours.half - plain.half).abs().max() / plain.half.abs().max()) <= 1e-5
-    assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-5
+    # Quiet features are scaled up fifty times, and with them what single precision rounds off their large means.
+    assert float((ours.half - plain.half).abs().max() / plain.half.abs().max()) <= 1e-4
+    assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-4
 
 
 def smooth_pictures():

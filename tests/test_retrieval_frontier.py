@@ -176,7 +176,7 @@ def pruning_sample(sample):
     matcher = load_checkpoint(sample.model).matcher
     torch.manual_seed(0)
     config = dataclasses.replace(sample.checkpoint.config, matcher=dataclasses.replace(matcher.config, pruner_width=8))
-    matcher.pruner = Pruner(matcher.config.hidden, 8, matcher.config.embedding_dim).eval()
+    matcher.pruner = Pruner(matcher.config.half, 8, matcher.config.embedding_dim).eval()
     other = dataclasses.replace(sample)
     other.__dict__["checkpoint"] = dataclasses.replace(sample.checkpoint, matcher=matcher, config=config)
     return other

@@ -34,7 +34,7 @@ def checkpoint_of(pruner_width=8, queries=TOUCHES):
     """A matcher with random weights whose queries are random halves."""
     torch.manual_seed(0)
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=pruner_width))
-    halves = np.random.default_rng(1).normal(size=(queries, config.matcher.hidden)).astype(np.float16)
+    halves = np.random.default_rng(1).normal(size=(queries, config.matcher.half)).astype(np.float16)
     matcher = Matcher(config.matcher).eval()
     return Checkpoint(Path("m"), "0" * 64, config, {}, gel_check=None, matcher=matcher, split=None, queries=halves)
 
@@ -48,7 +48,7 @@ def checkpoint():
 def gallery(checkpoint):
     """Distinct vectors, each photo's place among them, and halves; the last ten photos are copies of the first ten, and
     the first vector is nobody's."""
-    halves = np.random.default_rng(2).normal(size=(PHOTOS, checkpoint.config.matcher.hidden)).astype(np.float16)
+    halves = np.random.default_rng(2).normal(size=(PHOTOS, checkpoint.config.matcher.half)).astype(np.float16)
     halves[-10:] = halves[:10]
     with torch.inference_mode():
         embeddings = checkpoint.matcher.pruner.photo(torch.from_numpy(halves.astype(np.float32))).numpy()

@@ -155,7 +155,7 @@ def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, 
     made = load_checkpoint(trainer.out)
     assert made.config == PRUNED
     assert made.matcher.pruner is not None
-    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.hidden)
+    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.half)
     assert not state_path(trainer.out).exists()
 
 

@@ -114,7 +114,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
 def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
     """An index of made-up photos, three of each object: random halves and unit embeddings."""
     rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
-    halves = rng.normal(size=(photos, matcher.hidden)).astype(np.float16)
+    halves = rng.normal(size=(photos, matcher.half)).astype(np.float16)
     embeddings = rng.normal(size=(photos, matcher.embedding_dim)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     names = [f"object-{number // 3:06d}/{number % 3}.jpg" for number in range(photos)]
