@@ -152,9 +152,7 @@ def test_a_binary_file_cut_off_is_not_blamed_on_a_missing_package(tmp_path):
     found."""
     path = tmp_path / "cut.stl"
     path.write_bytes(bytes([0xFF, 0xFE, 0x9D]) * 100)
-    with pytest.raises(
-        SceneError, match="must be a mesh in STL, and cannot be read as one|must hold triangles, and holds none"
-    ) as caught:
+    with pytest.raises(SceneError, match=r"must (be a mesh in STL|hold triangles), and") as caught:
         load_mesh_object(path, 0)
     assert "No module" not in str(caught.value)
 
