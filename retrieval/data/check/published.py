@@ -31,7 +31,7 @@ _Item = TypeVar("_Item")
 
 
 def dead(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
-    """Pictures of one colour alone, and touches that are their untouched gel byte for byte."""
+    """Pictures of one colour alone."""
     kinds: dict[str, Callable[[Grasp], bool]] = {
         "the photo": lambda one: seen[one.photo].flat,
         "a touch": lambda one: any(seen[path].flat for path in one.touches),
@@ -40,8 +40,12 @@ def dead(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     for what, is_dead in kinds.items():
         names = [grasp.grasp_id for grasp in grasps if is_dead(grasp)]
         yield from named("error", "dead-frame", f"{what} is of one colour alone, a dead frame,", names, grasps)
-    frozen = [grasp.grasp_id for grasp in grasps if _digests(seen, grasp.touches) & _digests(seen, grasp.backgrounds)]
-    yield from named("error", "frozen-frame", "touch and untouched gel are the same image", frozen, grasps)
+
+
+def frozen(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+    """Touches that are their untouched gel byte for byte; that of a grasp that missed may well be."""
+    names = [grasp.grasp_id for grasp in grasps if _digests(seen, grasp.touches) & _digests(seen, grasp.backgrounds)]
+    yield from named("error", "frozen-frame", "touch and untouched gel are the same image", names, grasps)
 
 
 def repeated(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:

@@ -56,7 +56,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     trained_on = {grasp.grasp_id for grasp in accepted}
     of_all: tuple[_Check, ...] = (_same_images, published.dead, doubts.swapped, doubts.fingers, doubts.moments)
     of_accepted: tuple[_Check, ...] = (
-        *(published.one_background, published.repeated),
+        *(published.frozen, published.one_background, published.repeated),
         *(doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies),
     )
     for check in of_all + of_accepted:
