@@ -284,6 +284,17 @@ def test_a_fork_waits_for_the_query_under_way(searcher, touch, monkeypatch):
         assert answer.result().results
 
 
+def test_touches_are_encoded_with_the_threads_asked_for_whichever_thread_asks(index, touch):
+    before = torch.get_num_threads()
+    try:
+        with Searcher.open(index, threads=2) as opened, ThreadPoolExecutor(1) as threads:
+            torch.set_num_threads(3)
+            assert threads.submit(lambda: (opened.query(touch), torch.get_num_threads())[1]).result() == 2
+            assert (opened.query(touch).results != [], torch.get_num_threads()) == (True, 2)
+    finally:
+        torch.set_num_threads(before)
+
+
 @forking
 def test_a_fork_of_a_process_that_computed_on_several_threads_computes_on_one(searcher):
     before = torch.get_num_threads()

@@ -12,12 +12,14 @@ from contextlib import contextmanager
 
 import httpx
 import pytest
+from threadpoolctl import threadpool_info
 
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
 from retrieval.serve.service import Bench
+from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
-from tests.serving import command, listening, problem
+from tests.serving import command, listening, problem, service
 from tests.waiting import until
 
 
@@ -106,6 +108,15 @@ def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_non
         assert value(url, "retrieve_batch_queries_count") == 2
         other = [askers.submit(asked, url, body, top=top) for top in (2, 3)]
         assert [len(one.result().json()["results"]) for one in other] == [2, 3]
+
+
+def test_a_core_is_left_to_the_event_loop_and_blas_has_no_threads_that_spin(index, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 9)
+    assert [ServiceSettings(index=index, workers=workers).threads for workers in (1, 2, 9)] == [8, 4, 1]
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    with service(index):
+        own = [one for one in threadpool_info() if one.get("threading_layer") == "pthreads"]
+    assert {one["num_threads"] for one in own} == {1}
 
 
 # Generations ---------------------------------------------------------------------------------------------------------

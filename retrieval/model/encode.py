@@ -150,16 +150,21 @@ def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) ->
 
 
 class TorchEncoder:
-    """The touch encoder of one query after another: `encode_touches` of a model that does not change."""
+    """The touch encoder of one query after another: `encode_touches` of a model that does not change.
+
+    threads: with which PyTorch computes from then on, here and in whatever else the process does; None leaves it.
+    """
 
     name = "torch"
 
-    def __init__(self, matcher: Matcher) -> None:
-        self._fast = for_inference(matcher, ["touch_tower"])
+    def __init__(self, matcher: Matcher, threads: int | None = None) -> None:
+        self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 
     @torch.inference_mode()
     def encode(self, touches: Sequence[Sequence[Image]]) -> TouchCodes:
         """Of touches, each its fingers' images."""
+        if self._threads is not None:
+            torch.set_num_threads(self._threads)  # which holds for the calling thread
         features = self._fast.touch_features(touch_batch(touches))
         code, readings = self._fast.touch_entry(features), self._fast.gel_readings(features)
         return TouchCodes(code.half.numpy(), code.embedding.numpy(), None if readings is None else readings.numpy())

@@ -97,7 +97,7 @@ def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
     return session
 
 
-def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:
+def exported_beside(checkpoint: Stored, threads: int | None = None) -> OnnxEncoder | None:
     """The export that lies beside a checkpoint, where it is of this checkpoint and ONNX Runtime is installed.
 
     One that is stale or damaged is not used, and a warning says so.
@@ -106,7 +106,7 @@ def exported_beside(checkpoint: Stored) -> OnnxEncoder | None:
     if not path.is_file() or find_spec("onnxruntime") is None:
         return None
     try:
-        return OnnxEncoder(path, checkpoint.digest)
+        return OnnxEncoder(path, checkpoint.digest, threads)
     except CheckpointError as error:
         log.warning("%s; PyTorch is used instead (slower to start): run `retrieve export` again", error)
         return None

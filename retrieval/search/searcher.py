@@ -73,10 +73,14 @@ class Searcher:
         self._closed = False
 
     @classmethod
-    def open(cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True) -> "Searcher":
+    def open(
+        cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True, threads: int | None = None
+    ) -> "Searcher":
         """Open the current generation of an index with the checkpoint that built it.
 
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
+        threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
+        the choice to the library.
         Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) where there is one, and
         PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`, CheckpointError, and
         MismatchedIndex for another model.
@@ -97,7 +101,7 @@ class Searcher:
             load_checkpoint(stored.path)  # a damaged one says so
         generation.require(fingerprint(stored))
         require_usable(generation, stored.config.matcher.half)
-        encoder = exported_beside(stored) or torch_encoder(stored)
+        encoder = exported_beside(stored, threads) or torch_encoder(stored, threads)
         return cls(Path(index), generation, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
@@ -374,9 +378,9 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
     return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
 
 
-def torch_encoder(stored: Stored) -> Encoder:
+def torch_encoder(stored: Stored, threads: int | None = None) -> Encoder:
     """The towers in PyTorch, whose import takes longer than all the rest."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder
 
-    return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher)
+    return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher, threads)

@@ -10,6 +10,7 @@ import anyio.to_thread
 from fastapi import FastAPI
 from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from threadpoolctl import threadpool_limits
 
 from retrieval.serve import bench, catalogue, errors, health, history, human, page_files, queries
 from retrieval.serve.generations import Generations
@@ -93,10 +94,12 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     if not parts.generations.ready:
         await asyncio.to_thread(parts.generations.open)
-    work = [*parts.queue.workers(), parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
+    parts.queue.start()
+    work = [parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
     running = [asyncio.ensure_future(one) for one in work]
     try:
-        yield
+        with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
+            yield
     finally:
         parts.stopping.set()
         if parts.keeping:
@@ -104,7 +107,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
-        parts.queue.close()
+        await asyncio.to_thread(parts.queue.close)
         if parts.keeping:
             parts.keeping.close()
 

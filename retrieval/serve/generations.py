@@ -79,7 +79,7 @@ class Generations:
     def open(self) -> None:
         """Open the newest generation. Raises the errors of `Searcher.open`."""
         said = self._settings
-        opened = Opened(Searcher.open(said.index, model=said.model, verify=said.verify))
+        opened = Opened(Searcher.open(said.index, model=said.model, verify=said.verify, threads=said.threads))
         self._current = opened
         self._metrics.serves(opened.name)
         gc.collect()  # what the one before held in circles

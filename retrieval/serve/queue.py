@@ -7,14 +7,14 @@ together and ask alike are encoded together.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from threading import Condition, Thread
 from typing import Any, NamedTuple, TypeVar
 
 from starlette.requests import Request
 
-from retrieval.errors import RetrievalError
 from retrieval.search.answer import QueryResult
 from retrieval.serve.errors import Problem
 from retrieval.serve.generations import Generations, Opened
@@ -44,22 +44,30 @@ class _Job:
 
 
 class Queue:
-    """Requests that wait for the model, in the order in which they came."""
+    """Requests that wait for the model, in the order in which they came. The threads that work on them take one after
+    the other themselves: none waits for the event loop in between."""
 
     def __init__(self, generations: Generations, settings: ServiceSettings, metrics: Metrics) -> None:
         self._generations, self._settings, self._metrics = generations, settings, metrics
-        self._jobs: asyncio.Queue[_Job] = asyncio.Queue()
-        self._threads = ThreadPoolExecutor(settings.workers, "query")
+        self._jobs: deque[_Job] = deque()
+        self._changed, self._closed = Condition(), False
+        self._threads: list[Thread] = []
         self._held = 0
-        self._next: _Job | None = None  # did not fit to those before it
 
-    def workers(self) -> list[Coroutine[Any, Any, None]]:
-        """What must run for anything to be answered."""
-        return [self._work() for _ in range(self._settings.workers)]
+    def start(self) -> None:
+        """Begin to answer, for the event loop that calls."""
+        loop = asyncio.get_running_loop()
+        self._threads = [Thread(target=self._work, args=(loop,)) for _ in range(self._settings.workers)]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
-        """Let go of the threads."""
-        self._threads.shutdown()
+        """Answer what waits, and end."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
 
     @property
     def held(self) -> int:
@@ -102,7 +110,10 @@ class Queue:
         self._held += 1
         self._metrics.held.set(self._held)
         answer.add_done_callback(self._let_go)
-        self._jobs.put_nowait(_Job(work, asked, answer, now, now + seconds))
+        job = _Job(work, asked, answer, now, now + seconds)
+        with self._changed:
+            self._jobs.append(job)
+            self._changed.notify_all()
         gone: asyncio.Future[None] = asyncio.ensure_future(_gone(request))
         either: set[asyncio.Future[Any]] = {answer, gone}
         try:
@@ -115,6 +126,9 @@ class Queue:
         finally:
             gone.cancel()
             answer.cancel()
+            with self._changed:
+                if job in self._jobs:
+                    self._jobs.remove(job)
 
     def _let_go(self, answer: asyncio.Future[Any]) -> None:
         self._held -= 1
@@ -122,50 +136,44 @@ class Queue:
         if not answer.cancelled():
             answer.exception()  # which nobody may be there to ask for
 
-    async def _work(self) -> None:
-        while True:
-            jobs = [job for job in await self._together() if not job.answer.done()]
-            if not jobs:
-                continue
+    def _work(self, loop: asyncio.AbstractEventLoop) -> None:
+        while jobs := self._together():
             opened, now = self._generations.current, time.monotonic()
             for job in jobs:
                 self._metrics.waiting.observe(now - job.began)
             self._metrics.batches.observe(len(jobs))
-            loop = asyncio.get_running_loop()
-            try:
-                answers = await loop.run_in_executor(self._threads, _answers, opened, jobs)
-            except Exception as error:  # a bug, which ends no worker
-                answers = [error] * len(jobs)
-            for job, answer in zip(jobs, answers, strict=True):
-                if job.answer.done():
-                    continue
-                if isinstance(answer, Exception):
-                    job.answer.set_exception(answer)
-                else:
-                    job.answer.set_result(answer)
+            loop.call_soon_threadsafe(_tell, jobs, _answers(opened, jobs))
 
-    async def _together(self) -> list[_Job]:
-        """The next job, and what comes within the window that can be answered with it."""
-        first, self._next = self._next or await self._jobs.get(), None
-        jobs, until = [first], time.monotonic() + self._settings.batch_ms / 1e3
-        if not self._settings.batch_ms or first.asked is None:
+    def _together(self) -> list[_Job]:
+        """The next job, and those that come within the window and can be answered with it; none at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._jobs or self._closed)
+            if not self._jobs:
+                return []
+            jobs, until = [first := self._jobs.popleft()], time.monotonic() + self._settings.batch_ms / 1e3
+            while first.asked and len(jobs) < self._settings.batch_most and (left := until - time.monotonic()) > 0:
+                if not self._changed.wait_for(lambda: self._jobs, left):
+                    break
+                if not (asked := self._jobs[0].asked) or asked.keywords != first.asked.keywords:
+                    break
+                jobs.append(self._jobs.popleft())
             return jobs
-        while len(jobs) < self._settings.batch_most and (left := until - time.monotonic()) > 0:
-            try:
-                job = await asyncio.wait_for(self._jobs.get(), left)
-            except TimeoutError:
-                break
-            if self._next or job.asked is None or job.asked.keywords != first.asked.keywords:
-                self._next = job
-                break
-            jobs.append(job)
-        return jobs
 
 
 async def _gone(request: Request) -> None:
     """Ends when the connection does; the body has been read."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
+
+
+def _tell(jobs: list[_Job], answers: list[Any]) -> None:
+    for job, answer in zip(jobs, answers, strict=True):
+        if job.answer.done():
+            continue
+        if isinstance(answer, Exception):
+            job.answer.set_exception(answer)
+        else:
+            job.answer.set_result(answer)
 
 
 def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
@@ -179,7 +187,7 @@ def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
     try:
         found = opened.searcher.query_many([one.touches for one in asked], **asked[0].keywords)
-    except RetrievalError:
+    except Exception:  # each alone says which of them it was
         return None
     return [Answered(result, opened.model) for result in found]
 

@@ -56,7 +56,7 @@ class Service:
     stopping: Event = field(default_factory=Event)
 
 
-def _service(request: Request) -> Service:
+async def _service(request: Request) -> Service:  # what is no coroutine function is called in a thread
     found: Service = request.app.state.service
     return found
 

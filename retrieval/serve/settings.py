@@ -1,6 +1,7 @@
 """What an operator may choose of the service."""
 
 import ipaddress
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +64,12 @@ class ServiceSettings:
             )
         if self.token is not None and not (len(self.token) >= LEAST_TOKEN and self.token.isascii()):
             raise ConfigError(f"a token must be {LEAST_TOKEN} or more ASCII characters; got {len(self.token)}")
+
+    @property
+    def threads(self) -> int:
+        """With which one request is worked on. A core is left to the event loop, which else answers late; and threads
+        of one computation wait for each other, so that a taken core holds up all of them."""
+        return max(1, ((os.cpu_count() or 1) - 1) // self.workers)
 
     @property
     def is_local(self) -> bool:

@@ -26,6 +26,8 @@ from retrieval.serve.settings import MAX_BODY_BYTES, MAX_BODY_PIXELS, MAX_PICTUR
 
 HELD_BYTES = 4 * MAX_BODY_BYTES
 """Of all bodies that are on their way at once."""
+PARSED_AT_ONCE_BYTES = 1 << 18
+"""Sooner than a thread begins."""
 Body = TypeVar("Body", bound=BaseModel)
 MOST_GRASPS, MOST_OBJECTS = 32, 32
 _CLOSE = {"connection": "close"}  # what is left of the body is not read
@@ -197,12 +199,14 @@ async def read_query(request: Request, fingers: int) -> Asked:
 
 
 async def read_json(request: Request, model: type[Body]) -> Body:
-    """The JSON body of a request, read within its limits and parsed off the event loop. Raises Problem."""
+    """The JSON body of a request, read within its limits; a large one is parsed off the event loop. Raises Problem."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise Problem("unsupported-type", f"the body must be application/json; got {kind[:100] or 'no content-type'}")
     data = await request.body()
     try:
+        if len(data) <= PARSED_AT_ONCE_BYTES:
+            return model.model_validate_json(data)
         return await run_in_threadpool(model.model_validate_json, data)
     except ValidationError as error:
         wrong = error.errors(include_input=False, include_url=False, include_context=False)
