@@ -5,15 +5,20 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
 
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a NaN or infinite value where a number must be
+    +-- TooManyBad             more photos cannot be read than the user allows
+    +-- Unanswered             shards did not answer, and more of the catalogue was asked for
     +-- Interrupted            the user stopped the job; what was made is kept
     +-- BadInput               wrong use or bad input (exit code 2)
         +-- ImageError         a file is not a readable image
         +-- DatasetError       a recording or catalogue is not usable
+        |   +-- NoPhoto        none of a catalogue's photos can be read
         +-- CheckpointError    a checkpoint is missing, damaged or of another kind
         +-- ConfigError        a setting is unknown or out of range
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 class RetrievalError(Exception):
@@ -31,6 +36,14 @@ class RetrievalError(Exception):
 
 class NumericalError(RetrievalError):
     """A NaN or infinite value stands where a number must be."""
+
+
+class TooManyBad(RetrievalError):
+    """More of a catalogue's photos cannot be read than the user allows; the index stays as it was."""
+
+
+class Unanswered(RetrievalError):
+    """Shards of a cluster did not answer, and less of the catalogue was searched than the user asked for."""
 
 
 class Interrupted(RetrievalError):
@@ -59,6 +72,17 @@ class ImageError(BadInput):
 
 class DatasetError(BadInput):
     """A recording or a catalogue is not usable."""
+
+
+class NoPhoto(DatasetError):
+    """None of a catalogue's photos can be read. `skipped` says of each why."""
+
+    def __init__(self, message: str, skipped: Sequence[Any] = ()) -> None:
+        super().__init__(message)
+        self.skipped = list(skipped)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.skipped)
 
 
 class CheckpointError(BadInput):

@@ -9,7 +9,7 @@ import pytest
 
 from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
 from indexes.store.folder import IndexStore
-from indexes.store.manifest import _own_digest
+from indexes.store.manifest import own_digest
 from tests.test_indexes_store import FINGERPRINT, filled, unit
 
 TABLES = ["rows.jsonl", "table.npy", "embeddings.npy", "halves.npy"]
@@ -40,7 +40,7 @@ def rewrite_manifest(folder, **changes) -> None:
     path = folder / "manifest.json"
     content = json.loads(path.read_text()) | changes
     content.pop("sha256")
-    path.write_text(json.dumps(content | {"sha256": _own_digest(content)}))
+    path.write_text(json.dumps(content | {"sha256": own_digest(content)}))
 
 
 def flip(path, position: int, bit: int = 0) -> None:
@@ -70,7 +70,7 @@ def test_a_current_file_of_garbage_is_corrupt(folder, text):
 
 def test_a_current_file_that_names_a_missing_generation_is_corrupt(folder):
     (folder.parent / "CURRENT").write_text("gen-000009\n")
-    with pytest.raises(CorruptIndex, match="CURRENT names gen-000009, which is missing"):
+    with pytest.raises(CorruptIndex, match="the generation gen-000009 is missing"):
         reopened(folder)
 
 

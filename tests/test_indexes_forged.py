@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from indexes.errors import CorruptIndex, IndexesError, LockedIndex, NoIndex, RowError, WriteFailed
 from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
-from indexes.store.manifest import _own_digest
+from indexes.store.manifest import own_digest
 from indexes.store.regular import DEEPEST, read_regular
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
 
@@ -43,7 +43,7 @@ def forge(folder, change=lambda content: None):
     for name, must in content["files"].items():
         must |= {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)}
     change(content)
-    path.write_text(json.dumps(content | {"sha256": _own_digest(content)}))
+    path.write_text(json.dumps(content | {"sha256": own_digest(content)}))
 
 
 def forge_array(folder, name, change):

@@ -287,7 +287,7 @@ def test_the_candidates_are_the_nearest_photos_of_each_grasp(
 ):
     """Plain loops: the best inner products of each grasp, the full network on their union, and on the other photos of
     the objects that come first by these."""
-    monkeypatch.setattr("retrieval.search.searcher.COMPLETED", completed)
+    monkeypatch.setattr("retrieval.search.shard.COMPLETED", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, near = checkpoint.config.preprocessing.load_touch, set()
     for grasp in grasps:
@@ -346,7 +346,7 @@ def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, to
     """float64 shares of logits that lie 745 behind all equal 0: ranked by probability, they would be one tie."""
     head, halves = searcher.judge, searcher.encode(touch).halves
     larger = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
-    monkeypatch.setattr(searcher, "judge", larger)
+    monkeypatch.setattr(searcher.shard, "judge", larger)
     monkeypatch.setattr(searcher, "posterior", Posterior(slope=100.0))
     result = searcher.query([touch])
     assert [match.probability for match in result.results[-2:]] == [0.0, 0.0]

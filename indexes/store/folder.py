@@ -61,15 +61,24 @@ class IndexStore:
         self._lock = WriterLock(self.path / "LOCK")
 
     def open(
-        self, *, verify: bool = True, expect: Mapping[str, str] | None = None, threads: int | None = None
+        self,
+        *,
+        name: str | None = None,
+        verify: bool = True,
+        expect: Mapping[str, str] | None = None,
+        threads: int | None = None,
     ) -> Generation:
-        """The current generation, checked whole.
+        """The current generation, or the one of that `name`, checked whole.
 
         `verify` False leaves out the SHA-256 of the files (sizes are still checked). `expect` names values
         that the fingerprint must have. `threads` is the number used by searches.
 
         Raises `NoIndex`, `CorruptIndex`, `UnsupportedFormat`, or `MismatchedIndex` (see `indexes.errors`).
         """
+        if name is not None:
+            generation = self._read(name, verify, threads)
+            generation.require(expect or {})
+            return generation
         name = self.current()
         try:
             generation = self._read(name, verify, threads)
@@ -199,14 +208,19 @@ class IndexStore:
         files.sync(self.path)
         files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
         generation.folder = self.path / name
-        for number in self._numbers()[: -1 - keep]:
-            _discard(self.path / generation_name(number))
+        self.discard_before(name, keep)
         return generation
+
+    def discard_before(self, name: str, keep: int = 2) -> None:
+        """Delete the generations before the one of that name, but for `keep` of them that readers may just open."""
+        for number in self._numbers():
+            if number < int(name.removeprefix("gen-")) - keep:
+                _discard(self.path / generation_name(number))
 
     def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
         folder = self.path / name
         if not folder.is_dir():
-            raise CorruptIndex(f"{self.path}: CURRENT names {name}, which is missing; {AGAIN}")
+            raise CorruptIndex(f"{self.path}: the generation {name} is missing; {AGAIN}")
         generation = read_generation(folder, verify=verify, threads=threads)
         if generation.name != name:
             raise CorruptIndex(f"{folder}: the manifest is that of {generation.name}; {AGAIN}")

@@ -90,14 +90,7 @@ class Generation:
 
     def require(self, expect: Mapping[str, str]) -> None:
         """Check that the fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
-        for key, value in expect.items():
-            got = self.fingerprint.get(key)
-            if got != value:
-                raise MismatchedIndex(
-                    f"{self.folder.parent}: the index was made with {key} {got and got[:12]!r}, "
-                    f"asked for is {value[:12]!r}; "
-                    f"use what made it, or {AGAIN}"
-                )
+        require_made_by(self.folder.parent, self.fingerprint, expect)
 
     def row_number(self, row_id: str) -> int:
         """The number of the row with that id; KeyError where there is none."""
@@ -195,6 +188,18 @@ class Generation:
             ids = self.rows.ids(rows[start:end])
             rows[start:end] = rows[start:end][sorted(range(len(ids)), key=ids.__getitem__)]
         return rows, spread
+
+
+def require_made_by(where: Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
+    """Check that a fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
+    for key, value in expect.items():
+        got = fingerprint.get(key)
+        if got != value:
+            raise MismatchedIndex(
+                f"{where}: the index was made with {key} {got and got[:12]!r}, "
+                f"asked for is {value[:12]!r}; "
+                f"use what made it, or {AGAIN}"
+            )
 
 
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:

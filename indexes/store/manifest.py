@@ -65,7 +65,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the file, with a digest of its own content at the end."""
     content = {"format": FORMAT} | asdict(manifest)
     del content["segments"]
-    content["sha256"] = _own_digest(content)
+    content["sha256"] = own_digest(content)
     with durable(folder / NAME) as handle:
         handle.write(encoded(content, indent=2) + b"\n")
 
@@ -82,7 +82,7 @@ def read_manifest(folder: Path) -> Manifest:
     if not isinstance(content, dict):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
     _check_format(path, content.get("format"))
-    if content.pop("sha256", None) != _own_digest(content):
+    if content.pop("sha256", None) != own_digest(content):
         raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
     return _parsed(path, content)
 
@@ -117,7 +117,8 @@ def _check_format(path: Path, version: object) -> None:
         )
 
 
-def _own_digest(content: Mapping[str, Any]) -> str:
+def own_digest(content: Mapping[str, Any]) -> str:
+    """What a document says of itself under "sha256": the digest of all else in it."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

@@ -1,7 +1,7 @@
 """`retrieve build-index`: make a folder of photos searchable."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,7 +9,7 @@ from indexes import KINDS
 from retrieval.commands.options import Json, Model
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
-from retrieval.errors import RetrievalError
+from retrieval.errors import BadInput, RetrievalError
 
 PREVIEWED = 16
 """Photos of the catalogue, evenly chosen, that a preview shows."""
@@ -43,11 +43,20 @@ def build_index(
     preview: Annotated[
         bool, typer.Option("--preview", help="write OUT-views.png: what the model sees of some of the photos")
     ] = False,
+    shards: Annotated[
+        int | None,
+        typer.Option(help="index folders to divide the catalogue over (default: as OUT has it, else one, undivided)"),
+    ] = None,
+    bad_share: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="of shards: photos that may be unreadable (default: 0.05 of all)"),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
+    from indexes.store.cluster import is_cluster, read_cluster
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search import build, defaults
+    from retrieval.search import build, build_cluster, defaults
 
     sheet = out.resolve().with_name(f"{out.resolve().name}-views.png")
     if preview:
@@ -55,16 +64,22 @@ def build_index(
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
     checkpoint = load_checkpoint(path)
+    asked: dict[str, Any] = {
+        "objects_from": objects_from,
+        "kind": kind,
+        "min_recall": min_recall,
+        "max_ms": max_ms,
+    }
+    if shards is None and is_cluster(out):
+        shards = read_cluster(out).of
+    if shards is None and bad_share is not None:
+        raise BadInput("--bad-share is for a catalogue in shards; give --shards too")
     try:
-        report = build.build_index(
-            catalogue,
-            checkpoint,
-            out,
-            objects_from=objects_from,
-            kind=kind,
-            min_recall=min_recall,
-            max_ms=max_ms,
-        )
+        if shards is None:
+            report = build.build_index(catalogue, checkpoint, out, **asked)
+        else:
+            allowed = build_cluster.BAD_SHARE if bad_share is None else bad_share
+            report = build_cluster.build_cluster(catalogue, checkpoint, out, shards, bad_share=allowed, **asked)
     except KeyboardInterrupt:
         say(f"what was embedded is kept in {out}; the same command goes on with it")
         raise
@@ -75,7 +90,8 @@ def build_index(
         from indexes.store.folder import IndexStore
         from retrieval.report.views import write_views
 
-        rows = IndexStore(out).open(verify=False).rows
+        first = IndexStore(out / report.shards[0]["folder"] if report.shards else out)
+        rows = first.open(verify=False).rows
         chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
         write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
         say(f"views: {len(chosen)} photos in {sheet}")

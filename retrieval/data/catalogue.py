@@ -65,6 +65,15 @@ class Catalogue:
     unread: tuple[str, ...] = ()
 
     @property
+    def where(self) -> str:
+        """The folder, whole, as indexes name it."""
+        return str(self.folder.resolve())
+
+    def read(self, path: str) -> bytes:
+        """The bytes of a photo's file. Raises ImageError."""
+        return read_bytes(self.folder / path)
+
+    @property
     def object_ids(self) -> tuple[str, ...]:
         """The objects, sorted, each once; some may have no photo that can be read."""
         return tuple(sorted({photo.object_id for photo in self.photos} | set(self.unread)))
@@ -136,7 +145,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
     """Read a photo's bytes, once; an unreadable one is a SkippedPhoto."""
     try:
-        data = read_bytes(catalogue.folder / photo.path)
+        data = catalogue.read(photo.path)
     except ImageError as error:
         return SkippedPhoto(photo.path, error.reason)
     return PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())

@@ -56,6 +56,35 @@ class Belief:
 
 
 @dataclass(frozen=True)
+class Mass:
+    """What objects of a catalogue, or of a part of one, weigh together: logs of their sums of exp(w * logit).
+
+    judged: of those that were judged; unjudged: of the others, as a sample of them says. objects: how many of both.
+    """
+
+    judged: float
+    unjudged: float
+    objects: int
+
+    @classmethod
+    def joined(cls, masses: Sequence["Mass"]) -> "Mass":
+        """Of several parts, one at least, that have no object in common."""
+        return cls(
+            float(np.logaddexp.reduce([mass.judged for mass in masses])),
+            float(np.logaddexp.reduce([mass.unjudged for mass in masses])),
+            sum(mass.objects for mass in masses),
+        )
+
+    def extended(self, objects: int) -> "Mass":
+        """With so many other objects of which nothing is known: each is taken to weigh what these do on average."""
+        if not objects:
+            return self
+        mean = float(np.logaddexp(self.judged, self.unjudged)) - math.log(self.objects)
+        unjudged = float(np.logaddexp(self.unjudged, math.log(objects) + mean))
+        return Mass(self.judged, unjudged, self.objects + objects)
+
+
+@dataclass(frozen=True)
 class Posterior:
     """The formula's numbers, and how many catalogues they were fitted on."""
 
@@ -107,24 +136,31 @@ class Posterior:
         sample (S,): logits of some of these, drawn at random; needed where there are any. Raises BadInput, and
         NumericalError for a logit that is not finite.
         """
-        judged, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
         require_prior(none_prior)
+        return self.share(logits, self.mass(logits, grasps, unjudged=unjudged, sample=sample), grasps, none_prior)
+
+    def mass(self, logits: ArrayLike, grasps: int = 1, *, unjudged: int = 0, sample: ArrayLike = ()) -> Mass:
+        """What objects weigh, given as `believe` takes them; of several parts of a catalogue, `Mass.joined`."""
+        judged, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
         if not len(judged) or unjudged < 0 or (unjudged and not len(drawn)):
             raise BadInput(
                 "a posterior needs a judged object, and a sample where others were not judged; got "
                 f"{len(judged)} judged, {unjudged} not, and a sample of {len(drawn)}"
             )
-        weight = self.weight(grasps)
-        each = math.log1p(-none_prior) - math.log(len(judged) + unjudged) + self.offset
-        others = -math.inf
+        weight, others = self.weight(grasps), -math.inf
         if unjudged:  # so many times the mean of the sample
-            others = each + math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(weight * drawn))
+            others = math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(weight * drawn))
+        return Mass(float(np.logaddexp.reduce(weight * judged)), others, len(judged) + unjudged)
+
+    def share(self, logits: ArrayLike, mass: Mass, grasps: int = 1, none_prior: float = NONE_PRIOR) -> Belief:
+        """What is believed of some of the objects that `mass` stands for: `objects` (J,) are those of these logits."""
+        some = _finite(logits, "every logit")
+        each = math.log1p(-none_prior) - math.log(mass.objects) + self.offset
         none = math.log(none_prior) if none_prior else -math.inf
         # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN.
-        terms = np.concatenate([[none, others], each + weight * judged])
-        shares = np.exp(terms - terms.max())
-        shares /= shares.sum()
-        return Belief(float(shares[0]), shares[2:], float(shares[1]))
+        whole = float(np.logaddexp.reduce([none, each + mass.unjudged, each + mass.judged]))
+        shares = np.exp(np.minimum(each + self.weight(grasps) * some - whole, 0.0))
+        return Belief(math.exp(none - whole), shares, math.exp(each + mass.unjudged - whole))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in `calibration.json`."""

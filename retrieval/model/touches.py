@@ -12,7 +12,7 @@ How deep the lists are nested says what is meant, so nothing is guessed:
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -189,7 +189,12 @@ class Stopwatch:
     def __call__(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self._stages[stage] = self._stages.get(stage, 0.0) + 1e3 * (time.perf_counter() - start)
+        self.add({stage: 1e3 * (time.perf_counter() - start)})
+
+    def add(self, timing_ms: Mapping[str, float]) -> None:
+        """Count stages that another watch took."""
+        for stage, ms in timing_ms.items():
+            self._stages[stage] = self._stages.get(stage, 0.0) + ms
 
     def finished(self, shares: int) -> dict[str, float]:
         """One of so many equal shares: of the stages in their order, and of "total" since it was made."""

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -65,33 +65,50 @@ def build_index(
     (4, 0)
     """
     asked = Asked(kind, min_recall, max_ms)
-    store = IndexStore(out)
-    named_before = _named_before(store)
+    named_before = _named_before(IndexStore(out))
     naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
-    catalogue = list_catalogue(folder, naming)
-    if kind is not None:
-        chosen = load_kind(kind)
+    renamed = "" if named_before in (None, naming.text) else renamed_note(naming, str(named_before))
+    return build_listed(list_catalogue(folder, naming), checkpoint, out, Wanted(naming, asked, quiet, note=renamed))
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is wanted of a build. note: to be said of it first. about: more for the manifest. donors: generations whose
+    codes may be taken. keep: generations before the new one that stay."""
+
+    naming: Naming
+    asked: Asked
+    quiet: bool = False
+    note: str = ""
+    about: Mapping[str, Any] = field(default_factory=dict)
+    donors: Sequence[Generation] = ()
+    keep: int = 2
+
+
+def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted: Wanted) -> BuildReport:
+    """As `build_index`, of photos that are listed already."""
+    asked, naming, store = wanted.asked, wanted.naming, IndexStore(out)
+    if asked.kind is not None:
+        chosen = load_kind(asked.kind)
         chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock():
         parent, why = _parent(store, checkpoint)
-        if named_before not in (None, naming.text):
-            why = f"Objects are named by {naming.text} now, no longer by {named_before}. {why}".rstrip()
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
-            "catalogue": str(folder.resolve()),
+            "catalogue": catalogue.where,
             "objects_from": naming.text,
             "asked": asdict(asked),
+            **wanted.about,
         }
         start = time.perf_counter()
         with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
-            made = Embedder(checkpoint, parent, unfinished)
-            with closing(made.parts(catalogue, quiet)) as parts:
+            made = Embedder(checkpoint, parent, unfinished, wanted.donors)
+            with closing(made.parts(catalogue, wanted.quiet)) as parts:
                 changed = _unless_same(parent, parts, about)
-                job = _Job(store, made, about, asked, quiet)
+                job = _Job(store, made, about, asked, wanted.quiet, wanted.keep)
                 generation = parent if parent is not None and changed is None else job.write(changed or ())
             unfinished.clear()
         seconds = time.perf_counter() - start - job.settling_s
-    inside = out.resolve()
     names = sorted(made.objects)
     return BuildReport(
         index=str(out),
@@ -110,16 +127,27 @@ def build_index(
         resumed=made.resumed,
         removed=made.removed,
         skipped=made.skipped,
-        ignored=[name for name in catalogue.ignored if not (folder / name).resolve().is_relative_to(inside)],
+        ignored=_outside(catalogue, out),
         without_photo=sorted(set(catalogue.object_ids) - set(names)),
         notes=list(catalogue.notes),
         kind=generation.manifest.kind,
-        reason=" ".join(filter(None, (why, generation.manifest.about["reason"]))),
+        reason=" ".join(filter(None, (wanted.note, why, generation.manifest.about["reason"]))),
         recall=generation.manifest.recall,
         candidates=generation.manifest.about["candidates"],
         half_error=made.half_error,
         seconds=seconds,
     )
+
+
+def renamed_note(naming: Naming, before: str) -> str:
+    """That objects are named by another rule now."""
+    return f"Objects are named by {naming.text} now, no longer by {before}."
+
+
+def _outside(catalogue: Catalogue, out: Path) -> list[str]:
+    """Files of the catalogue that are no pictures by name, but for those of the index itself."""
+    inside = out.resolve()
+    return [name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)]
 
 
 def _named_before(store: IndexStore) -> str | None:
@@ -164,6 +192,7 @@ class _Job:
     about: Mapping[str, Any]
     asked: Asked
     quiet: bool
+    keep: int
     settling_s: float = 0.0
 
     def write(self, parts: Iterable[Part]) -> Generation:
@@ -180,6 +209,7 @@ class _Job:
             parent=self.made.parent,
             software=__version__,
             settle=self._settle,
+            keep=self.keep,
             queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
         )
 

@@ -24,7 +24,8 @@ class BuildReport:
     ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all
     of whose pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
     (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
-    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone.
+    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a
+    cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -58,6 +59,7 @@ class BuildReport:
     candidates: dict[str, Any] | None
     half_error: float
     seconds: float
+    shards: list[dict[str, Any]] | None = None
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -91,6 +93,8 @@ class BuildReport:
         if self.recall["queries"]:  # else exact by construction
             at, recall = self.recall["at"], self.recall["value"]
             measured = f" Recall@{at} against exact search: {recall:.3f}, measured on this index."
+        for shard in self.shards or ():
+            yield f"  {shard['folder']} ({shard['generation']}): {shard['photos']} photos of {shard['objects']} objects"
         yield f"candidate search: {self.kind}. {self.reason}{measured}"
         yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
         yield from _some("remark(s)", self.notes)

@@ -17,6 +17,7 @@ from indexes.store.regular import read_json
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
+    from indexes.store.cluster import ClusterManifest
     from indexes.store.manifest import Manifest
 
 SHIPPED = "simulated-mobilenet.safetensors"
@@ -44,12 +45,14 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     if given is not None:
         return Path(given), "given"
     from indexes.errors import IndexesError
+    from indexes.store.cluster import is_cluster, read_cluster
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
 
-    here, manifest = _trained_here(), None
+    here = _trained_here()
+    manifest: Manifest | ClusterManifest | None = None
     with suppress(IndexesError):  # no usable index is none
-        manifest = read_manifest(index / IndexStore(index).current())
+        manifest = read_cluster(index) if is_cluster(index) else read_manifest(index / IndexStore(index).current())
     if manifest is not None:
         own = model_of(manifest)
         newer = f"; {here} was trained in this folder too: name it to take it" if here not in (None, own) else ""
@@ -61,7 +64,7 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
 
 
-def model_of(manifest: "Manifest") -> Path:
+def model_of(manifest: "Manifest | ClusterManifest") -> Path:
     """The checkpoint that built an index: where it lay then, else the last trained here or the shipped one, if equal.
 
     Raises CheckpointError where none is.
@@ -81,14 +84,19 @@ def find_index(given: str | None) -> tuple[Path, str]:
     """The index to use and why: the one given, else ./index, else the last one built from this folder."""
     if given is not None:
         return Path(given), "given"
-    if (INDEX / "CURRENT").is_file():
+    if _is_index(INDEX):
         return INDEX, "in this folder"
-    if (last := _noted().get("index")) and (Path(last) / "CURRENT").is_file():
+    if (last := _noted().get("index")) and _is_index(Path(last)):
         return Path(last), "the last one built from this folder"
     raise BadInput(
         "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
         "or name one with --index"
     )
+
+
+def _is_index(folder: Path) -> bool:
+    """Whether an index folder or a cluster of them lies there."""
+    return any((folder / name).is_file() for name in ("CURRENT", "CLUSTER.json"))
 
 
 def remember(kind: str, path: Path) -> None:

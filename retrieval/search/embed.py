@@ -20,7 +20,7 @@ from indexes.store.tables import Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
-from retrieval.errors import DatasetError, NumericalError
+from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, encode_photos, one_thread
 
@@ -74,13 +74,22 @@ class Part:
 class Embedder:
     """Makes parts of a catalogue's photos, and counts what became of them. What it encodes is kept in `unfinished`.
 
+    donors: other generations of the same model, whose codes are taken for photos of the same content.
+
     photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `renamed` had
     another name in the parent, and `known` are the parent's own by id, with the same content or another. objects: how
     many rows each has. half_error: largest rounding of a stored half.
     """
 
-    def __init__(self, checkpoint: Checkpoint, parent: Generation | None, unfinished: Unfinished) -> None:
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        parent: Generation | None,
+        unfinished: Unfinished,
+        donors: Sequence[Generation] = (),
+    ) -> None:
         self.checkpoint, self.parent, self.unfinished = checkpoint, parent, unfinished
+        self._holders = [*([] if parent is None else [parent]), *donors]
         self.skipped: list[SkippedPhoto] = []
         self.objects: Counter[str] = Counter()
         self.photos, self.embedded, self.resumed, self.renamed, self.known = 0, 0, 0, 0, 0
@@ -92,7 +101,7 @@ class Embedder:
         return 0 if self.parent is None else self.parent.count - self.known
 
     def parts(self, catalogue: Catalogue, quiet: bool) -> Generator[Part, None, None]:
-        """The catalogue's photos in its order. Raises DatasetError where none can be read, and NumericalError for
+        """The catalogue's photos in its order. Raises NoPhoto where none can be read, and NumericalError for
         halves that float16 cannot hold."""
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
@@ -106,10 +115,13 @@ class Embedder:
                     yield part
         if not self.photos:
             first = self.skipped[0]
-            raise DatasetError(f"no photo in {catalogue.folder} can be read; the first: {first.path}: {first.reason}")
-        if self.parent is not None and self.embedded + self.resumed < self.photos:
+            raise NoPhoto(
+                f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", self.skipped
+            )
+        if self.embedded + self.resumed < self.photos:
             # What was taken over was rounded when it was made.
-            self.half_error = max(self.half_error, self.parent.manifest.about.get("half_error", 0.0))
+            errors = [holder.manifest.about.get("half_error", 0.0) for holder in self._holders]
+            self.half_error = max(self.half_error, *errors)
 
     def _find(self, catalogue: Catalogue, photos: Sequence[CataloguePhoto]) -> list[_Found | SkippedPhoto]:
         """Read photos' files, and keep the bytes of those with which there is more to do. Called on threads."""
@@ -139,12 +151,14 @@ class Embedder:
     def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
         """Codes of these contents, of the parent under other names, or of a build that was cut off."""
         found: dict[str, _Code] = {}
-        if self.parent is not None and digests:
-            numbers = self.parent.rows.holding(digests)
-            having = [digest for digest, number in zip(digests, numbers, strict=True) if number >= 0]
+        for holder in self._holders:
+            if not (wanted := [digest for digest in digests if digest not in found]):
+                break
+            numbers = holder.rows.holding(wanted)
+            having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            embeddings = self.parent.embeddings[self.parent.slots[rows]]
-            halves = self.parent.arrays["halves"][rows]
+            embeddings = holder.embeddings[holder.slots[rows]]
+            halves = holder.arrays["halves"][rows]
             codes = (_Code(*code, 0.0, resumed=False) for code in zip(embeddings, halves, strict=True))
             found.update(zip(having, codes, strict=True))
         left = self.unfinished.find(digest for digest in digests if digest not in found)

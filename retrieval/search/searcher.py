@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
+from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from retrieval.errors import BadInput
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
 from retrieval.model.onnx_encoder import exported_beside
 from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
-from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
+from retrieval.model.stored import Stored, read_judge
 from retrieval.model.touches import (
     AnyImage,
     AnyTouches,
@@ -27,15 +28,12 @@ from retrieval.model.touches import (
     TouchReader,
     read_grasps,
 )
-from retrieval.search import defaults
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
-from retrieval.search.objects import JudgedObjects, Objects, listed_photo, require_usable
+from retrieval.search.objects import Objects
+from retrieval.search.opening import folder_shard, open_cluster, stored_for
+from retrieval.search.shard import Felt, FolderShard, Judged, Shard
 
-DEFAULT_CANDIDATES = 1000
-COMPLETED = 20
-"""Objects, at least, of which every photo is judged."""
 Floats = NDArray[np.float32]
-Rows = NDArray[np.int64]
 
 
 class Searcher:
@@ -54,29 +52,28 @@ class Searcher:
     >>> searcher.close()
     """
 
-    def __init__(self, index: Path, generation: Generation, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
-        self.index, self.generation, self.checkpoint = index, generation, checkpoint
-        self.encoder, self.judge = encoder, judge
+    def __init__(self, index: Path, shard: Shard, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
+        self.index, self.shard, self.checkpoint = index, shard, checkpoint
+        self.encoder, self.judge, self.described = encoder, judge, shard.described
         self.gel_check = checkpoint.gel_check
         compares = self.gel_check is not None and self.gel_check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares)
         self.posterior: Posterior | None = None  # where the model was never calibrated
-        if "calibration" in generation.documents:
+        if self.described.calibration is not None:
             try:
-                self.posterior = Posterior.from_dict(generation.documents["calibration"])
+                self.posterior = Posterior.from_dict(self.described.calibration)
             except BadInput as error:
                 raise UnsupportedFormat(
                     f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
                 ) from error
-        self.catalogue = Path(generation.manifest.about["catalogue"])
-        self.objects = Objects(generation)
+        self.catalogue = Path(self.described.about["catalogue"])
         self._closed = False
 
     @classmethod
     def open(
         cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True, threads: int | None = None
     ) -> "Searcher":
-        """Open the current generation of an index with the checkpoint that built it.
+        """Open the current generation of an index, or of a cluster of them, with the checkpoint that built it.
 
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
         threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
@@ -93,22 +90,40 @@ class Searcher:
         >>> from_arrays.results == from_files.results
         True
         """
-        generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
-        stored = read_stored(Path(model) if model else defaults.model_of(generation.manifest))
-        if stored.digest != generation.fingerprint.get("checkpoint"):
-            from retrieval.model.checkpoint import load_checkpoint
-
-            load_checkpoint(stored.path)  # a damaged one says so
-        generation.require(fingerprint(stored))
-        require_usable(generation, stored.config.matcher.half)
+        folder = Path(index)
+        if is_cluster(folder):
+            manifest = read_cluster(folder)
+            stored = stored_for(manifest, model)
+            shard: Shard = open_cluster(folder, manifest, stored, verify=verify)
+        else:
+            generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
+            stored = stored_for(generation.manifest, model)
+            shard = folder_shard(generation, stored)
         encoder = exported_beside(stored, threads) or torch_encoder(stored, threads)
-        return cls(Path(index), generation, stored, encoder, read_judge(stored.path))
+        return cls(folder, shard, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
         """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""
         self._closed = True
-        for name in ("generation", "encoder", "reader", "judge", "objects"):
+        for name in ("shard", "encoder", "reader", "judge"):
             vars(self).pop(name, None)
+
+    @property
+    def generation(self) -> Generation:
+        """The opened generation, where one index folder is searched. Raises BadInput for a cluster."""
+        return self._folder.generation
+
+    @property
+    def objects(self) -> Objects:
+        """The objects of that generation."""
+        return self._folder.objects
+
+    @property
+    def _folder(self) -> FolderShard:
+        shard = self._held().shard
+        if not isinstance(shard, FolderShard):
+            raise BadInput(f"{self.index} is a cluster of index folders, and this wants one; open a shard of it")
+        return shard
 
     def __enter__(self) -> "Searcher":
         return self._held()
@@ -142,9 +157,9 @@ class Searcher:
         Only grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
         """
         held = self._held()
-        limit = held._limit(top, candidates)
+        require_counts(top, candidates)
         grasps = read_grasps(touches, held.reader.fingers)
-        return held._answers(grasps, [slice(len(grasps))], background, top, limit, none_prior)[0]
+        return held._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
     def query_growing(
         self,
@@ -164,10 +179,10 @@ class Searcher:
         (1, 2)
         """
         held = self._held()
-        limit = held._limit(top, candidates)
+        require_counts(top, candidates)
         grasps = read_grasps(touches, held.reader.fingers)
         asked = [slice(count) for count in range(1, len(grasps) + 1)]
-        return held._answers(grasps, asked, background, top, limit, none_prior)
+        return held._answers(grasps, asked, background, top, candidates, none_prior)
 
     def query_many(
         self,
@@ -184,7 +199,7 @@ class Searcher:
         another order. Where one object's touches are not fit, nothing is answered and the error names it.
         """
         held = self._held()
-        limit = held._limit(top, candidates)
+        require_counts(top, candidates)
         asked = [
             read_grasps(touches, held.reader.fingers, of=f"object {number}, ")
             for number, touches in enumerate(objects, 1)
@@ -192,7 +207,7 @@ class Searcher:
         ends = np.cumsum([len(grasps) for grasps in asked]).tolist()
         spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, asked, strict=True)]
         every = [grasp for grasps in asked for grasp in grasps]
-        return held._answers(every, spans, background, top, limit, none_prior) if asked else []
+        return held._answers(every, spans, background, top, candidates, none_prior) if asked else []
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
         """The unit embeddings (G, embedding_dim) and halves (G, half) of G grasps, given as `query` takes them.
@@ -214,14 +229,6 @@ class Searcher:
             raise BadInput(f"this searcher of {self.index} was closed; open the index again")
         return held
 
-    def _limit(self, top: int, candidates: int | None) -> int:
-        """Photos that are judged for each grasp: as many as asked for, else as measured on the index, else 1000."""
-        measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
-        limit = int(measured["k"]) if candidates is None else candidates
-        if top < 1 or limit < 1:
-            raise BadInput(f"top and candidates must be 1 or more; got {top} and {limit}")
-        return max(top, limit)
-
     # The stages: each takes and gives what belongs to one object, images of all objects side by side ------------
 
     def _answers(
@@ -230,7 +237,7 @@ class Searcher:
         asked: Sequence[slice],
         background: Sequence[AnyImage] | None,
         top: int,
-        limit: int,
+        candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
         """An answer for each of `asked`, which names the grasps that are of its object."""
@@ -245,61 +252,26 @@ class Searcher:
         judged = []
         for own, halves, embeddings in parts:
             felt = (own == CONTACT) & (own != NOT_A_GEL).all()
-            with clock("candidates"):
-                rows = self._candidates(embeddings[felt], limit)
-            with clock("rerank"):
-                judged.append(self._judged(halves[felt], rows, top, none_prior))
+            judged.append(self._judged(Felt(embeddings[felt], halves[felt]), top, candidates, none_prior, clock))
         timing_ms = clock.finished(len(asked))
         return [
-            self._answer(grasps[its], own.tolist(), embeddings, timing_ms, found, top, none_prior)
+            self._answer(grasps[its], own.tolist(), embeddings, timing_ms, found, none_prior)
             for its, (own, _, embeddings), found in zip(asked, parts, judged, strict=True)
         ]
 
-    def _candidates(self, embeddings: Floats, k: int) -> Rows:
-        """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
-        if not len(embeddings):
-            return np.zeros(0, dtype=np.int64)
-        if not self.checkpoint.config.has_embeddings or k >= self.generation.count:
-            return np.arange(self.generation.count)
-        found = [rows for rows, _ in self.generation.search(embeddings, k)]
-        return np.unique(np.concatenate(found))
-
-    def _judged(self, halves: Floats, rows: Rows, top: int, none_prior: float) -> "_Judged | None":
-        """Objects by their judged photos, and what is believed of them; None where nothing was felt.
-
-        Candidates are some photos of an object: of the best objects the others are judged as well.
-        """
-        if not len(halves):
+    def _judged(
+        self, felt: Felt, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
+    ) -> "_Judged | None":
+        """The best objects, and what is believed of them; None where nothing was felt."""
+        if not len(felt.halves):
+            clock.add({"candidates": 0.0, "rerank": 0.0})
             return None
-        meaning, logits = self.posterior or Posterior(), self._logits(halves, rows)
-        objects = self.objects.judged(rows, logits, meaning, len(halves))
-        if len(rows) < self.generation.count:
-            best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
-            rest = self.objects.rest_of(best, rows)
-        else:
-            rest = rows[:0]
-        if len(rest):
-            rows = np.concatenate([rows, rest])
-            logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
-            objects = self.objects.judged(rows, logits, meaning, len(halves))
-        if self.posterior is None:
-            return _Judged(len(rows), len(halves), objects, None)
-        unjudged = self.objects.count - len(objects.numbers)
-        # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
-        # expected to be.
-        sample = objects.logits.min(keepdims=True)
-        if unjudged and len(drawn := self.objects.sample_without(objects.numbers)):
-            sample = self.objects.judged(drawn, self._logits(halves, drawn), meaning, len(halves)).logits
-        belief = self.posterior.believe(
-            objects.logits, len(halves), none_prior=none_prior, unjudged=unjudged, sample=sample
-        )
-        return _Judged(len(rows), len(halves), objects, belief)
-
-    def _logits(self, halves: Floats, rows: Rows) -> Floats:
-        """Match logits of the rows, summed over grasps."""
-        every = len(rows) == self.generation.count
-        logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
-        return self.objects.equal_for_equals(rows, logits)
+        found = self.shard.ask(felt, top, candidates, self.posterior)
+        clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
+        if self.posterior is None or found.mass is None:
+            return _Judged(found, len(felt.halves), None)
+        logits = [one.logit for one in found.best]
+        return _Judged(found, len(felt.halves), self.posterior.share(logits, found.mass, len(felt.halves), none_prior))
 
     def _answer(
         self,
@@ -308,7 +280,6 @@ class Searcher:
         embeddings: Floats,
         timing_ms: dict[str, float],
         judged: "_Judged | None",
-        top: int,
         none_prior: float,
     ) -> QueryResult:
         belief = judged.belief if judged else None
@@ -317,11 +288,12 @@ class Searcher:
             grasps=shown,
             index={
                 "path": str(self.index),
-                "generation": self.generation.name,
-                "kind": self.generation.manifest.kind,
-                "photos": self.generation.count,
-                "objects": self.objects.count,
-                "scored": judged.photos if judged else 0,
+                "generation": self.described.name,
+                "kind": self.described.kind,
+                "photos": self.described.photos,
+                "objects": self.described.objects,
+                "scored": judged.found.photos if judged else 0,
+                **(self._shares(judged) if self.described.shards > 1 else {}),
                 "encoder": self.encoder.name,
                 "catalogue": str(self.catalogue),
                 "model": str(self.checkpoint.path),
@@ -331,17 +303,20 @@ class Searcher:
             verdict=_verdict(shown, belief),
             none_probability=belief.none if belief else None,
             posterior=self._meaning(judged, none_prior) if judged else None,
-            results=self._ranking(judged, top) if judged else [],
+            results=self._ranking(judged) if judged else [],
             embeddings=embeddings,
         )
 
-    def _ranking(self, judged: "_Judged", top: int) -> list[Match]:
-        objects, belief = judged.objects, judged.belief
-        ranking = []
-        for rank, place in enumerate(self.objects.best(objects, top), start=1):
-            photo = listed_photo(self.generation.rows[int(objects.rows[place])])
-            probability = None if belief is None else float(belief.objects[place])
-            path, logit = self.catalogue.absolute() / photo.path, float(objects.logits[place])
+    def _shares(self, judged: "_Judged | None") -> dict[str, Any]:
+        """Of how many shards the index is, and which share of its photos could be searched."""
+        searched = self.described.photos if judged is None else judged.found.searched
+        return {"shards": self.described.shards, "searched": searched / self.described.photos}
+
+    def _ranking(self, judged: "_Judged") -> list[Match]:
+        ranking, base = [], self.catalogue.absolute()
+        for rank, (logit, photo) in enumerate(judged.found.best, start=1):
+            probability = None if judged.belief is None else float(judged.belief.objects[rank - 1])
+            path = base / photo.path
             ranking.append(Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path))
         return ranking
 
@@ -353,18 +328,17 @@ class Searcher:
             **self.posterior.to_dict(),
             "none_prior": none_prior,
             "grasps": judged.grasps,
-            "objects": self.objects.count,
-            "judged_objects": len(judged.objects.numbers),
+            "objects": self.described.objects,
+            "judged_objects": judged.found.objects,
             "unjudged_probability": judged.belief.unjudged,
         }
 
 
 class _Judged(NamedTuple):
-    """What was judged for one object in the hand: so many photos, by so many grasps."""
+    """What was found for one object in the hand by so many grasps, and what is believed of it."""
 
-    photos: int
+    found: Judged
     grasps: int
-    objects: JudgedObjects
     belief: Belief | None
 
 
@@ -376,6 +350,12 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
     if belief is None:
         return UNCALIBRATED
     return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
+
+
+def require_counts(top: int, candidates: int | None) -> None:
+    """Raises BadInput for numbers of objects or candidates that are none."""
+    if top < 1 or (candidates is not None and candidates < 1):
+        raise BadInput(f"top and candidates must be 1 or more; got {top} and {candidates}")
 
 
 def torch_encoder(stored: Stored, threads: int | None = None) -> Encoder:

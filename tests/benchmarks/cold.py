@@ -42,7 +42,8 @@ generation = step("open the index", lambda: search.IndexStore(index).open(thread
 stored = step("read the checkpoint", lambda: search.read_stored(Path(model)))
 encoder = step("make the encoder", lambda: search.exported_beside(stored) or search.torch_encoder(stored))
 judge = step("read the head", lambda: search.read_judge(Path(model)))
-searcher = step("number objects", lambda: search.Searcher(Path(index), generation, stored, encoder, judge))
+shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
+searcher = search.Searcher(Path(index), shard, stored, encoder, judge)
 result = searcher.query([touch])
 assert result.index["encoder"] == ("torch" if backend == "torch" else "onnx")
 for name in {STAGES!r}:

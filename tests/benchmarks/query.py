@@ -23,6 +23,7 @@ from retrieval.model.stored import fingerprint, read_judge
 from retrieval.model.touches import Encoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.searcher import Searcher
+from retrieval.search.shard import FolderShard
 from tests.benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
 
 PHOTOS, CANDIDATES = 10_000, 132
@@ -61,7 +62,9 @@ def _lines(folder: Path, checkpoint: Checkpoint, photos: int, repetitions: int) 
 
 def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Path], repetitions: int) -> Line:
     generation = IndexStore(index).open(threads=1)
-    searcher = Searcher(index, generation, checkpoint, encoder, read_judge(checkpoint.path))
+    judge = read_judge(checkpoint.path)
+    shard = FolderShard(generation, judge, checkpoint.config.has_embeddings)
+    searcher = Searcher(index, shard, checkpoint, encoder, judge)
     images = [checkpoint.config.preprocessing.load_touch(path) for path in touch]
     told: list[dict[str, float]] = []
     arms = {

@@ -1,0 +1,196 @@
+"""A cluster: several index folders that are one catalogue together, and the one file that says which.
+
+    CLUSTER.json          the shards: folder, generation, SHA-256 of that generation's manifest; the only file replaced
+    shard-00-of-04/       an ordinary index folder, with its own CURRENT; empty shards have none
+    LOCK                  held by whoever builds
+
+What the file names is the cluster, whatever CURRENT says in the folders: all shards are switched by one rename. The
+digest of a generation's manifest stands for every byte of the generation, so that no folder can be mistaken for
+another. Opening reads this file alone; it is as long as there are shards, however many photos they hold.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.store.files import encoded, file_digest, naming, write_atomically
+from indexes.store.folder import GENERATION, IndexStore
+from indexes.store.generation import Generation
+from indexes.store.manifest import NAME as GENERATION_MANIFEST
+from indexes.store.manifest import own_digest
+from indexes.store.regular import read_json
+from indexes.store.rows import key_of
+
+NAME, FORMAT = "CLUSTER.json", 1
+CLUSTER = re.compile(r"cluster-(\d{6,})")
+FOLDER = re.compile(r"shard-(\d{2,})-of-(\d{2,})")
+MOST_SHARDS = 4096
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """One shard: its folder in the cluster's, its generation, the SHA-256 of that one's manifest.json, and what it
+    holds."""
+
+    folder: str
+    generation: str
+    sha256: str
+    photos: int
+    objects: int
+
+
+@dataclass(frozen=True)
+class ClusterManifest:
+    """The file. kind, fingerprint: those of all shards; about: catalogue, checkpoint and what else was said of the
+    build; calibration: the document of that name, None without one."""
+
+    generation: str
+    created: str
+    software: str
+    kind: str
+    fingerprint: dict[str, str]
+    about: dict[str, Any]
+    calibration: Any
+    of: int
+    shards: list[ShardEntry]
+
+    @property
+    def photos(self) -> int:
+        """Of all shards."""
+        return sum(shard.photos for shard in self.shards)
+
+    @property
+    def objects(self) -> int:
+        """Of all shards; none lies in two."""
+        return sum(shard.objects for shard in self.shards)
+
+
+def is_cluster(folder: Path) -> bool:
+    """Whether a cluster lies there."""
+    return (folder / NAME).is_file()
+
+
+def shard_of(object_id: str, shards: int) -> int:
+    """Which of so many shards holds the photos of an object: by a hash of its name, the same everywhere."""
+    return int.from_bytes(key_of(object_id)[8:], "little") % shards
+
+
+def shard_folder(number: int, of: int) -> str:
+    """The folder of a shard, counted from 0."""
+    return f"shard-{number:02d}-of-{of:02d}"
+
+
+def cluster_name(number: int) -> str:
+    """The name of a cluster's generation, such as cluster-000007."""
+    return f"cluster-{number:06d}"
+
+
+def number_of(name: str) -> int:
+    """The number in a generation's name."""
+    return int(name.rpartition("-")[2])
+
+
+def entry_of(cluster: Path, folder: str, generation: Generation, objects: int) -> ShardEntry:
+    """What the manifest is to say of a shard that was written."""
+    digest = file_digest(cluster / folder / generation.name / GENERATION_MANIFEST)
+    return ShardEntry(folder, generation.name, digest, generation.count, objects)
+
+
+def write_cluster(folder: Path, manifest: ClusterManifest) -> None:
+    """Put the file in its place: this cluster answers from now on."""
+    content = {"format": FORMAT} | asdict(manifest)
+    content["sha256"] = own_digest(content)
+    with naming(folder / NAME):
+        write_atomically(folder / NAME, encoded(content, indent=2) + b"\n")
+
+
+def read_cluster(folder: Path) -> ClusterManifest:
+    """The manifest of a cluster. Raises NoIndex, CorruptIndex or UnsupportedFormat."""
+    path = folder / NAME
+    try:
+        content = read_json(path)
+    except FileNotFoundError as error:
+        raise NoIndex(f"{folder}: there is no cluster here; run `retrieve build-index --shards` first") from error
+    except OSError as error:
+        raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+    except ValueError as error:
+        raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
+    return parsed_cluster(path, content)
+
+
+def parsed_cluster(path: Path, content: Any) -> ClusterManifest:
+    """The manifest that a document holds, which messages call `path`. Raises CorruptIndex or UnsupportedFormat."""
+    if not isinstance(content, dict) or type(content.get("format")) is not int:
+        raise CorruptIndex(f"{path}: must be a JSON object that says its format; {AGAIN}")
+    if content["format"] != FORMAT:
+        raise UnsupportedFormat(f"{path}: has format {content['format']}, this software reads {FORMAT}; {AGAIN}")
+    if content.pop("sha256", None) != own_digest(content):
+        raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
+    del content["format"]
+    if set(content) != {field.name for field in fields(ClusterManifest)}:
+        raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; {AGAIN}")
+    wrong = [name for name, is_right in _RIGHT.items() if not is_right(content[name])]
+    if wrong:
+        raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
+    return ClusterManifest(**content | {"shards": [ShardEntry(**entry) for entry in content["shards"]]})
+
+
+def open_shard(
+    cluster: Path,
+    entry: ShardEntry,
+    fingerprint: Mapping[str, str],
+    *,
+    verify: bool = True,
+    threads: int | None = None,
+) -> Generation:
+    """The generation that the cluster names, checked as `IndexStore.open` does. Raises its errors, and CorruptIndex for
+    another generation than the cluster was made of."""
+    store = IndexStore(cluster / entry.folder)
+    generation = store.open(name=entry.generation, verify=verify, threads=threads)
+    try:
+        generation.require(fingerprint)
+    except MismatchedIndex as error:
+        raise CorruptIndex(f"{generation.folder} is not of this cluster ({error})") from error
+    if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256 or generation.count != entry.photos:
+        raise CorruptIndex(f"{generation.folder} is not the generation that {cluster / NAME} was written for; {AGAIN}")
+    return generation
+
+
+def _is_entry(value: object) -> bool:
+    if not isinstance(value, dict) or set(value) != {field.name for field in fields(ShardEntry)}:
+        return False
+    texts = isinstance(value["folder"], str) and isinstance(value["generation"], str)
+    counts = all(type(value[name]) is int and value[name] > 0 for name in ("photos", "objects"))
+    return bool(
+        texts
+        and counts
+        and FOLDER.fullmatch(value["folder"])
+        and GENERATION.fullmatch(value["generation"])
+        and isinstance(value["sha256"], str)
+    )
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
+
+
+def _is_shards(value: object) -> bool:
+    if not isinstance(value, list) or not 1 <= len(value) <= MOST_SHARDS or not all(map(_is_entry, value)):
+        return False
+    return len({entry["folder"] for entry in value}) == len(value)
+
+
+_RIGHT = {
+    "generation": lambda value: isinstance(value, str) and bool(CLUSTER.fullmatch(value)),
+    "created": lambda value: isinstance(value, str),
+    "software": lambda value: isinstance(value, str),
+    "kind": lambda value: isinstance(value, str),
+    "fingerprint": _is_texts,
+    "about": lambda value: isinstance(value, dict),
+    "of": lambda value: type(value) is int and 1 <= value <= MOST_SHARDS,
+    "shards": _is_shards,
+}
+"""What each field must be: whoever alters the file can write the digest that fits."""

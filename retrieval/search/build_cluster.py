@@ -1,0 +1,277 @@
+"""From photos to a cluster: several index folders over one catalogue, switched together.
+
+Each shard is built as an ordinary index is, over the photos of the objects that are its own: what was embedded before,
+in it, in the shards of another division, or by a build that was cut off, is not embedded again. The cluster's manifest
+is written when every shard is on the disk. Killed at any moment, a build leaves the cluster as it was.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.store.cluster import (
+    FOLDER,
+    MOST_SHARDS,
+    ClusterManifest,
+    ShardEntry,
+    cluster_name,
+    entry_of,
+    number_of,
+    read_cluster,
+    shard_folder,
+    shard_of,
+    write_cluster,
+)
+from indexes.store.files import remove_folder
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.locking import WriterLock
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto, list_catalogue
+from retrieval.data.naming import FOLDER as BY_FOLDER
+from retrieval.data.naming import Naming, per_object
+from retrieval.errors import BadInput, NoPhoto, TooManyBad
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.stored import fingerprint
+from retrieval.search.build import Wanted, build_listed, renamed_note
+from retrieval.search.build_report import BuildReport
+from retrieval.search.operating import Asked
+from retrieval.version import __version__
+
+BAD_SHARE = 0.05
+"""Of a catalogue's photos, how many may be unreadable where nothing else is said."""
+_KEEP_ALL = 10**6
+
+
+@dataclass(frozen=True)
+class ShardJob:
+    """One shard to build, as it is sent to wherever it is built. donors: folders, and generations in them, of shards
+    of another division."""
+
+    cluster: Path
+    folder: str
+    catalogue: Catalogue
+    model: Path
+    naming: Naming
+    asked: Asked
+    donors: Sequence[tuple[str, str]]
+    quiet: bool
+
+
+@dataclass(frozen=True)
+class ShardBuilt:
+    """What became of the shard in `folder`; `entry` and `report` are None where none of its photos can be read. counts:
+    how many photos each of its objects has."""
+
+    folder: str
+    entry: ShardEntry | None
+    report: BuildReport | None
+    counts: list[int]
+    skipped: list[SkippedPhoto]
+
+
+Run = Callable[[Sequence[ShardJob], Checkpoint], Iterable[ShardBuilt]]
+"""Builds shards, in any order."""
+
+
+def build_cluster(
+    folder: Path,
+    checkpoint: Checkpoint,
+    out: Path,
+    shards: int,
+    *,
+    objects_from: str | None = None,
+    kind: str | None = None,
+    min_recall: float | None = None,
+    max_ms: float | None = None,
+    bad_share: float = BAD_SHARE,
+    quiet: bool = False,
+    run: Run | None = None,
+) -> BuildReport:
+    """Write the next generation of the cluster `out` over the catalogue `folder`, in so many shards.
+
+    run: builds the shards; None: here, one after another. What else is asked for is as `build_index` takes it, and
+    holds for each shard. Raises its errors; BadInput for a number of shards that is none, or where `out` is an index
+    folder; and TooManyBad where more than a share of `bad_share` of the photos cannot be read.
+    """
+    if not 1 <= shards <= MOST_SHARDS:
+        raise BadInput(f"shards must be from 1 to {MOST_SHARDS}; got {shards}")
+    if not 0 <= bad_share <= 1:
+        raise BadInput(f"the share of bad photos must be from 0 to 1; got {bad_share}")
+    if (out / "CURRENT").is_file():
+        raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
+    asked = Asked(kind, min_recall, max_ms)
+    with WriterLock(out / "LOCK"):
+        before, note = _before(out)
+        named_before = None if before is None else before.about.get("objects_from")
+        naming = Naming(next(rule for rule in (objects_from, named_before, BY_FOLDER) if rule is not None))
+        if named_before not in (None, naming.text):
+            note = f"{renamed_note(naming, str(named_before))} {note}".rstrip()
+        catalogue = list_catalogue(folder, naming)
+        _sweep(out, before, shards)
+        donors = (
+            [] if before is None or before.of == shards else [(one.folder, one.generation) for one in before.shards]
+        )
+        jobs = [
+            ShardJob(out, shard_folder(number, shards), own, checkpoint.path, naming, asked, donors, quiet)
+            for number, own in _divided(catalogue, shards)
+        ]
+        built = sorted((run or one_after_another)(jobs, checkpoint), key=lambda one: one.folder)
+        report = _report(out, catalogue, naming, checkpoint, built)
+        if (bad := len(report.skipped)) > bad_share * len(catalogue.photos):
+            first = report.skipped[0]
+            raise TooManyBad(
+                f"{bad} of {len(catalogue.photos)} photos cannot be read, more than the share of {bad_share:g} that is "
+                f"allowed (--bad-share); the cluster stays as it was. The first: {first.path}: {first.reason}"
+            )
+        manifest = _manifest(before, built, shards, checkpoint, catalogue, report, asked)
+        written = before is None or manifest.generation != before.generation
+        if written:
+            write_cluster(out, manifest)
+        for entry in manifest.shards:
+            IndexStore(out / entry.folder).discard_before(entry.generation)
+    reason = " ".join(filter(None, (note, report.reason)))
+    return replace(report, generation=manifest.generation, written=written, reason=reason)
+
+
+def one_after_another(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterable[ShardBuilt]:
+    """Build shards in this process."""
+    return [build_shard(job, checkpoint) for job in jobs]
+
+
+def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuilt:
+    """Build one shard. Raises the errors of `build_index`, but none where no photo of this one can be read."""
+    model = checkpoint or load_checkpoint(job.model)
+    store = IndexStore(job.cluster / job.folder)
+    donors = [_donor(job.cluster, *donor, fingerprint(model)) for donor in job.donors]
+    about = {"shard": job.folder}
+    wanted = Wanted(job.naming, job.asked, job.quiet, "", about, [one for one in donors if one is not None], _KEEP_ALL)
+    try:
+        report = build_listed(job.catalogue, model, store.path, wanted)
+    except NoPhoto as error:
+        return ShardBuilt(job.folder, None, None, [], error.skipped)
+    generation = store.open(name=report.generation, verify=False)
+    counts = np.bincount(generation.codes("object_id")).tolist()
+    entry = entry_of(job.cluster, job.folder, generation, len(counts))
+    return ShardBuilt(job.folder, entry, report, counts, report.skipped)
+
+
+def _before(out: Path) -> tuple[ClusterManifest | None, str]:
+    """The cluster there, and why it is of no use where it is not."""
+    try:
+        before = read_cluster(out)
+    except NoIndex:
+        return None, ""
+    except (CorruptIndex, UnsupportedFormat) as error:
+        return None, f"The cluster there was not usable ({error})."
+    return before, ""
+
+
+def _sweep(out: Path, before: ClusterManifest | None, shards: int) -> None:
+    """Delete shards of divisions that neither the cluster there nor the wanted one has."""
+    known = set() if before is None else {entry.folder for entry in before.shards}
+    for path in out.iterdir():
+        division = FOLDER.fullmatch(path.name)
+        if division and path.is_dir() and path.name not in known and int(division[2]) != shards:
+            remove_folder(path)
+
+
+def _divided(catalogue: Catalogue, shards: int) -> list[tuple[int, Catalogue]]:
+    """The catalogue's photos by shard; a shard without any is left out. What concerns no photo is said of none."""
+    own: dict[int, list[CataloguePhoto]] = {}
+    for photo in catalogue.photos:
+        own.setdefault(shard_of(photo.object_id, shards), []).append(photo)
+    return [
+        (number, replace(catalogue, photos=tuple(photos), ignored=(), skipped=(), notes=(), unread=()))
+        for number, photos in sorted(own.items())
+    ]
+
+
+def _donor(cluster: Path, folder: str, name: str, wanted: Mapping[str, str]) -> Generation | None:
+    """A shard whose codes may be taken over; None where it cannot serve."""
+    try:
+        return IndexStore(cluster / folder).open(name=name, expect=wanted)
+    except IndexesError:
+        return None
+
+
+def _report(
+    out: Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuilt]
+) -> BuildReport:
+    """What all builds did together. Raises NoPhoto where none of them had a photo to write."""
+    reports = [one.report for one in built if one.report is not None]
+    skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
+    if not reports:
+        raise NoPhoto(f"no photo in {catalogue.where} can be read; the first: {skipped[0]}", skipped)
+    counts = [count for one in built for count in one.counts]
+    lost = {name for report in reports for name in report.without_photo}
+    bad = {item.path for one in built if one.report is None for item in one.skipped}
+    lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad} | set(catalogue.unread)
+    reasons = Counter(report.reason for report in reports).most_common()
+    return BuildReport(
+        index=str(out),
+        generation="",
+        written=True,
+        model=str(checkpoint.path),
+        photos=sum(report.photos for report in reports),
+        objects=len(counts),
+        objects_from=naming.text,
+        per_object=per_object(counts),
+        examples=reports[0].examples,
+        doubts=list(dict.fromkeys(doubt for report in reports for doubt in report.doubts)),
+        embedded=sum(report.embedded for report in reports),
+        reused=sum(report.reused for report in reports),
+        renamed=sum(report.renamed for report in reports),
+        resumed=sum(report.resumed for report in reports),
+        removed=sum(report.removed for report in reports),
+        skipped=skipped,
+        ignored=list(catalogue.ignored),
+        without_photo=sorted(lost),
+        notes=list(catalogue.notes),
+        kind=", ".join(sorted({report.kind for report in reports})),
+        reason=f"{len(reports)} shards; of {reasons[0][1]} of them: {reasons[0][0]}",
+        recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
+        candidates=None,
+        half_error=max(report.half_error for report in reports),
+        seconds=sum(report.seconds for report in reports),
+        shards=[asdict(one.entry) for one in built if one.entry is not None],
+    )
+
+
+def _manifest(
+    before: ClusterManifest | None,
+    built: Sequence[ShardBuilt],
+    shards: int,
+    checkpoint: Checkpoint,
+    catalogue: Catalogue,
+    report: BuildReport,
+    asked: Asked,
+) -> ClusterManifest:
+    """The manifest to write, or the one that is there where it would say the same."""
+    about: dict[str, Any] = {
+        "checkpoint": str(checkpoint.path.resolve()),
+        "catalogue": catalogue.where,
+        "objects_from": report.objects_from,
+        "asked": asdict(asked),
+        "half_error": report.half_error,
+    }
+    made = ClusterManifest(
+        generation=cluster_name(1 if before is None else number_of(before.generation) + 1),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        software=__version__,
+        kind=report.kind,
+        fingerprint=fingerprint(checkpoint),
+        about=about,
+        calibration=checkpoint.posterior.to_dict() if checkpoint.posterior else None,
+        of=shards,
+        shards=[one.entry for one in built if one.entry is not None],
+    )
+    same = before is not None and before == replace(
+        made, generation=before.generation, created=before.created, software=before.software
+    )
+    return before if before is not None and same else made

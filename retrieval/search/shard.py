@@ -1,0 +1,218 @@
+"""What can be searched: the photos of an index folder, or of several that are one catalogue together.
+
+Whoever asks has the codes of touches and gets the best objects, and what all others weigh: an answer is made of that
+alone, however many photos there are. No photo's half, no list of candidates and no other object's logit leaves a shard.
+
+An object's photos all lie in one shard, so that its logit is known there. Merged, the best of all shards are the best
+of the catalogue, and the sums of their likelihoods are its sum.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.store.generation import Generation
+from retrieval.errors import BadInput
+from retrieval.model.judge import Judge
+from retrieval.model.posterior import Mass, Posterior
+from retrieval.model.touches import Stopwatch
+from retrieval.search.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
+
+DEFAULT_CANDIDATES = 1000
+COMPLETED = 20
+"""Objects, at least, of which every photo is judged."""
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+
+class Felt(NamedTuple):
+    """Grasps of one object that felt something: embeddings (G, embedding_dim) and halves (G, half), G > 0."""
+
+    embeddings: Floats
+    halves: Floats
+
+
+class Ranked(NamedTuple):
+    """An object with its logit, and the photo that shows it best."""
+
+    logit: float
+    photo: ListedPhoto
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a shard says of one object in the hand.
+
+    photos, objects: how many were judged. best: at most as many objects as asked for, the best first, equals by name.
+    mass: what all objects weigh; None where the model was never calibrated. searched: photos that could have been
+    candidates, which are all where every shard answered. timing_ms: by stage.
+    """
+
+    photos: int
+    objects: int
+    best: list[Ranked]
+    mass: Mass | None
+    searched: int
+    timing_ms: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Described:
+    """What is known of a shard without asking it.
+
+    name: of the generation, or of the whole cluster's. kind: of the candidate search. photos, objects: how many.
+    fingerprint: what made its codes. about: what its manifest says besides, the catalogue and the checkpoint among it.
+    calibration: the posterior as the index has it, None without one. shards: index folders.
+    """
+
+    name: str
+    kind: str
+    photos: int
+    objects: int
+    fingerprint: Mapping[str, str]
+    about: Mapping[str, Any]
+    calibration: Any | None
+    shards: int = 1
+
+
+class Shard(Protocol):
+    """What a searcher searches. Any number of threads may ask at once."""
+
+    @property
+    def described(self) -> Described:
+        """What is known without asking."""
+
+    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
+        """The best `top` objects for these grasps, and what all weigh.
+
+        candidates: photos per grasp that the full classifier judges, in each index folder, `top` at least; None: as
+        many as measured there. Raises NumericalError.
+        """
+
+    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
+        """The rows of these photos; None for one that is not there."""
+
+
+class FolderShard:
+    """The photos of one generation of an index folder.
+
+    has_embeddings: whether the model's embeddings were trained; without, every photo is judged.
+    """
+
+    def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
+        self.generation, self.judge, self.has_embeddings = generation, judge, has_embeddings
+        self.objects = Objects(generation)
+
+    @property
+    def described(self) -> Described:
+        """What is known without asking."""
+        manifest = self.generation.manifest
+        return Described(
+            manifest.generation,
+            manifest.kind,
+            self.generation.count,
+            self.objects.count,
+            manifest.fingerprint,
+            manifest.about,
+            self.generation.documents.get("calibration"),
+        )
+
+    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
+        """As `Shard.ask`. Candidates are some photos of an object: of the best objects the others are judged too."""
+        clock = Stopwatch()
+        with clock("candidates"):
+            rows = self._candidates(felt.embeddings, self.limit(top, candidates))
+        with clock("rerank"):
+            objects, photos = self._judged(felt.halves, rows, top, posterior or Posterior())
+            mass = None if posterior is None else self._mass(felt.halves, objects, posterior)
+        best = [
+            Ranked(float(objects.logits[place]), listed_photo(self.generation.rows[int(objects.rows[place])]))
+            for place in self.objects.best(objects, top)
+        ]
+        return Judged(photos, len(objects.numbers), best, mass, self.generation.count, clock.finished(1))
+
+    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
+        """As `Shard.rows`."""
+        numbers = self.generation.rows.find(ids).tolist()
+        return [None if number < 0 else self.generation.rows[number] for number in numbers]
+
+    def limit(self, top: int, candidates: int | None) -> int:
+        """Photos that are judged for each grasp: as many as asked for, else as measured on the index, else 1000."""
+        measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
+        return max(top, int(measured["k"]) if candidates is None else candidates)
+
+    def _candidates(self, embeddings: Floats, k: int) -> Rows:
+        """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
+        if not self.has_embeddings or k >= self.generation.count:
+            return np.arange(self.generation.count)
+        found = [rows for rows, _ in self.generation.search(embeddings, k)]
+        return np.unique(np.concatenate(found))
+
+    def _judged(self, halves: Floats, rows: Rows, top: int, meaning: Posterior) -> tuple[JudgedObjects, int]:
+        """Objects by their judged photos, and how many photos these are."""
+        logits = self._logits(halves, rows)
+        objects = self.objects.judged(rows, logits, meaning, len(halves))
+        if len(rows) == self.generation.count:
+            return objects, len(rows)
+        best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
+        rest = self.objects.rest_of(best, rows)
+        if not len(rest):
+            return objects, len(rows)
+        rows = np.concatenate([rows, rest])
+        logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
+        return self.objects.judged(rows, logits, meaning, len(halves)), len(rows)
+
+    def _mass(self, halves: Floats, objects: JudgedObjects, posterior: Posterior) -> Mass:
+        unjudged = self.objects.count - len(objects.numbers)
+        # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
+        # expected to be.
+        sample = objects.logits.min(keepdims=True)
+        if unjudged and len(drawn := self.objects.sample_without(objects.numbers)):
+            sample = self.objects.judged(drawn, self._logits(halves, drawn), posterior, len(halves)).logits
+        return posterior.mass(objects.logits, len(halves), unjudged=unjudged, sample=sample)
+
+    def _logits(self, halves: Floats, rows: Rows) -> Floats:
+        """Match logits of the rows, summed over grasps."""
+        every = len(rows) == self.generation.count
+        logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
+        return self.objects.equal_for_equals(rows, logits)
+
+
+class Shards:
+    """Several shards of one process as one. described: of all of them together."""
+
+    def __init__(self, shards: Sequence[Shard], described: Described) -> None:
+        self.shards, self.described = list(shards), described
+
+    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
+        """As `Shard.ask`."""
+        return merged([shard.ask(felt, top, candidates, posterior) for shard in self.shards], top)
+
+    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
+        """As `Shard.rows`."""
+        return first_rows([shard.rows(ids) for shard in self.shards])
+
+
+def merged(answers: Sequence[Judged], top: int) -> Judged:
+    """One answer of those of several shards, one at least."""
+    if not answers:
+        raise BadInput("there is no answer to merge; a cluster needs a shard at least")
+    best = sorted((one for answer in answers for one in answer.best), key=lambda one: (-one.logit, one.photo.object_id))
+    masses = [answer.mass for answer in answers if answer.mass is not None]
+    stages = dict.fromkeys(stage for answer in answers for stage in answer.timing_ms)
+    return Judged(
+        sum(answer.photos for answer in answers),
+        sum(answer.objects for answer in answers),
+        best[:top],
+        Mass.joined(masses) if masses else None,
+        sum(answer.searched for answer in answers),
+        {stage: max(answer.timing_ms.get(stage, 0.0) for answer in answers) for stage in stages},
+    )
+
+
+def first_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
+    """Of what shards say of the same photos, what is not None."""
+    return [next((row for row in rows if row is not None), None) for rows in zip(*found, strict=True)]
