@@ -121,10 +121,10 @@ def paired(bench, share):
     )
 
 
-async def _load(url, body, clients, seconds):
+async def _load(url, body, clients, seconds, pause_s=0.0):
     """Of accepted queries the seconds that they took, and that their searches took; and statuses.
 
-    A client that is told to come again does so when it was told. As the clients share the machine with the service they
+    A client pauses between two queries; one that is told to come again does so when it was told. As the clients share the machine with the service they
     send bytes made once, over bare lines.
     """
     taken, searches, statuses, until = [], [], Counter(), time.monotonic() + seconds
@@ -145,8 +145,7 @@ async def _load(url, body, clients, seconds):
             if headers.get("connection") == "close" or status is None:
                 line[1].close()
                 line = None
-            if status == 429:
-                await asyncio.sleep(float(headers["retry-after"]))
+            await asyncio.sleep(float(headers["retry-after"]) if status == 429 else pause_s)
 
     await asyncio.gather(*(ask() for _ in range(clients)))
     return taken, searches, statuses
@@ -192,11 +191,11 @@ def clients(bench, share):
 
 def memory(bench, share):
     """Memory of the process over minutes of load, the history kept."""
-    seconds, found = of(share, 1200, 40), []
+    seconds, found, loads = of(share, 1200, 40), [], []
     with command("--index", bench.index, "--port", "0", "--history", bench.folder / "kept") as (process, url, _):
         asyncio.run(_load(url, bench.body, 8, 30))  # what is made at first is made by then
         ended = time.monotonic() + seconds
-        load = threading.Thread(target=lambda: asyncio.run(_load(url, bench.body, 8, seconds)))
+        load = threading.Thread(target=lambda: loads.append(asyncio.run(_load(url, bench.body, 8, seconds, 0.5))))
         load.start()
         while time.monotonic() < ended:
             found.append(resident_mb(process.pid))
@@ -204,7 +203,12 @@ def memory(bench, share):
         load.join()
     third = len(found) // 3
     first, last = statistics.median(found[:third]), statistics.median(found[-third:])
-    say("memory", f"{seconds} s: first third {first:.0f} MB, last third {last:.0f} MB: {last - first:+.1f} MB", "flat")
+    say(
+        "memory",
+        f"{seconds} s, {len(loads[0][0])} queries kept: first third {first:.0f} MB, last third {last:.0f} MB: "
+        f"{last - first:+.1f} MB",
+        "flat",
+    )
 
 
 def reloads(bench, share):
