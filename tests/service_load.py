@@ -124,8 +124,8 @@ def paired(bench, share):
 async def _load(url, body, clients, seconds, pause_s=0.0):
     """Of accepted queries the seconds that they took, and that their searches took; and statuses.
 
-    A client pauses between two queries; one that is told to come again does so when it was told. As the clients share the machine with the service they
-    send bytes made once, over bare lines.
+    A client pauses between two queries; one that is told to come again does so when it was told. As the clients share
+    the machine with the service they send bytes made once, over bare lines.
     """
     taken, searches, statuses, until = [], [], Counter(), time.monotonic() + seconds
     request = httpx.Request("POST", f"{url}/v1/query", json=body)
