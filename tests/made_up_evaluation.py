@@ -111,6 +111,16 @@ def examples(rng, grasps, objects, best):
     return queries
 
 
+def some(rng, grasps, objects):
+    """Two touches of these objects, each with the grasp of a photo that was found for it."""
+    own = [grasp for grasp in grasps if grasp.object_id in objects]
+    found = [grasp.grasp_id for grasp in grasps]
+    return [
+        {"grasp_id": own[at].grasp_id, "object_id": own[at].object_id, "found": str(rng.choice(found))}
+        for at in rng.permutation(len(own))[:2]
+    ]
+
+
 def method(rng, name, grasps, split):
     """All that results.json says of one method."""
     skill = SKILL.get(name, 0.9)
@@ -124,8 +134,10 @@ def method(rng, name, grasps, split):
         "measures": measures(rng, skill),
         "per_object": {"test_candidates": {item: draw[item] for item in test}, "all_candidates": draw},
         "confusions": [
-            {"object_id": a, "mistaken_for": b, "share": float(s)} for (a, b), s in zip(pairs, shares, strict=True)
+            {"object_id": a, "mistaken_for": b, "share": float(s), "grasps": some(rng, grasps, [a])}
+            for (a, b), s in zip(pairs, shares, strict=True)
         ],
+        "guessed": {str(k): [some(rng, grasps, test) for _ in range(k)] for k in (5, 10)},
         "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
         "calibration": {
             "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},

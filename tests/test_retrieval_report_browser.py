@@ -1,4 +1,4 @@
-"""The page of an evaluation in a real browser, from the disk: its tables sort and filter."""
+"""The page of an evaluation in a real browser, from the disk: its tables sort and filter, its pictures show grasps."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def opened(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     recording = synthetic.write_recording(folder / "recording", synthetic.make_objects(12), 3)
     out = write_made_up(recording, folder / "out", ("late_fusion", "cca", "plsca", "chance"))
-    write_report(out, None)
+    write_report(out, recording)
     with chromium() as browser, page(browser, (out / "report.html").as_uri(), offline=True) as found:
         yield found
 
@@ -44,5 +44,51 @@ def test_words_leave_the_rows_that_hold_them_all(opened):
     assert rows.count() == before
 
 
+def test_a_click_on_a_confusion_shows_touches_that_were_mistaken_with_their_pictures(opened):
+    pair = opened.get_by_role("button", name="taken for").first
+    told = pair.get_attribute("aria-label")
+    pair.click()
+    shown = opened.get_by_role("region", name="Grasps that were clicked")
+    assert shown.get_by_role("heading").inner_text() == told
+    cards = shown.locator(".cards li")
+    assert all(text.startswith(told.split(" taken for ")[0]) for text in cards.locator("p").all_inner_texts())
+    pictures = shown.locator("img")
+    assert (cards.count(), pictures.count()) == (2, 8)  # two gels, the object, and what was found, of each
+    assert pictures.evaluate_all("all => all.every((one) => one.complete && one.naturalWidth > 0)")
+    pair.click()
+    assert shown.count() == 0
+
+
+def test_a_point_of_a_guess_curve_stands_where_it_is_drawn_and_shows_grasps(opened):
+    figure = opened.locator("figure", has=opened.get_by_alt_text("Rising curves")).first
+    points = figure.get_by_role("button", name="late fusion: found with guess")
+    assert points.count() == 15  # of five candidates and of ten
+    colour = (0, 114, 178)  # the method's
+    for point in (points.nth(0), points.nth(3), points.nth(14)):
+        point.click()
+        assert figure.locator(".shown h3").inner_text() == point.get_attribute("aria-label")
+        assert figure.locator(".shown img").count() > 0
+        opened.keyboard.press("Escape")
+        near = opened.evaluate(PIXELS, point.element_handle())
+        assert any(max(abs(a - b) for a, b in zip(pixel, colour, strict=True)) < 40 for pixel in near)
+    points.nth(0).focus()
+    opened.keyboard.press("ArrowRight")
+    assert "guess 2 of 5" in opened.evaluate("document.activeElement.ariaLabel")
+
+
+PIXELS = """(spot) => {
+    const image = spot.parentElement.querySelector("img");
+    const [at, of] = [spot.getBoundingClientRect(), image.getBoundingClientRect()];
+    const canvas = new OffscreenCanvas(image.naturalWidth, image.naturalHeight).getContext("2d");
+    canvas.drawImage(image, 0, 0);
+    const scale = image.naturalWidth / of.width;
+    const x = (at.x + at.width / 2 - of.x) * scale, y = (at.y + at.height / 2 - of.y) * scale;
+    const found = canvas.getImageData(x - 3, y - 3, 7, 7).data;
+    return Array.from({ length: 49 }, (_, n) => [...found.slice(4 * n, 4 * n + 3)]);
+}"""
+"""Colours of the picture under the middle of a place."""
+
+
 def test_axe_finds_nothing_serious(opened):
+    opened.get_by_role("button", name="taken for").first.click()
     assert serious(opened) == []

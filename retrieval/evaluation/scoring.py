@@ -18,6 +18,7 @@ from retrieval.evaluation.calibrate import (
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
+from retrieval.evaluation.shown import Shown
 from retrieval.metrics import protocols
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
@@ -26,7 +27,8 @@ from retrieval.metrics.registry import SHOWN_PHOTOS, Scored, guesses, take
 from retrieval.metrics.table import ScoreTable
 
 CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, SHOWN_PHOTOS))
-_CONFUSIONS, _EXAMPLES, _RANKED = 12, 6, 6
+_CONFUSIONS = 12
+_GUESSES = (5, 10)
 
 Measures = dict[str, Measure]
 
@@ -105,21 +107,23 @@ def score_method(
 ) -> tuple[dict[str, Any], list[Measures]]:
     """A method's entry of results.json, and its measures by training seed for comparisons.
 
-    Values are means over the training seeds; reliability, reject's curves and the examples are those of the first.
+    Values are means over the training seeds; reliability, reject's curves and the grasps shown are those of the first.
     "reject" is None where validation or test objects are fewer than three.
     """
     judged = [MethodScores(queries, predictions, seed) for predictions in by_seed]
+    shown = Shown(judged[0].touches("test", "test"), queries, grasp_ids)
     calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in judged]
     measures = [take(one.scored(fitted.pairs[1])) for one, fitted in zip(judged, calibrations, strict=True)]
     entry = {
         "chosen": [predictions.chosen for predictions in by_seed],
         "measures": summaries(measures, draws, seed),
         "per_object": _per_object(queries, judged, measures, seed),
-        "confusions": _confusions(queries, judged, seed),
+        "confusions": _confusions(queries, judged, shown, seed),
         "calibration": calibrations[0].to_dict(),
         "reliability": reliability(calibrations[0], judged[0].by_grasps("test"), CHOICES, seed=seed),
         "reject": _reject(judged, calibrations, draws, seed),
-        "examples": _examples(judged[0].touches("test", "test"), queries, grasp_ids),
+        "examples": shown.examples(),
+        "guessed": {str(k): found for k in _GUESSES if (found := shown.guessed(k, seed))},
     }
     return entry, measures
 
@@ -144,7 +148,7 @@ def _mean_by_name(queries: Queries, by_seed: Iterable[Mapping[int, float]]) -> d
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def _confusions(queries: Queries, judged: Sequence[MethodScores], seed: int) -> list[dict[str, Any]]:
+def _confusions(queries: Queries, judged: Sequence[MethodScores], shown: Shown, seed: int) -> list[dict[str, Any]]:
     """The largest shares of first guesses among all test objects that fell on a wrong one."""
     shares: dict[tuple[int, int], float] = {}
     for one in judged:
@@ -153,7 +157,13 @@ def _confusions(queries: Queries, judged: Sequence[MethodScores], seed: int) -> 
     largest = sorted(shares.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
     names = queries.objects
     return [
-        {"object_id": names[true], "mistaken_for": names[guessed], "share": share} for (true, guessed), share in largest
+        {
+            "object_id": names[true],
+            "mistaken_for": names[guessed],
+            "share": share,
+            "grasps": shown.mistaken(true, guessed),
+        }
+        for (true, guessed), share in largest
     ]
 
 
@@ -186,32 +196,3 @@ def _rejections(judged: MethodScores, calibrations: Calibrations, seed: int) -> 
         for grasps, table in tables
         if grasps in fitted and enough_objects(table)
     }
-
-
-def _examples(table: ScoreTable, queries: Queries, grasp_ids: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """The best and the worst queries, one of an object: by the rank of its first photo, then by the margin."""
-    ranks = protocols.true_ranks(table)
-    shown = np.where(table.own, -np.inf, table.scores)
-    margin = np.where(table.relevant, shown, -np.inf).max(1) - np.where(table.relevant, -np.inf, shown).max(1)
-    order = [row for row in np.lexsort((-margin, ranks)) if table.askable[row]]
-    touches, photos = (queries.of_part(owner, "test") for owner in (queries.touch_owner, queries.photo_owner))
-
-    def example(row: int) -> dict[str, Any]:
-        columns = np.argsort(-shown[row], kind="stable")[:_RANKED]
-        return {
-            "grasp_id": grasp_ids[queries.touches[touches[row]]],
-            "object_id": queries.objects[table.touch_owner[row]],
-            "true_rank": float(ranks[row]),
-            "ranked": [grasp_ids[queries.photos[photos[column]]] for column in columns],
-        }
-
-    first, last = (_one_each(rows, table.touch_owner) for rows in (order, order[::-1]))
-    return {"best": [example(row) for row in first], "worst": [example(row) for row in last]}
-
-
-def _one_each(rows: Sequence[int], owner: NDArray[np.int64]) -> list[int]:
-    """The first row of each object, the first few of these."""
-    first: dict[int, int] = {}
-    for row in rows:
-        first.setdefault(int(owner[row]), int(row))
-    return list(first.values())[:_EXAMPLES]

@@ -1,11 +1,12 @@
 """What every section of an evaluation's report is built with."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 from retrieval.report.canvas import draw
-from retrieval.report.document import Block, Details, Picture
+from retrieval.report.document import Block, Card, Details, Picture, Spot
 from retrieval.report.galleries import Grasps
 from retrieval.report.results import Results, at_start, measure_label, method_label, percent
 
@@ -18,10 +19,37 @@ class Builder:
         self.main = (results.learned or results.methods)[0]
         self.figures: list[Path] = []
 
-    def picture(self, name: str, alt: str, caption: str, make: Callable[..., Any], *arguments: Any) -> Picture:
-        path = draw(self.out / "figures" / name, make, *arguments)
+    def picture(
+        self,
+        name: str,
+        alt: str,
+        caption: str,
+        make: Callable[..., Any],
+        *arguments: Any,
+        spots: Mapping[str, Sequence[tuple[str, Sequence[Any]]]] | None = None,
+    ) -> Picture:
+        """A figure. spots: by the `gid` of what the figure shows, for each of its places a label and the grasps that
+        results.json names there."""
+        path = self.out / "figures" / name
+        places = draw(path, make, *arguments)
         self.figures.append(path)
-        return Picture(f"figures/{name}", alt, caption)
+        clicked = [
+            Spot(box, label, tuple(map(self._card, grasps)))
+            for gid, asked in (spots or {}).items()
+            for box, (label, grasps) in zip(places.get(gid, ()), asked, strict=False)
+            if grasps and self.grasps
+        ]
+        return Picture(f"figures/{name}", alt, caption, tuple(clicked))
+
+    def _card(self, shown: Any) -> Card:
+        """A grasp of results.json: its gel images, its object, and the photo that was found."""
+        own, found = self.grasps.get(shown["grasp_id"]), self.grasps.get(shown["found"])
+        taken = found.object_id if found else shown["found"]
+        touches = own.touches if own else ()
+        gels = [(f"finger {ascii_lowercase[place]}", path) for place, path in enumerate(touches)]
+        right = "found first" if taken == shown["object_id"] else "found first, wrongly"
+        photos = [("the object", own.photo if own else None), (f"{right}: {taken}", found.photo if found else None)]
+        return Card(f"{shown['object_id']}, grasp {shown['grasp_id']}", (*gels, *photos))
 
     def any(self, *measures: str) -> bool:
         return any(self.results.summary(name, key) for name in self.results.methods for key in measures)

@@ -77,10 +77,21 @@ def percent_axis(panel: Axes, label: str) -> None:
     panel.set_ylabel(label)
 
 
-def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
+@dataclass(frozen=True)
+class Box:
+    """Where something stands in a figure, in shares of its width and height; left and top from its upper left."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+
+def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, list[Box]]:
     """Write the figure that `make(*arguments)` gives; a .jpg holds photographs, a .png holds lines.
 
-    Raises RetrievalError where matplotlib is missing.
+    Returns where what the figure gave a name to (`gid`) stands: a line's points, the box of anything else. Raises
+    RetrievalError where matplotlib is missing.
     """
     try:
         from matplotlib import rc_context
@@ -92,7 +103,7 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(_RC), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
-        agg: Any = FigureCanvasAgg(make(*arguments))
+        agg: Any = FigureCanvasAgg(figure := make(*arguments))
         agg.draw()
     image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
     if path.suffix == ".jpg":
@@ -100,4 +111,18 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> Path:
     else:  # a plot has few colours: 256 of its own make the file three times smaller
         image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     write_atomically(path, data.getvalue())
-    return path
+    width, height = agg.get_width_height()
+    named = figure.findobj(lambda artist: artist.get_gid() is not None)
+    return {artist.get_gid(): [_box(corners, width, height) for corners in _corners(artist)] for artist in named}
+
+
+def _corners(artist: Any) -> list[tuple[float, float, float, float]]:
+    """Left, bottom, right, top in pixels from the lower left."""
+    if hasattr(artist, "get_xydata"):
+        return [(x, y, x, y) for x, y in artist.get_transform().transform(artist.get_xydata())]
+    return [artist.get_window_extent().extents]
+
+
+def _box(corners: tuple[float, float, float, float], width: float, height: float) -> Box:
+    left, bottom, right, top = corners
+    return Box(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)

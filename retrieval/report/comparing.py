@@ -1,11 +1,13 @@
 """Sections that set the methods side by side, and say whether the result can be believed."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from retrieval.metrics.registry import PHOTO_TO_TOUCH, SET_SIZES, TOUCH_TO_PHOTO, of_grasps
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
+from retrieval.report.results import method_label
 
 INTERVALS = (
     "Brackets hold 95 % intervals: a bootstrap that resamples objects, since queries of one object are alike. Every "
@@ -48,13 +50,26 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
     yield builder.picture(
         "guess-curves.png",
         f"Rising curves. {builder.values('guesses_k5')}. {builder.values('guesses_k10')}.",
-        "How often the object is found within N guesses, the true one among K − 1 others. Bands: 95 % intervals.",
+        "How often the object is found within N guesses, the true one among K − 1 others. Bands: 95 % intervals. On "
+        "the page a click on a point shows grasps that it stands for.",
         plots.guess_curves,
         builder.results,
+        spots={
+            f"{name} guesses_k{k}": _guessed(builder, name, k)
+            for name in reversed(builder.results.learned)  # the last lies on top
+            for k in (5, 10)
+        },
     )
     for k in (5, 10):
         if table := tables.guesses(builder.results, f"guesses_k{k}"):
             yield Details(f"Numbers for {k} candidates", (table,))
+
+
+def _guessed(builder: Builder, name: str, k: int) -> list[tuple[str, Sequence[Any]]]:
+    """For each point of a guess curve what it is, and touches whose object takes that many guesses."""
+    found = builder.results.data["methods"][name].get("guessed", {}).get(str(k), [])
+    label = method_label(name)
+    return [(f"{label}: found with guess {number} of {k}", shown) for number, shown in enumerate(found, start=1)]
 
 
 def grasps(builder: Builder) -> Iterator[Block | None]:

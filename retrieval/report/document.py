@@ -12,10 +12,11 @@ from typing import Any, ClassVar
 
 from PIL import Image
 
-from retrieval.report.canvas import FIGURE_DPI
-from retrieval.report.pages import data_uri, render, script
+from retrieval.report.canvas import FIGURE_DPI, Box
+from retrieval.report.pages import data_uri, jpeg, render, script, thumbnail
 
 _PAGE_DPI = 96
+_CARD_PX = 128
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,23 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Card:
+    """A line of text, and photographs with what each shows; None for one that is not there."""
+
+    text: str
+    pictures: tuple[tuple[str, Path | None], ...]
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A place of a picture that shows cards when it is clicked. label: what is clicked, and what stands above them."""
+
+    box: Box
+    label: str
+    cards: tuple[Card, ...]
+
+
+@dataclass(frozen=True)
 class Picture:
     """A picture in a file under the document's folder. alt: what it shows, for those who cannot see it."""
 
@@ -61,6 +79,7 @@ class Picture:
     file: str
     alt: str
     caption: str
+    spots: tuple[Spot, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,7 +115,16 @@ class Document:
 
 
 def to_html(document: Document, folder: Path) -> str:
-    """One page with every picture, read from under `folder`, inside it."""
+    """One page with every picture, read from under `folder`, inside it; those of cards once each."""
+    photographs: dict[Path, str] = {}
+
+    def called(path: Path) -> str:
+        """By which a card finds its picture on the page."""
+        return photographs.setdefault(path, f"p{len(photographs)}")
+
+    def photograph(path: Path) -> str | None:
+        image = thumbnail(path, _CARD_PX)
+        return None if image is None else data_uri(jpeg(image), "jpeg")
 
     def uri(file: str) -> str:
         return data_uri((folder / file).read_bytes(), "png" if file.endswith(".png") else "jpeg")
@@ -109,7 +137,18 @@ def to_html(document: Document, folder: Path) -> str:
     def anchor(title: str) -> str:
         return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
-    return render("evaluation.html", document=document, uri=uri, width=width, anchor=anchor, script=script("tables.js"))
+    return render(
+        "evaluation.html",
+        document=document,
+        uri=uri,
+        width=width,
+        anchor=anchor,
+        percent="{:.2%}".format,
+        called=called,
+        photographs=photographs,
+        photograph=photograph,
+        scripts=[script("tables.js"), script("spots.js")],
+    )
 
 
 # Markdown --------------------------------------------------------------------------------------------

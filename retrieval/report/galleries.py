@@ -45,7 +45,10 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
 
 
 def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
-    """Object and what it was taken for, side by side, with the share of its queries where that came first."""
+    """Object and what it was taken for, side by side, with the share of its queries where that came first; the Nth pair
+    is called N."""
+    from matplotlib.patches import Rectangle
+
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
     figure, panel = _sheet(3.1 * columns - 0.4, 1.45 * rows - 0.15)
@@ -62,6 +65,7 @@ def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
         )
         _tile(panel, left + 1.75, top, photo_of.get(pair["mistaken_for"]), _WRONG, 2)
         _label(panel, left + 1.75, top, _two_lines(pair["mistaken_for"]))
+        panel.add_patch(Rectangle((left, top), 2.67, 0.92, fill=False, lw=0, gid=str(place)))
     return figure
 
 

@@ -60,10 +60,15 @@ def _mistaken(builder: Builder, name: str) -> Iterator[Block]:
         f"confusions-{file_name(name)}.jpg",
         f"Objects beside what they were mistaken for, {method_label(name)}: {'; '.join(told)}.",
         f"Left the object, right (red) what {method_label(name)} took it for, with the share of the object's "
-        "touches for which that came first in the full gallery of unseen objects.",
+        "touches for which that came first in the full gallery of unseen objects. On the page a click on a pair shows "
+        "such touches.",
         galleries.confusions,
         pairs,
         {grasp.object_id: grasp.photo for grasp in reversed(list(builder.grasps.values()))},
+        spots={
+            str(place): [(f"{one['object_id']} taken for {one['mistaken_for']}", one.get("grasps", ()))]
+            for place, one in enumerate(pairs)
+        },
     )
 
 

@@ -58,7 +58,8 @@ def guess_curves(results: Results) -> Figure:
             value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
             guesses, style = np.arange(1, len(value) + 1), style_of(name)
             panel.plot(guesses, _percents(summary["chance"]), color=FAINT, ls="--", lw=1.2, zorder=1)
-            panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
+            (line,) = panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line)
+            line.set_gid(f"{name} {key}")
             if name not in KNOW_NOTHING:
                 panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('guesses_k')} candidate objects")

@@ -33,14 +33,14 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     Raises RetrievalError where matplotlib is missing.
     """
     rows = {name: Row.from_dict(row) for name, row in document["rows"].items()}
-    figures = {
-        name: draw(out / "figures" / f"{name}.png", figure, row.panels) for name, row in rows.items() if row.panels
-    }
+    figures = {out / "figures" / f"{name}.png": row.panels for name, row in rows.items() if row.panels}
+    for path, panels in figures.items():
+        draw(path, figure, panels)
     page = out / "frontier.html"
     sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
     html = to_html(Document("Error against run time", tuple(_lead(document, rows)), sections), out)
     write_output(page, text_bytes(html), PAGE)
-    return [page, *figures.values()]
+    return [page, *figures]
 
 
 def _lead(document: Mapping[str, Any], rows: Mapping[str, Row]) -> Iterator[Block]:

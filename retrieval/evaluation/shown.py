@@ -1,0 +1,97 @@
+"""Which grasps stand for a number of results.json: a few, for the reader who asks to see some."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.evaluation.queries import Queries
+from retrieval.metrics import protocols
+from retrieval.metrics.registry import guesses
+from retrieval.metrics.table import ScoreTable
+
+_EXAMPLES, _RANKED, _EACH = 6, 6, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The test touches of one method and seed with the test photos, and what they are called in results.json."""
+
+    table: ScoreTable
+    queries: Queries
+    grasp_ids: Sequence[str]
+
+    def examples(self) -> dict[str, list[dict[str, Any]]]:
+        """The best and the worst queries, one of an object: by the rank of its first photo, then by the margin."""
+        ranks, seen = protocols.true_ranks(self.table), self._seen()
+        margin = self._best(self.table.relevant) - self._best(~self.table.relevant)
+        order = [row for row in np.lexsort((-margin, ranks)) if self.table.askable[row]]
+
+        def example(row: int) -> dict[str, Any]:
+            columns = np.argsort(-seen[row], kind="stable")[:_RANKED]
+            return self._query(row) | {
+                "true_rank": float(ranks[row]),
+                "ranked": [self._photo(column) for column in columns],
+            }
+
+        first, last = (self._one_each(rows, _EXAMPLES) for rows in (order, order[::-1]))
+        return {"best": [example(row) for row in first], "worst": [example(row) for row in last]}
+
+    def mistaken(self, true: int, guessed: int) -> list[dict[str, Any]]:
+        """Touches of an object that speak most for another one, each with the photo that does."""
+        of_other = np.broadcast_to(self.table.photo_owner == guessed, self.table.scores.shape)
+        margin = self._best(of_other) - self._best(self.table.relevant)
+        own = np.flatnonzero((self.table.touch_owner == true) & self.table.askable)
+        rows = own[np.argsort(-margin[own], kind="stable")][:_EACH]
+        return [self._query(row) | {"found": self._photo(self._first(of_other, row))} for row in rows]
+
+    def guessed(self, k: int, seed: int) -> list[list[dict[str, Any]]]:
+        """For the Nth guess of K: the touches whose object is likeliest found by that guess and no earlier one, one of
+        an object, each with the photo that comes first of all. Empty for fewer than K objects."""
+        measure = guesses(self.table, k, seed)
+        if measure is None:
+            return []
+        asked, every = np.flatnonzero(self.table.askable), np.ones_like(self.table.own)
+        chances = np.diff(measure.values, axis=1, prepend=0.0)
+        found = []
+        for chance in chances.T:
+            rows = [int(row) for row in np.argsort(-chance, kind="stable") if chance[row] > 0]
+            found.append(
+                [
+                    self._query(row) | {"found": self._photo(self._first(every, row))}
+                    for row in self._one_each(asked[rows].tolist(), _EACH)
+                ]
+            )
+        return found
+
+    def _seen(self) -> NDArray[np.float32]:
+        """Scores with -inf where a touch is not shown the photo: that of its own grasp."""
+        return np.where(self.table.own, -np.inf, self.table.scores)
+
+    def _best(self, among: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """Of each touch, the highest score among these photos."""
+        return np.asarray(np.where(among, self._seen(), -np.inf).max(1))
+
+    def _first(self, among: NDArray[np.bool_], row: int) -> int:
+        return int(np.where(among[row], self._seen()[row], -np.inf).argmax())
+
+    def _query(self, row: int) -> dict[str, Any]:
+        touches = self.queries.of_part(self.queries.touch_owner, "test")
+        return {
+            "grasp_id": self.grasp_ids[int(self.queries.touches[touches[row]])],
+            "object_id": self.queries.objects[self.table.touch_owner[row]],
+        }
+
+    def _photo(self, column: int) -> str:
+        """The grasp in which it was taken."""
+        photos = self.queries.of_part(self.queries.photo_owner, "test")
+        return self.grasp_ids[int(self.queries.photos[photos[column]])]
+
+    def _one_each(self, rows: Sequence[int], count: int) -> list[int]:
+        """The first row of each object, the first few of these."""
+        first: dict[int, int] = {}
+        for row in rows:
+            first.setdefault(int(self.table.touch_owner[row]), int(row))
+        return list(first.values())[:count]
