@@ -33,6 +33,7 @@ SHORTER = {
     "import": [],
     "check": [],
     "train": ["--iterations", "2"],
+    "adapt": [],
     "build-index": [],
     "query": [],
     "export": [],
@@ -77,6 +78,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     (tmp_path / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "shipped_rig.toml", tmp_path / "tests")
     (tmp_path / "points.csv").write_text(POINTS)
+    (tmp_path / "grey.toml").write_text(next(block for block in blocks("toml") if "grey" in block))
     torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
     monkeypatch.chdir(tmp_path)
     with replay_file(EmulatedWSG50(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
@@ -116,7 +118,7 @@ def test_the_settings_of_the_pages_make_a_rig(tmp_path, monkeypatch):
         rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)
         assert len(rig.object_ids(1)) == 1
         kinds.append(tomllib.loads(block)["rig"])
-    assert sorted(kinds) == ["real", "sim"]
+    assert sorted(kinds) == ["real", "sim", "sim"]
 
 
 def test_the_make_commands_exist_and_the_first_lines_name_two_of_them():

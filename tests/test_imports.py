@@ -21,7 +21,7 @@ LAYERS = (
     ("methods",),
     ("evaluation",),
     ("report",),
-    ("lab", "serve"),
+    ("adaptation", "lab", "serve"),
     ("commands",),
     ("__main__",),
 )

@@ -97,7 +97,7 @@ HARD = {
 
 
 @pytest.mark.parametrize("name", HARD)
-@pytest.mark.parametrize("kind", ["led", *fitted_names()])
+@pytest.mark.parametrize("kind", ["led", "grey", *fitted_names()])
 def test_hard_surfaces_give_pictures(name, kind):
     sensor = replace(draw_sensor(0, "a", optics=kind), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
     clean = sensor._clean(Surface(HARD[name], sensor.field))
@@ -107,6 +107,17 @@ def test_hard_surfaces_give_pictures(name, kind):
     picture = sensor.render(HARD[name], 0)
     assert picture.shape == (24, 32, 3)
     assert picture.dtype == np.uint8
+
+
+def test_a_grey_sensor_gives_grey_pictures_of_other_light():
+    heights = 0.3 * np.exp(-((np.indices((24, 32)) - 12) ** 2).sum(0) / 20.0)
+    grey = replace(draw_sensor(0, "a", optics="grey"), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
+    clean = grey._clean(Surface(heights, grey.field))
+    for channel in (1, 2):  # but for a white balance that is a little off
+        assert np.allclose(
+            clean[..., channel] / clean[..., 0], np.median(clean[..., channel] / clean[..., 0]), atol=0.02
+        )
+    assert np.ptp(clean[..., 0]) > 10  # it feels the bump
 
 
 def test_the_naive_normal_of_a_cliff_is_no_number():

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from retrieval.commands import rig
+from retrieval.commands.adapt import adapt
 from retrieval.commands.build_index import build_index
 from retrieval.commands.check import check
 from retrieval.commands.collect import collect
@@ -50,6 +51,7 @@ for _command in (
     export_recording,
     check,
     train,
+    adapt,
     build_index,
     query,
     export,

@@ -180,7 +180,7 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
     validation, test: shares of the objects, each met as closely as whole groups allow; a part that is wanted holds
     at least the two objects that pairs need. Raises DatasetError where the recording has too few for that.
     """
-    groups = _linked_objects(grasps)
+    groups = linked_objects(grasps)
     queue = [groups[index] for index in np.random.default_rng(seed).permutation(len(groups))]
     total = sum(len(group) for group in groups)
     chosen = {
@@ -213,8 +213,8 @@ def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
     return tuple(sorted(taken))
 
 
-def _linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
-    """Objects joined wherever they share a sequence; groups and members sorted."""
+def linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
+    """Objects joined wherever they share a sequence, which no split may tear apart; groups and members sorted."""
     group_of: dict[str, set[str]] = {}
     first_of_sequence: dict[str, str] = {}
     for grasp in grasps:

@@ -20,7 +20,7 @@ Objects that were not judged keep their share of the probability, estimated from
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -209,13 +209,18 @@ class JudgedTouches:
     own: NDArray[np.bool_]
 
 
-def fit_posterior(judged: JudgedTouches, *, seed: int = 0) -> Posterior:
+def fit_posterior(*parts: JudgedTouches, seed: int = 0) -> Posterior:
     """Fit on single touches of validation objects and, where an object has more, on sets of up to 5 grasps of it.
 
-    With one grasp of each object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than
-    three objects, or where no touch has another photo of its object.
+    parts: of one matcher, or of several, such as those of folds, each with objects of its own. With one grasp of each
+    object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than three objects, or where
+    no touch has another photo of its object.
     """
-    asked = []
+    return fit_questions([questions for judged in parts for questions in _asked(judged, seed)])
+
+
+def _asked(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
+    """Of single touches, and of sets of each size that its objects have grasps for."""
     for grasps in range(1, _MOST_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
         sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch
@@ -225,8 +230,7 @@ def fit_posterior(judged: JudgedTouches, *, seed: int = 0) -> Posterior:
             photos = judged.photo_owner == name
             sets += [rows for rows in draws if len(rows) == grasps and (photos & ~judged.own[rows].any(0)).any()]
         if sets or grasps == 1:
-            asked.append(Questions.of(judged, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed))
-    return fit_questions(asked)
+            yield Questions.of(judged, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,9 +79,10 @@ class World:
 class SimSettings(TypedSettings):
     """What the simulated rig is like.
 
-    fingers: those with a gel. optics: led, or a sensor fitted to real presses (gelsight, gelsight_mini). gels: so many
-    pairs serve one after the other, each for its share of the objects. markers: black dots on the gels. families: only
-    shapes of these. meshes: a folder of STL, OBJ or PLY files to hold instead (needs the extra `mesh`). contact_grid
+    fingers: those with a gel. optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses
+    (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
+    markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
+    instead (needs the extra `mesh`). contact_grid
     (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one.
     localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
     tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts are made

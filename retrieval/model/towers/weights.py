@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from retrieval.errors import CheckpointError
+from retrieval.model.towers import TOGETHER
 from retrieval.model.towers.base import Tower
+from retrieval.model.towers.side_by_side import SideBySide
 
 log = logging.getLogger(__name__)
 
@@ -25,10 +27,20 @@ def initialise_tower(tower: Tower, name: str, init: str) -> None:
     """Give `tower`, built as `name`, its first weights.
 
     init: "random" leaves it as built, "imagenet" fetches the published checkpoint once into PyTorch's cache,
-    anything else is the path of a .pth, .pt or .safetensors state dict with torchvision's key names.
+    anything else is the path of a .pth, .pt or .safetensors state dict with torchvision's key names. Towers side by
+    side take one for all of them, or as many, joined alike.
     Raises CheckpointError where a file is missing, damaged or of another architecture.
     """
     if init == "random":
+        return
+    if isinstance(tower, SideBySide):
+        names, inits = name.split(TOGETHER), init.split(TOGETHER)
+        if len(inits) not in (1, len(names)):
+            raise CheckpointError(
+                f"{len(names)} towers side by side take first weights for each, joined by {TOGETHER!r}; got {init!r}"
+            )
+        for part, its_name, its_init in zip(tower.parts, names, inits * (len(names) // len(inits)), strict=True):
+            initialise_tower(part, its_name, its_init)  # type: ignore[arg-type]
         return
     path = _imagenet_file(name) if init == "imagenet" else Path(init)
     load_tower_state(tower, read_state(path), str(path))

@@ -158,8 +158,8 @@ def _noise_tile(rows: int, cols: int, seed: int) -> Array:
 def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _ANY_GEL) -> GelSensor:
     """A sensor as one comes from the factory, and after some use: its own gel, lamps, tint and dust.
 
-    The same seed, finger and optics give the same sensor. `optics`: led, or the name of a fitted sensor. `gel`: what
-    is not to be drawn; all else is drawn as without it.
+    The same seed, finger and optics give the same sensor. `optics`: led, grey, or the name of a fitted sensor. `gel`:
+    what is not to be drawn; all else is drawn as without it.
     Raises UnknownName for other optics and RobotConfigError for an empty finger.
     """
     if optics not in OPTICS:
@@ -211,6 +211,14 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
     )
 
 
+def _draw_grey(rng: np.random.Generator) -> LedOptics:
+    """Another maker's sensor: white lamps in other places, seen by a grey camera; hence three equal channels."""
+    bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
+    glow = _draw_glow(MINI_GLOWS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
+    share = 0.55, 0.3, 0.15
+    return LedOptics(bars, (glow,) * 3, (share,) * 3, ambient=0.45, shadow=0.2)  # type: ignore[arg-type]
+
+
 def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
     turn, out, up = rng.standard_normal(3) * (math.radians(5), 0.8, 0.35)
     return replace(
@@ -240,6 +248,7 @@ def _draw_glow(glow: Glow, gain: float, rng: np.random.Generator) -> Glow:
 
 OPTICS: dict[str, Callable[[np.random.Generator], Optics]] = {
     "led": _draw_led,
+    "grey": _draw_grey,
     "gelsight": lambda _: load_fitted("gelsight"),
     "gelsight_mini": lambda _: load_fitted("gelsight_mini"),
 }

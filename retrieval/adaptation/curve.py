@@ -1,0 +1,200 @@
+"""How many touches of how many own objects does it take? Fits on fewer of them, judged on objects left out."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from indexes.store.files import write_atomically
+from retrieval.adaptation.folds import Blocks, Fold, draw_folds, first_guesses, measure, told
+from retrieval.adaptation.maps import RIDGES, fit_codes
+from retrieval.adaptation.material import Material, widths_of
+from retrieval.console.files import MARKED
+from retrieval.console.progress import Bar
+from retrieval.metrics.intervals import summarise
+from retrieval.metrics.measure import Measure
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import one_thread
+from retrieval.model.fusion import Matcher, score_halves
+from retrieval.model.towers.side_by_side import SideBySide
+from retrieval.report.canvas import FAINT, Figure, canvas, draw, percent_axis
+from retrieval.training.features import Features, encode_recording
+from retrieval.version import __version__
+
+OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
+"""What is tried: so many own objects, of which all outside the fold at most, and so many touches of each."""
+RIDGE = RIDGES[1]
+BOTH, TAUGHT, PUBLISHED = "adapted", "towers of the model alone", "published towers alone"
+BLURRED, AS_IT_IS = "adapted, touches blurred", "the model as it is"
+COLOURS = ("#9ecae1", "#56b4e9", "#0072b2", "#08306b")
+
+
+Interval = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One place on the curve: a fit on so many touches of each of so many objects, and its first guesses and pair
+    accuracy on those left out, each with the ends of its interval by object."""
+
+    what: str
+    objects: int
+    touches: int
+    first: Interval
+    pairs: Interval
+    chance: float
+
+    @classmethod
+    def of(cls, what: str, objects: int, touches: int, first: Measure, pairs: Measure) -> "Point":
+        """Of measures over the objects left out."""
+        return cls(what, objects, touches, interval_of(first), interval_of(pairs), float(first.chance[0]))
+
+
+def interval_of(measure: Measure) -> Interval:
+    """A value, and the ends of its interval."""
+    found = summarise([measure])
+    return found["value"][0], found["low"][0], found["high"][0]
+
+
+@one_thread()
+def learning_curve(
+    material: Material, start: Checkpoint, *, cache: Path | None = None, seed: int = 0, quiet: bool = False
+) -> list[Point]:
+    """Fits on fewer touches of fewer objects; beside them, with all that a fit here takes: the towers of each side
+    alone, the blurred control, and the model that one started from, as it is.
+
+    cache: where the features of that last one are kept. Raises BadInput for fewer than six objects.
+    """
+    folds = draw_folds(material.grasps, seed)
+    features, blocks = material.features, material.blocks
+    most = min(len(set(features.object_ids)) - len(fold) for fold in folds)
+    held = int(np.bincount(features.owner).min())
+    objects, touches = (
+        sorted({min(count, end) for count in counts}) for counts, end in ((OBJECTS, most), (TOUCHES, held))
+    )
+    tried = [(BOTH, features, blocks, count, each) for count in objects for each in touches]
+    tried.append((BLURRED, material.blurred, blocks, objects[-1], touches[-1]))
+    if isinstance(material.matcher.touch_tower, SideBySide):
+        for place, name in enumerate((TAUGHT, PUBLISHED)):
+            tried.append((name, *one_tower(material, place), objects[-1], touches[-1]))
+    points = [_as_it_is(material, start, folds, cache, quiet)]
+    with Bar("learning curve", len(tried), "fits", quiet=quiet) as bar:
+        for what, shown, widths, count, each in tried:
+            points.append(_point(what, shown, widths, folds, count, each, seed))
+            bar.advance()
+    return points
+
+
+def _point(
+    what: str, features: Features, blocks: Blocks, folds: Sequence[Sequence[str]], objects: int, touches: int, seed: int
+) -> Point:
+    """Of every fold, a fit on objects and touches drawn from those outside it."""
+    rng = np.random.default_rng([seed, objects, touches])
+    everyone = {name for fold in folds for name in fold}
+    parts = []
+    for fold in folds:
+        chosen = rng.permutation(sorted(everyone.difference(fold)))[:objects]
+        rows = [rng.permutation(np.flatnonzero(_owned(features, name)))[:touches] for name in chosen]
+        learned = features.select(np.sort(np.concatenate(rows)))
+        touch = learned.touch.reshape(len(learned), -1)
+        codes = dict(fit_codes(touch, learned.photo, learned.owner, blocks, ridges=(RIDGE,)))
+        parts.append(first_guesses(Fold(features.of_objects(fold), codes), RIDGE))
+    return Point.of(what, objects, touches, measure(parts, "first"), measure(parts, "below"))
+
+
+def _owned(features: Features, name: str) -> NDArray[np.bool_]:
+    return np.array([each == name for each in features.object_ids])
+
+
+def one_tower(material: Material, place: int) -> tuple[Features, Blocks]:
+    """What one of the towers that stand side by side makes of the grasps alone."""
+
+    def part(x: NDArray[np.float32], widths: Sequence[int], images: int) -> NDArray[np.float32]:
+        its = np.split(x.reshape(len(x), images, -1), np.cumsum(widths)[:-1], axis=2)[place]
+        return np.ascontiguousarray(its)
+
+    matcher, features = material.matcher, material.features
+    felt, seen = widths_of(matcher.touch_tower), widths_of(matcher.photo_tower)
+    fingers = matcher.config.fingers
+    touch, photo = part(features.touch, felt, fingers), part(features.photo, seen, matcher.views)
+    alone = replace(features, touch=touch, photo=photo.reshape(len(photo), -1))
+    return alone, ([felt[place]] * fingers, [seen[place]] * matcher.views)
+
+
+def _as_it_is(
+    material: Material, start: Checkpoint, folds: Sequence[Sequence[str]], cache: Path | None, quiet: bool
+) -> Point:
+    """The start with nothing fitted; a touch of fewer fingers than it takes is given to each of them."""
+    fingers, wanted = material.config.matcher.fingers, start.config.matcher.fingers
+    config = replace(start.config, matcher=replace(start.config.matcher, fingers=fingers))
+    seen = Matcher(config.matcher, start.matcher.views).eval()
+    seen.touch_tower, seen.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
+    features = encode_recording(material.grasps, seen, config, cache, quiet=quiet)
+    parts = []
+    for fold in folds:
+        asked = features.of_objects(fold)
+        touch = np.resize(asked.touch.transpose(1, 0, 2), (wanted, *asked.touch.shape[::2])).transpose(1, 0, 2)
+        with torch.inference_mode():
+            felt = start.matcher.touch_code(torch.from_numpy(touch.reshape(len(asked), -1).copy())).half
+            photo = start.matcher.photo_code(torch.from_numpy(asked.photo)).half.numpy()
+        scores = np.stack([score_halves(start.matcher.head, half[None], photo) for half in felt])
+        parts.append(told(scores, asked))
+    return Point.of(AS_IT_IS, 0, 0, measure(parts, "first"), measure(parts, "below"))
+
+
+def write_curve(folder: Path, points: Sequence[Point]) -> Path:
+    """curve.json, curve.png and curve.md in `folder`; returns the last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {"software": __version__, "points": [asdict(point) for point in points]}
+    write_atomically(folder / "curve.json", f"{json.dumps(document, indent=1)}\n".encode())
+    draw(folder / "curve.png", _figure, points)
+    path = folder / "curve.md"
+    write_atomically(path, "\n".join(_text(points)).encode())
+    return path
+
+
+def _text(points: Sequence[Point]) -> Iterator[str]:
+    yield from (MARKED, "# How many touches of how many own objects?", "")
+    yield "First guess and pair accuracy of one touch on objects that were left out of the fit; intervals by object,"
+    yield f"chance {points[0].chance:.3f} and .500.\n"
+    yield "| what | objects | touches of each | first guess | pair accuracy |\n|---|---|---|---|---|"
+    for point in points:
+        yield (
+            f"| {point.what} | {point.objects} | {point.touches} | {{:.3f}} [{{:.3f}}, {{:.3f}}] ".format(*point.first)
+            + "| {:.3f} [{:.3f}, {:.3f}] |".format(*point.pairs)
+        )
+    yield "\n![learning curve](curve.png)\n"
+
+
+def _figure(points: Sequence[Point]) -> Figure:
+    figure = canvas(6.4, 3.8)
+    panel = figure.add_subplot()
+    fitted = [point for point in points if point.what == BOTH]
+    for objects, colour in zip(sorted({point.objects for point in fitted}), COLOURS, strict=False):
+        line = [point for point in fitted if point.objects == objects]
+        across = [point.touches for point in line]
+        panel.fill_between(
+            across,
+            [100 * p.first[1] for p in line],
+            [100 * p.first[2] for p in line],
+            color=colour,
+            alpha=0.12,
+            lw=0,
+        )
+        panel.plot(across, [100 * p.first[0] for p in line], "o-", color=colour, label=f"{objects} own objects")
+    for what, dashes in ((AS_IT_IS, ":"), (BLURRED, "--")):
+        level = next(100 * point.first[0] for point in points if point.what == what)
+        panel.axhline(level, color=FAINT, ls=dashes, lw=1.2, label=what)
+    panel.axhline(100 * points[0].chance, color=FAINT, lw=0.8, label="chance")
+    panel.set_xscale("log")
+    ticks = sorted({point.touches for point in fitted})
+    panel.set_xticks(ticks, [str(tick) for tick in ticks])
+    panel.minorticks_off()
+    panel.set_xlabel("touches of each own object")
+    percent_axis(panel, "first guess right, objects left out (%)")
+    panel.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure

@@ -1,0 +1,85 @@
+"""What a fit is worth: first guesses on own objects that were left out of it, beside the same of blurred touches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from retrieval.adaptation.folds import Fold, best_ridge, draw_folds, first_guesses, fit_folds, measure
+from retrieval.adaptation.material import Material
+from retrieval.console.output import say
+from retrieval.errors import BadInput
+from retrieval.metrics.intervals import compare, summarise
+from retrieval.metrics.measure import Measure
+from retrieval.model.encode import one_thread
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the fit is worth on objects left out; the same of blurred touches is the control.
+
+    ridge: the one chosen. folds: the fits behind it. first, below: first guesses among a fold's objects, and pairs.
+    """
+
+    ridge: float
+    folds: list[Fold]
+    first: Measure
+    below: Measure
+    blurred_first: Measure
+    blurred_below: Measure
+
+    def lines(self) -> list[str]:
+        """For people."""
+        found = [("first guess", self.first, self.blurred_first), ("pair accuracy", self.below, self.blurred_below)]
+        lines = [f"objects left out once each, one touch, {self.first.gallery}:"]
+        for name, touched, control in found:
+            mine, other, gain = summarise([touched]), summarise([control]), compare([touched], [control])
+            lines.append(
+                f"  {name} {interval(mine)}; blurred touch {interval(other)}; chance {mine['chance'][0]:.3f}; "
+                f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
+            )
+        lines.append("  " + self.verdict)
+        return lines
+
+    @property
+    def verdict(self) -> str:
+        """Whether the touch itself was felt, in words."""
+        gain = compare([self.first], [self.blurred_first])
+        if gain["low"] > 0:
+            return "the touch tells more than its blur does: what was learnt is more than light and coarse shape"
+        return "the touch tells no more than its blur does: this is not shown to be touch; record more objects"
+
+    def to_dict(self) -> dict[str, float]:
+        """As the checkpoint keeps it."""
+        return {
+            "left_out_first_guess": float(self.first.by_object()[1].mean()),
+            "left_out_first_guess_blurred": float(self.blurred_first.by_object()[1].mean()),
+            "left_out_first_guess_chance": float(self.first.chance[0]),
+            "left_out_pair_accuracy": float(self.below.by_object()[1].mean()),
+            "left_out_pair_accuracy_blurred": float(self.blurred_below.by_object()[1].mean()),
+        }
+
+
+def interval(summary: dict[str, Any]) -> str:
+    """A value with its interval."""
+    return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
+
+
+@one_thread()
+def judge(material: Material, *, seed: int, quiet: bool) -> Estimate | None:
+    """The estimate from objects left out; None where there are too few of them."""
+    try:
+        drawn = draw_folds(material.grasps, seed)
+    except BadInput as error:
+        if not quiet:
+            say(f"nothing is known of how good this is: {error}")
+        return None
+    folds, blurred = (
+        list(fit_folds(features, drawn, material.blocks, what=what, quiet=quiet))
+        for features, what in ((material.features, "touches"), (material.blurred, "blurred touches"))
+    )
+    ridge, its = best_ridge(folds), best_ridge(blurred)
+    told, control = [first_guesses(fold, ridge) for fold in folds], [first_guesses(fold, its) for fold in blurred]
+    return Estimate(
+        ridge,
+        folds,
+        *(measure(parts, column) for parts in (told, control) for column in ("first", "below")),
+    )

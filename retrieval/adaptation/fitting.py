@@ -1,0 +1,118 @@
+"""The checkpoint: codes fitted on all own objects become a matcher's projections, folds say what its logits mean."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from retrieval.adaptation.estimate import Estimate
+from retrieval.adaptation.folds import Fold
+from retrieval.adaptation.maps import Affine, Codes, fit_codes
+from retrieval.adaptation.material import Material
+from retrieval.data.dataset import Split, data_digest
+from retrieval.metrics.pairs import fit_calibration
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import default_device, one_thread
+from retrieval.model.fusion import Matcher
+from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
+from retrieval.training.batches import FrozenFeatures
+from retrieval.training.features import by_image
+from retrieval.training.judgement import with_verdicts
+
+MOST_JUDGED = 60
+"""Touches of an object that the posterior is fitted on."""
+
+
+@one_thread()
+def fitted(material: Material, estimate: Estimate | None, out: Path) -> Checkpoint:
+    """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridge."""
+    features, config, matcher = material.features, material.config, material.matcher
+    by_ridge = dict(
+        fit_codes(features.touch.reshape(len(features), -1), features.photo, features.owner, material.blocks)
+    )
+    codes = by_ridge[estimate.ridge if estimate else max(by_ridge)]
+    scale, offset = _log_odds(estimate.folds, estimate.ridge) if estimate else (1.0, 0.0)
+    install(matcher, codes, scale, offset)
+    objects = tuple(sorted(set(features.object_ids)))
+    return Checkpoint(
+        path=out,
+        digest="",
+        config=config,
+        provenance={
+            "step": 0,
+            "source": material.source,
+            "data_digest": data_digest(material.grasps),
+            "metrics": estimate.to_dict() if estimate else {},
+        },
+        gel_check=None,
+        matcher=matcher,
+        split=Split(config.training.seed, train=objects, validation=(), test=()),
+    )
+
+
+def _log_odds(folds: list[Fold], ridge: float) -> tuple[float, float]:
+    """Scale and offset that make of a cosine the log-odds of a match, with as many pairs that match as do not."""
+    cosines, labels = [], []
+    for fold in folds:
+        same = fold.left_out.owner[:, None] == fold.left_out.owner
+        given = fold.cosines(ridge).ravel()
+        rng = np.random.default_rng(0)
+        pairs = [rng.permutation(np.flatnonzero(part.ravel())) for part in (same, ~same)]
+        count = min(len(pairs[0]), len(pairs[1]), 20_000)
+        cosines += [given[part[:count]] for part in pairs]
+        labels += [np.ones(count), np.zeros(count)]
+    found = fit_calibration(np.concatenate(cosines), np.concatenate(labels))
+    return found.slope, found.intercept
+
+
+@torch.no_grad()
+def install(matcher: Matcher, codes: Codes, scale: float, offset: float) -> None:
+    """Make the matcher judge by `scale * cosine + offset` of the codes; its layers of the head add nothing."""
+    for projection, found in ((matcher.touch_projection, codes.touch), (matcher.photo_projection, codes.photo)):
+        _set(projection, found)
+    for parameter in matcher.head.parameters():
+        parameter.zero_()
+    matcher.head.out.bias.fill_(offset)
+    assert matcher.cosine_scale is not None
+    matcher.cosine_scale.fill_(scale)
+
+
+def _set(layer: nn.Linear, found: Affine) -> None:
+    """Codes may be shorter than the layer: the rest stays 0, which no cosine sees."""
+    used = found.weight.shape[1]
+    layer.weight.zero_()
+    layer.bias.zero_()
+    layer.weight[:used] = _float(found.weight.T)
+    layer.bias[:used] = _float(found.bias)
+
+
+def _float(values: np.ndarray[Any, Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
+    """With the check of touches, whose thresholds come from half of the objects, and with the posterior of the folds:
+    codes know the objects that they were fitted on too well to say what a match is worth."""
+    device = default_device()
+    source = FrozenFeatures(made.config, device, by_image(material.grasps, material.features, device))
+    names = sorted({grasp.object_id for grasp in material.grasps})
+    halves = [[grasp for grasp in material.grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    made.matcher.to(device)
+    with source:
+        made = with_verdicts(made, source, *halves, quiet=quiet)
+    return dataclasses.replace(made, posterior=_posterior(made.matcher, estimate) if estimate else None)
+
+
+def _posterior(matcher: Matcher, estimate: Estimate) -> Posterior:
+    assert matcher.cosine_scale is not None
+    scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
+    parts = []
+    for fold in estimate.folds:
+        owner = fold.left_out.owner
+        rows = np.concatenate([np.flatnonzero(owner == name)[:MOST_JUDGED] for name in range(owner.max() + 1)])
+        logits = scale * fold.cosines(estimate.ridge)[np.ix_(rows, rows)] + offset
+        parts.append(JudgedTouches(logits, owner[rows], owner[rows], np.eye(len(rows), dtype=np.bool_)))
+    return fit_posterior(*parts)

@@ -1,0 +1,116 @@
+"""What a fit is worth on objects that it never saw: own objects are few, so each is left out once."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.adaptation.maps import RIDGES, Codes, fit_codes
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp, linked_objects
+from retrieval.errors import BadInput
+from retrieval.metrics.measure import Measure
+from retrieval.training.features import Features
+
+GALLERY = 9
+"""Objects among which a held-out touch is told, at most: about as many as a fold holds."""
+FEWEST = 6
+"""Own objects that can be judged: two folds of three."""
+Blocks = tuple[Sequence[int], Sequence[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """Objects that are left out together, the codes of each ridge that the others taught, and the features of these
+    objects' grasps."""
+
+    left_out: Features
+    codes: dict[float, Codes]
+
+    def cosines(self, ridge: float) -> NDArray[np.float32]:
+        """(n, n) of the touch of every grasp left out with the photo of every such grasp."""
+        return self.codes[ridge].cosines(self.left_out.touch.reshape(len(self.left_out), -1), self.left_out.photo)
+
+
+def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
+    """Objects in folds of about `GALLERY`; objects that share a sequence stay together. Raises BadInput for fewer
+    than `FEWEST` objects."""
+    groups = linked_objects(grasps)
+    total = sum(map(len, groups))
+    if total < FEWEST:
+        raise BadInput(f"{FEWEST} objects or more can be judged by leaving each out once; got {total}")
+    folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3))]
+    for place in np.random.default_rng([seed, 7]).permutation(len(groups)):
+        min(folds, key=len).extend(groups[place])
+    return [tuple(sorted(fold)) for fold in folds]
+
+
+def fit_folds(
+    features: Features, folds: Sequence[Sequence[str]], blocks: Blocks, *, what: str, quiet: bool
+) -> Iterator[Fold]:
+    """Each fold, and what the objects outside it teach."""
+    everyone = {name for fold in folds for name in fold}
+    with Bar(f"judge {what}", len(folds), "folds", quiet=quiet) as bar:
+        for fold in folds:
+            learned = features.of_objects(everyone.difference(fold))
+            touch = learned.touch.reshape(len(learned), -1)
+            yield Fold(features.of_objects(fold), dict(fit_codes(touch, learned.photo, learned.owner, blocks)))
+            bar.advance()
+
+
+def best_ridge(folds: Sequence[Fold]) -> float:
+    """The ridge by which touches left out are told apart best; of equals the larger."""
+    return max(RIDGES, key=lambda ridge: (pair_accuracy([first_guesses(fold, ridge) for fold in folds]), ridge))
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Of each touch of a fold: how its place among the fold's objects came out.
+
+    object_ids (n,); first (n,): whether its own object's photo stood first (a share where photos tie); below (n,): the
+    share of the other objects' photos that stood lower, equals counting half; objects: how many were told apart.
+    """
+
+    object_ids: tuple[str, ...]
+    first: NDArray[np.float64]
+    below: NDArray[np.float64]
+    objects: int
+
+
+def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> Told:
+    """A touch against a photo, drawn, of each of the fold's objects; its own is of another grasp where there is one."""
+    return told(fold.cosines(ridge), fold.left_out, seed)
+
+
+def told(scores: NDArray[np.float32], features: Features, seed: int = 0) -> Told:
+    """The same of scores (n, n) of touches with photos of grasps."""
+    rng, owner = np.random.default_rng([seed, 8]), features.owner
+    rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
+    first, below = np.empty(len(features)), np.empty(len(features))
+    for touch, name in enumerate(owner):
+        shown = np.array([rng.choice(mine[mine != touch] if len(mine) > 1 else mine) for mine in rows])
+        own, others = scores[touch, shown[name]], np.delete(scores[touch, shown], name)
+        higher, equal = int((others > own).sum()), int((others == own).sum())
+        first[touch] = 0.0 if higher else 1 / (1 + equal)
+        below[touch] = 1 - (higher + equal / 2) / len(others)
+    return Told(features.object_ids, first, below, len(rows))
+
+
+def pair_accuracy(parts: Sequence[Told]) -> float:
+    """How often a touch's own photo stands above one of another object; objects count alike."""
+    return float(measure(parts, "below").by_object()[1].mean())
+
+
+def measure(parts: Sequence[Told], column: str) -> Measure:
+    """The measure "first" or "below" of all folds."""
+    names = sorted({name for part in parts for name in part.object_ids})
+    owner = np.array([names.index(name) for part in parts for name in part.object_ids])
+    order = np.argsort(owner, kind="stable")
+    values = np.concatenate([getattr(part, column) for part in parts])[order, None]
+    chance = 0.5
+    if column == "first":
+        chance = float(np.mean([1 / part.objects for part in parts for _ in set(part.object_ids)]))
+    sizes = sorted({part.objects for part in parts})
+    gallery = " or ".join(map(str, sizes)) + " objects left out, one photo of each"
+    return Measure(values, owner[order].astype(np.int64), np.array([chance]), gallery)

@@ -1,0 +1,90 @@
+"""What is fitted on: own grasps as towers see them that stand still, those of the start beside published ones."""
+
+import dataclasses
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from retrieval.adaptation.folds import Blocks
+from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps, recording_source
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config, load_config
+from retrieval.model.fusion import Matcher
+from retrieval.model.towers import TOGETHER
+from retrieval.model.towers.base import Tower
+from retrieval.model.towers.side_by_side import SideBySide
+from retrieval.model.towers.weights import initialise_tower
+from retrieval.training.features import Features, encode_recording
+
+PRESET = "adapt"
+BESIDE = "mobilenet_v2"
+"""The tower whose published weights stand beside those of the start."""
+NOTHING = "none"
+"""In place of first weights: no tower beside those of the start."""
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Own grasps, the towers side by side, and what these make of them; blurred: of an 8 x 6 blur of each touch."""
+
+    grasps: list[Grasp]
+    config: Config
+    matcher: Matcher
+    features: Features
+    blurred: Features
+    source: str
+
+    @property
+    def blocks(self) -> Blocks:
+        """How wide the towers' features are that stand side by side, of a touch and of a photo."""
+        touch, photo = widths_of(self.matcher.touch_tower), widths_of(self.matcher.photo_tower)
+        return touch * self.config.matcher.fingers, photo * self.matcher.views
+
+
+def encode(
+    recording: Path, start: Checkpoint, *, init: str, split: Split | None, cache: Path | None, seed: int, quiet: bool
+) -> Material:
+    """The recording as the towers of the start, and those beside them, see it."""
+    grasps = load_grasps(recording)
+    if split is not None:
+        grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
+    if len({grasp.object_id for grasp in grasps}) < 2:
+        raise BadInput("a matcher is fitted to two own objects at least; record more")
+    config = config_for(start, finger_count(grasps), beside=init != NOTHING, seed=seed)
+    matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
+    for tower, known in (
+        (matcher.touch_tower, start.matcher.touch_tower),
+        (matcher.photo_tower, start.matcher.photo_tower),
+    ):
+        take_over(tower, known, init)
+    shown = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
+    features = shown()
+    blurred = shown(variant="blurred", photos_of=features)
+    return Material(grasps, config, matcher, features, blurred, recording_source(recording))
+
+
+def config_for(start: Checkpoint, fingers: int, *, beside: bool, seed: int) -> Config:
+    """The preset, for towers of the start and, `beside` them, the published one."""
+    preset, known = load_config(PRESET), start.config.matcher
+    tower = TOGETHER.join([known.tower, BESIDE] if beside else [known.tower])
+    matcher = dataclasses.replace(preset.matcher, tower=tower, tower_output=known.tower_output, fingers=fingers)
+    training = dataclasses.replace(preset.training, init="random", seed=seed)
+    return dataclasses.replace(preset, matcher=matcher, training=training)
+
+
+def take_over(tower: Tower, known: Tower, init: str) -> None:
+    """Give a tower the weights of the start and, to the part beside it, the published ones."""
+    if init == NOTHING:
+        tower.load_state_dict(known.state_dict())
+        return
+    assert isinstance(tower, SideBySide)
+    *parts, beside = tower.parts
+    for part, its in zip(parts, known.parts if isinstance(known, SideBySide) else [known], strict=True):
+        part.load_state_dict(its.state_dict())
+    initialise_tower(beside, BESIDE, init)  # type: ignore[arg-type]
+
+
+def widths_of(tower: Tower) -> list[int]:
+    """Of the features of towers side by side, or of the one."""
+    return tower.widths if isinstance(tower, SideBySide) else [tower.feature_count]

@@ -1,0 +1,41 @@
+"""`retrieve adapt`: a checkpoint for a new sensor and own objects, from a few of them.
+
+Towers stand still: those of the checkpoint that one starts from, which learnt on the simulated rig what relief looks
+like, beside those of published weights, which know pictures. What is fitted is linear (`retrieval.adaptation.maps`),
+and every number that is told of it comes from objects that were left out of the fit.
+"""
+
+from pathlib import Path
+
+from retrieval.adaptation.estimate import Estimate, judge
+from retrieval.adaptation.fitting import fitted, judged
+from retrieval.adaptation.material import Material, encode
+from retrieval.data.dataset import Split
+from retrieval.model.checkpoint import Checkpoint, require_writable, store_checkpoint
+
+
+def adapt(
+    recording: Path,
+    out: Path,
+    start: Checkpoint,
+    *,
+    init: str,
+    split: Split | None = None,
+    cache: Path | None = None,
+    seed: int = 0,
+    quiet: bool = False,
+) -> tuple[Material, Estimate | None]:
+    """Fit the towers of `start` to a recording of another sensor and own objects, and write the checkpoint `out`.
+
+    init: published weights whose tower stands beside those of the start ("imagenet", a file, or "none"). split: its
+    test objects are left out of everything. cache: where features are kept, so that a run which was stopped goes on.
+    The estimate is None for fewer than six objects; the checkpoint then says nothing of probabilities. Raises
+    DatasetError, CheckpointError, BadInput.
+    """
+    require_writable(out)
+    material = encode(recording, start, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
+    estimate = judge(material, seed=seed, quiet=quiet)
+    made = fitted(material, estimate, out)
+    made = judged(made, material, estimate, quiet=quiet)
+    store_checkpoint(made, out)
+    return material, estimate

@@ -1,0 +1,207 @@
+"""Fitting to a new sensor: linear maps, objects left out once each, and a checkpoint like any other."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import retrieval
+from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
+from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, told
+from retrieval.adaptation.maps import RIDGES, Affine, fit_codes
+from retrieval.adaptation.material import config_for, encode, take_over
+from retrieval.adaptation.recipe import adapt
+from retrieval.commands.main import main
+from retrieval.data.dataset import Split, load_grasps
+from retrieval.errors import BadInput, CheckpointError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.fusion import Matcher
+from retrieval.model.towers import build_tower
+from retrieval.model.towers.weights import initialise_tower
+from retrieval.training.features import Features
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Without the check of touches, whose 700 foreign pictures take most of the time."""
+    monkeypatch.setattr("retrieval.adaptation.fitting.with_verdicts", lambda made, *_, **__: made)
+
+
+def seen_alike(objects=30, grasps=6, seed=0):
+    """Features of touches (n, 12) and photos (n, 10) that share five numbers of their object, with noise, and whose
+    each grasp is (n,)."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), grasps)
+    shared = rng.standard_normal((objects, 5))[owner]
+    mixes = np.random.default_rng(99).standard_normal((2, 5, 12))
+    touch, photo = (shared @ mix + 0.3 * rng.standard_normal((len(owner), 12)) for mix in mixes)
+    return touch.astype(np.float32), photo[:, :10].astype(np.float32), owner
+
+
+def first_rank(codes, touch, photo, owner):
+    best = owner[codes.cosines(touch, photo).argmax(1)]
+    return float((best == owner).mean())
+
+
+def test_codes_tell_objects_that_no_fit_saw():
+    touch, photo, owner = seen_alike()
+    other = seen_alike(seed=1)
+    codes = dict(fit_codes(touch, photo, owner, ([12], [10])))
+    assert set(codes) == set(RIDGES)
+    assert all(first_rank(found, *other) > 0.9 for found in codes.values())  # chance 1 / 30
+    dealt = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
+    nothing = dict(fit_codes(touch, photo[np.argsort(dealt, kind="stable")], owner, ([12], [10])))
+    assert all(first_rank(found, *other) < 0.2 for found in nothing.values())
+
+
+def test_towers_side_by_side_weigh_the_same_whatever_their_unit():
+    touch, photo, owner = seen_alike()
+    louder = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
+    plain, loud = (dict(fit_codes(x, photo, owner, ([4, 8], [10])))[1.0] for x in (touch, louder))
+    assert np.allclose(plain.cosines(touch, photo), loud.cosines(louder, photo), atol=1e-4)
+
+
+def test_a_map_and_another_after_it_are_one():
+    rng = np.random.default_rng(0)
+    first = Affine(rng.standard_normal((4, 3)), rng.standard_normal(3))
+    second = Affine(rng.standard_normal((3, 2)), rng.standard_normal(2))
+    x = rng.standard_normal((5, 4))
+    assert np.allclose(first.then(second)(x), second(first(x)))
+
+
+def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(recording):
+    grasps = load_grasps(recording)
+    names = sorted({grasp.object_id for grasp in grasps})
+    twins = {names[0], names[7]}
+    grasps = [
+        dataclasses.replace(grasp, sequence_id="one sitting" if grasp.object_id in twins else None) for grasp in grasps
+    ]
+    for seed in range(5):
+        folds = draw_folds(grasps, seed)
+        assert sorted(name for fold in folds for name in fold) == names
+        assert any(twins <= set(fold) for fold in folds)
+        assert min(map(len, folds)) >= 3
+    few = [grasp for grasp in grasps if grasp.object_id in names[:5]]
+    with pytest.raises(BadInput, match="6 objects or more"):
+        draw_folds(few, 0)
+
+
+def test_places_of_hand_made_scores():
+    features = Features(
+        tuple("1234"), ("a", "b", "c", "a"), np.zeros((4, 1, 1), np.float32), np.zeros((4, 1), np.float32)
+    )
+    # Of a's touches the own photo is of the other grasp: 1 is shown photo 4, and 4 photo 1.
+    scores = np.array([[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [2, 2, 1, 9]], np.float32)
+    found = told(scores, features)
+    assert found.objects == 3
+    assert found.first.tolist() == [1.0, 0.5, found.first[2], 0.5]
+    assert found.below.tolist()[:2] == [1.0, 0.75]
+    assert measure([found], "first").chance.tolist() == [pytest.approx(1 / 3)]
+    by_object = [np.mean([1.0, 0.75]), 0.75, found.below[2]]
+    assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
+
+
+@pytest.mark.slow
+def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path):
+    out = tmp_path / "own.safetensors"
+    material, _ = adapt(recording, out, load_checkpoint(model), init="none", quiet=True)
+    made = load_checkpoint(out)
+    assert set(made.split.train) == {grasp.object_id for grasp in load_grasps(recording)}
+    assert made.posterior is not None
+    # The logit is the scaled cosine of codes and nothing else.
+    matcher, features = made.matcher, material.features
+    with torch.inference_mode():
+        felt = matcher.touch_code(torch.from_numpy(features.touch).flatten(1))
+        seen = matcher.photo_code(torch.from_numpy(features.photo))
+        logits = matcher.head(felt.half, seen.half)
+        cosines = (felt.embedding * seen.embedding).sum(1)
+    assert torch.allclose(logits, matcher.cosine_scale.item() * cosines + matcher.head.out.bias.item(), atol=1e-4)
+    assert matcher.cosine_scale > 0
+    retrieval.build_index(catalogue, made, tmp_path / "index", quiet=True)
+    answer = retrieval.open(tmp_path / "index", model=out).query([touch])
+    assert 0 <= answer.none_probability <= 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tmp_path):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
+    material, _ = adapt(
+        recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split, quiet=True
+    )
+    assert set(material.features.object_ids) == set(names[3:])
+    assert set(load_checkpoint(tmp_path / "own.safetensors").split.train) == set(names[3:])
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_too_few_objects_to_be_judged_give_a_checkpoint_that_claims_nothing(recording, model, tmp_path, capsys):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    split = Split(0, tuple(names[:4]), (), tuple(names[4:]))
+    _, estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split)
+    made = load_checkpoint(tmp_path / "own.safetensors")
+    assert (estimate, made.posterior, made.provenance["metrics"]) == (None, None, {})
+    assert "6 objects or more can be judged" in capsys.readouterr().err
+    one = Split(0, tuple(names[:1]), (), tuple(names[1:]))
+    with pytest.raises(BadInput, match="two own objects at least"):
+        adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=one)
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory):
+    """Weights of a tower that was published nowhere."""
+    path = tmp_path_factory.mktemp("weights") / "mobilenet_v2.pth"
+    torch.manual_seed(0)
+    torch.save(build_tower("mobilenet_v2", "pooled").state_dict(), path)
+    return path
+
+
+def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
+    start = load_checkpoint(model)
+    config = config_for(start, 2, beside=True, seed=0)
+    matcher = Matcher(config.matcher, 2).eval()
+    take_over(matcher.touch_tower, start.matcher.touch_tower, str(beside))
+    own, published = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
+    initialise_tower(published, "mobilenet_v2", str(beside))
+    images = torch.rand(2, 3, 64, 64)
+    with torch.inference_mode():
+        together = torch.cat([own(images), published(images)], 1)
+        assert torch.allclose(matcher.touch_tower(images), together, atol=1e-5)
+
+
+def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):
+    two = build_tower("mobilenet_v2+small", "pooled")
+    initialise_tower(two, "mobilenet_v2+small", f"{beside}+random")
+    assert torch.equal(two.parts[0].features[0][0].weight, torch.load(beside, weights_only=True)["features.0.0.weight"])
+    with pytest.raises(CheckpointError, match="2 towers side by side take first weights for each"):
+        initialise_tower(two, "mobilenet_v2+small", "random+random+random")
+
+
+def test_the_curve_holds_fits_on_less_and_what_they_are_compared_with(recording, model, beside, tmp_path, monkeypatch):
+    monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
+    monkeypatch.setattr("retrieval.adaptation.curve.TOUCHES", (1, 100))
+    start = load_checkpoint(model)
+    material = encode(recording, start, init=str(beside), split=None, cache=None, seed=0, quiet=True)
+    points = learning_curve(material, start, quiet=True)
+    assert [point.what for point in points] == [AS_IT_IS, BOTH, BOTH, BOTH, BOTH, BLURRED, TAUGHT, PUBLISHED]
+    assert [(point.objects, point.touches) for point in points[1:5]] == [(4, 1), (4, 3), (6, 1), (6, 3)]
+    assert all(low <= value <= high for point in points for value, low, high in (point.first, point.pairs))
+    text = write_curve(tmp_path / "curve", points).read_text()
+    assert text.count("\n| ") == len(points) + 1
+    assert len(json.loads((tmp_path / "curve" / "curve.json").read_text())["points"]) == len(points)
+    assert (tmp_path / "curve" / "curve.png").stat().st_size > 1000
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_command_says_what_it_found_and_goes_on_from_its_cache(recording, model, tmp_path, capsys):
+    out, cache = tmp_path / "own.safetensors", tmp_path / "cache"
+    line = ["adapt", str(recording), "--out", str(out), "--model", str(model), "--init", "none", "--cache", str(cache)]
+    assert main(line) == 0
+    said = capsys.readouterr().err
+    for part in ("first guess", "blurred touch", "pair accuracy", "fitted to 12 objects, 36 touches"):
+        assert part in said
+    kept = sorted(cache.iterdir())
+    assert kept
+    assert main(line) == 0
+    assert sorted(cache.iterdir()) == kept
