@@ -178,6 +178,7 @@ def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):
         initialise_tower(two, "mobilenet_v2+small", "random+random+random")
 
 
+@pytest.mark.slow
 def test_the_curve_holds_fits_on_less_and_what_they_are_compared_with(recording, model, beside, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
     monkeypatch.setattr("retrieval.adaptation.curve.TOUCHES", (1, 100))
