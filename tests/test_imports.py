@@ -18,6 +18,7 @@ LAYERS = (
     ("data",),
     ("model",),
     ("training", "search"),
+    ("cluster",),
     ("methods",),
     ("evaluation",),
     ("report",),

@@ -12,7 +12,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 def bounds():
     """Lower bound of every requirement, extras included."""
     listed = [*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())]
-    return {re.split("[<>=]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
+    return {re.split(r"[<>=\[]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
 
 
 def test_what_a_query_needs_is_bounded_as_it_is_for_everything_else():

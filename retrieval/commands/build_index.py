@@ -16,7 +16,10 @@ PREVIEWED = 16
 
 
 def build_index(
-    catalogue: Annotated[Path, typer.Argument(help="folder: <object>/<photo> or <object>.<ext>")],
+    catalogue: Annotated[
+        str,
+        typer.Argument(help="folder: <object>/<photo> or <object>.<ext>; or a URL of one, of Parquet or of tar files"),
+    ],
     *,
     objects_from: Annotated[
         str | None,
@@ -55,12 +58,15 @@ def build_index(
 ) -> None:
     """Make a folder of photos searchable."""
     from indexes.store.cluster import is_cluster, read_cluster
+    from retrieval.data.sources import is_elsewhere
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.search import build, build_cluster, defaults
 
     sheet = out.resolve().with_name(f"{out.resolve().name}-views.png")
     if preview:
         require_ours(sheet, PREVIEW)
+        if is_elsewhere(catalogue):
+            raise BadInput(f"--preview shows photos of a folder of this machine; {catalogue} is none")
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
     checkpoint = load_checkpoint(path)
@@ -93,7 +99,7 @@ def build_index(
         first = IndexStore(out / report.shards[0]["folder"] if report.shards else out)
         rows = first.open(verify=False).rows
         chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
-        write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
+        write_views([Path(catalogue) / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
         say(f"views: {len(chosen)} photos in {sheet}")
     if json:
         print_json(report.to_dict())

@@ -99,10 +99,24 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
     found = list(_walk(root, "", Path(os.path.realpath(root)), set()))
     skipped = [item for item in found if isinstance(item, SkippedPhoto)]
-    files = sorted(item for item in found if isinstance(item, str))
+    path = root / METADATA_FILE
+    try:
+        lines = read_regular(path)
+    except FileNotFoundError:
+        lines = b""
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
+    return catalogue_of(root, str(root), [item for item in found if isinstance(item, str)], skipped, naming, lines)
+
+
+def catalogue_of(
+    folder: Path, where: str, names: list[str], passed_over: list[SkippedPhoto], naming: Naming, metadata: bytes
+) -> Catalogue:
+    """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
+    METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does."""
     photos: list[tuple[str, str]] = []
-    ignored, unfit, unread = [], [], set()
-    for path in files:
+    skipped, ignored, unfit, unread = list(passed_over), [], [], set()
+    for path in sorted(names):
         ending = os.path.splitext(path)[1].lower()
         if ending not in EXTENSIONS and ending not in UNREAD:
             ignored += [path] if path != METADATA_FILE else []
@@ -119,19 +133,19 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
             photos.append((path, name))
     if not photos and unfit:
         raise DatasetError(
-            f"no photo in {root} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
+            f"no photo in {where} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
             "Give folder, stem, or a pattern for paths like this one"
         )
     if not photos:
         others = f"{len(ignored)} other files" + (f" such as {ignored[0]}" if ignored else "")
         left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
         kinds = ", ".join(sorted(EXTENSIONS))
-        raise DatasetError(f"no photo ({kinds}) in the catalogue {root}, only {others}{left_out}: {_LAYOUT}")
-    by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
+        raise DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
+    by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
     strange = sorted(by_photo.keys() - {path for path, _ in photos})
     strange += sorted(by_object.keys() - {name for _, name in photos})
     return Catalogue(
-        root,
+        folder,
         tuple(
             CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})}) for path, name in photos
         ),
@@ -203,17 +217,11 @@ def _walk(folder: Path, prefix: str, root: Path, followed: set[Path]) -> Iterato
 _Table = dict[str, dict[str, Any]]
 
 
-def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
+def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_Table, _Table]:
     """The other keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
     by_object: _Table = {}
     by_photo: _Table = {}
-    try:
-        lines = read_regular(path).split(b"\n")
-    except FileNotFoundError:
-        return by_object, by_photo
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text.split(b"\n"), start=1):
         if not line.strip():
             continue
         try:
@@ -222,7 +230,7 @@ def _read_metadata(path: Path, naming: Naming) -> tuple[_Table, _Table]:
             if name in table:
                 raise ValueError(f"{name} has a line already; join the two")
         except (ValueError, RecursionError) as error:
-            raise DatasetError(f"{path}, line {number}: {error}") from error
+            raise DatasetError(f"{where}, line {number}: {error}") from error
         table[name] = metadata
     return by_object, by_photo
 

@@ -16,8 +16,9 @@ from indexes.store.manifest import read_manifest
 from indexes.store.tables import Block, Tables
 from indexes.store.unfinished import Unfinished
 from indexes.store.writing import RECALL_QUERIES, Chosen
-from retrieval.data.catalogue import Catalogue, list_catalogue
+from retrieval.data.catalogue import Catalogue
 from retrieval.data.naming import FOLDER, Naming, doubts, per_object
+from retrieval.data.sources import Fetched, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.stored import fingerprint
@@ -38,7 +39,7 @@ from retrieval.version import __version__
 
 
 def build_index(
-    folder: Path,
+    folder: str | Path,
     checkpoint: Checkpoint,
     out: Path,
     *,
@@ -49,6 +50,8 @@ def build_index(
     quiet: bool = False,
 ) -> BuildReport:
     """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
+
+    folder: of this machine, or a URL as `retrieval.data.sources` reads it.
 
     objects_from: which object a photo shows (`retrieval.data.naming`); where None, as the index has it, else by folder.
     kind, min_recall, max_ms: what is asked of the search (`retrieval.search.operating`); where all are None, exact
@@ -68,7 +71,7 @@ def build_index(
     named_before = _named_before(IndexStore(out))
     naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
     renamed = "" if named_before in (None, naming.text) else renamed_note(naming, str(named_before))
-    return build_listed(list_catalogue(folder, naming), checkpoint, out, Wanted(naming, asked, quiet, note=renamed))
+    return build_listed(list_photos(folder, naming), checkpoint, out, Wanted(naming, asked, quiet, note=renamed))
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,8 @@ def renamed_note(naming: Naming, before: str) -> str:
 
 def _outside(catalogue: Catalogue, out: Path) -> list[str]:
     """Files of the catalogue that are no pictures by name, but for those of the index itself."""
+    if isinstance(catalogue, Fetched):
+        return list(catalogue.ignored)
     inside = out.resolve()
     return [name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)]
 

@@ -32,9 +32,10 @@ from indexes.store.files import remove_folder
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto, list_catalogue
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.data.naming import FOLDER as BY_FOLDER
 from retrieval.data.naming import Naming, per_object
+from retrieval.data.sources import list_photos
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint
@@ -80,7 +81,7 @@ Run = Callable[[Sequence[ShardJob], Checkpoint], Iterable[ShardBuilt]]
 
 
 def build_cluster(
-    folder: Path,
+    folder: str | Path,
     checkpoint: Checkpoint,
     out: Path,
     shards: int,
@@ -112,7 +113,7 @@ def build_cluster(
         naming = Naming(next(rule for rule in (objects_from, named_before, BY_FOLDER) if rule is not None))
         if named_before not in (None, naming.text):
             note = f"{renamed_note(naming, str(named_before))} {note}".rstrip()
-        catalogue = list_catalogue(folder, naming)
+        catalogue = list_photos(folder, naming)
         _sweep(out, before, shards)
         donors = (
             [] if before is None or before.of == shards else [(one.folder, one.generation) for one in before.shards]

@@ -295,7 +295,7 @@ class Searcher:
                 "scored": judged.found.photos if judged else 0,
                 **(self._shares(judged) if self.described.shards > 1 else {}),
                 "encoder": self.encoder.name,
-                "catalogue": str(self.catalogue),
+                "catalogue": str(self.described.about["catalogue"]),
                 "model": str(self.checkpoint.path),
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },

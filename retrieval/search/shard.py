@@ -7,14 +7,17 @@ An object's photos all lie in one shard, so that its logit is known there. Merge
 of the catalogue, and the sums of their likelihoods are its sum.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
+from threading import Lock
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
+from indexes.store.rows import key_of
 from retrieval.errors import BadInput
 from retrieval.model.judge import Judge
 from retrieval.model.posterior import Mass, Posterior
@@ -78,6 +81,13 @@ class Described:
     shards: int = 1
 
 
+class Page(NamedTuple):
+    """Some rows of so many that there are in all."""
+
+    total: int
+    rows: list[dict[str, Any]]
+
+
 class Shard(Protocol):
     """What a searcher searches. Any number of threads may ask at once."""
 
@@ -95,6 +105,10 @@ class Shard(Protocol):
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """The rows of these photos; None for one that is not there."""
 
+    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
+        """Photos in whose object, path and metadata all these words stand, in small letters, and of that object alone
+        where one is named; at most `limit` of them, from the one at `offset`."""
+
 
 class FolderShard:
     """The photos of one generation of an index folder.
@@ -105,6 +119,7 @@ class FolderShard:
     def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
         self.generation, self.judge, self.has_embeddings = generation, judge, has_embeddings
         self.objects = Objects(generation)
+        self._lock = Lock()
 
     @property
     def described(self) -> Described:
@@ -138,6 +153,29 @@ class FolderShard:
         """As `Shard.rows`."""
         numbers = self.generation.rows.find(ids).tolist()
         return [None if number < 0 else self.generation.rows[number] for number in numbers]
+
+    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
+        """As `Shard.page`."""
+        found = np.arange(self.generation.count)
+        if object_id is not None:
+            found = found[self.generation.rows.keys("object_id") == key_of(object_id)]
+        if words:
+            texts = self._texts_once()
+            found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
+        return Page(len(found), [self.generation.rows[int(row)] for row in found[offset : offset + limit]])
+
+    def _texts_once(self) -> list[str]:
+        with self._lock:
+            return self._texts
+
+    @cached_property
+    def _texts(self) -> list[str]:
+        """What each row is found by: object, path and metadata, without capitals."""
+        found = []
+        for row in self.generation.rows:
+            values = [row.get("object_id"), row.get("path"), *(row.get("metadata") or {}).values()]
+            found.append(" ".join(str(value) for value in values).casefold())
+        return found
 
     def limit(self, top: int, candidates: int | None) -> int:
         """Photos that are judged for each grasp: as many as asked for, else as measured on the index, else 1000."""
@@ -195,6 +233,10 @@ class Shards:
         """As `Shard.rows`."""
         return first_rows([shard.rows(ids) for shard in self.shards])
 
+    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
+        """As `Shard.page`; the photos of one shard after those of the other."""
+        return one_page([partial(shard.page, words, object_id) for shard in self.shards], offset, limit)
+
 
 def merged(answers: Sequence[Judged], top: int) -> Judged:
     """One answer of those of several shards, one at least."""
@@ -211,6 +253,16 @@ def merged(answers: Sequence[Judged], top: int) -> Judged:
         sum(answer.searched for answer in answers),
         {stage: max(answer.timing_ms.get(stage, 0.0) for answer in answers) for stage in stages},
     )
+
+
+def one_page(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: int) -> Page:
+    """The page of all shards together; each of `pages` gives that of one shard for an offset and a limit."""
+    total, rows = 0, list[dict[str, Any]]()
+    for page in pages:
+        found = page(max(0, offset - total), limit - len(rows))
+        total += found.total
+        rows += found.rows
+    return Page(total, rows)
 
 
 def first_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:

@@ -1,0 +1,250 @@
+"""Shards held by Ray Serve: a deployment for each, with replicas; whoever asks, asks all of them at once and merges.
+
+A deployment is named by the digest of its shard's content. A new generation of a cluster deploys the shards that
+changed and leaves the others as they are; the shards of the old one end when nobody asks them any more.
+
+A shard that does not answer in time is left out. The answer then says which share of the catalogue was searched, and
+its objects keep the probability that they had, on average; where more of the catalogue was asked for, there is none.
+"""
+
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from indexes.errors import IndexesError
+from indexes.store.cluster import ClusterManifest, ShardEntry, open_shard
+from indexes.store.generation import require_made_by
+from retrieval.errors import BadInput, RetrievalError, Unanswered
+from retrieval.model.posterior import Posterior
+from retrieval.model.stored import Stored, fingerprint, read_stored
+from retrieval.search.opening import described_cluster, folder_shard
+from retrieval.search.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
+
+T = TypeVar("T")
+AGAIN_S = 0.05
+"""Before a shard whose replica was lost is asked again."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """How shards are held.
+
+    replicas: of each, at least; most_replicas: to which number they may grow as requests wait. cpus: that Ray counts
+    for each. ongoing: requests that a replica works on at once. wait_s: for an answer. least_share: of the catalogue,
+    that must be searched.
+    """
+
+    replicas: int = 1
+    most_replicas: int | None = None
+    cpus: float = 0.5
+    ongoing: int = 4
+    wait_s: float = 5.0
+    least_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Raises BadInput."""
+        if not 1 <= self.replicas <= (self.most_replicas or self.replicas):
+            raise BadInput(f"replicas must be 1 or more, and no more than the most; got {self.replicas}")
+        if not 0 < self.least_share <= 1:
+            raise BadInput(f"the least share must lie above 0 and be 1 at most; got {self.least_share}")
+        if not self.wait_s > 0:
+            raise BadInput(f"the wait for a shard must be above 0 seconds; got {self.wait_s}")
+
+
+class ShardReplica:
+    """One shard in a process of Ray Serve."""
+
+    def __init__(self, cluster: str, entry: ShardEntry, made_by: dict[str, str], model: str, verify: bool) -> None:
+        stored = read_stored(Path(model))
+        generation = open_shard(Path(cluster), entry, made_by, verify=verify, threads=1)
+        self._shard = folder_shard(generation, stored)
+
+    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged | Exception:
+        """As `Shard.ask`. What is wrong is given back: raised, it would come with the tracebacks of all processes."""
+        return _or_error(lambda: self._shard.ask(felt, top, candidates, posterior))
+
+    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None] | Exception:
+        """As `Shard.rows`."""
+        return _or_error(lambda: self._shard.rows(ids))
+
+    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page | Exception:
+        """As `Shard.page`."""
+        return _or_error(lambda: self._shard.page(words, object_id, offset, limit))
+
+
+class RayShards:
+    """A cluster whose shards Ray Serve holds. handles: name of a shard -> its deployment."""
+
+    def __init__(
+        self, described: Described, entries: Sequence[ShardEntry], handles: dict[str, Any], held: Held
+    ) -> None:
+        self.described, self.entries, self._handles, self._held = described, list(entries), handles, held
+
+    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
+        """As `Shard.ask`. Raises Unanswered where less of the catalogue was searched than is wanted."""
+        answers, silent = self._asked("ask", felt, top, candidates, posterior)
+        searched = sum(entry.photos for entry in self.entries if entry not in silent)
+        if not answers or searched < self._held.least_share * self.described.photos:
+            raise self._unanswered(silent, searched)
+        found = merged(answers, top)
+        if found.mass is not None:
+            found = replace(found, mass=found.mass.extended(sum(entry.objects for entry in silent)))
+        return found
+
+    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
+        """As `Shard.rows`. Raises Unanswered where a photo may be in a shard that did not answer."""
+        answers, silent = self._asked("rows", list(ids))
+        found: list[dict[str, Any] | None] = first_rows(answers) if answers else [None for _ in ids]
+        if silent and None in found:
+            raise self._unanswered(silent, sum(entry.photos for entry in self.entries if entry not in silent))
+        return found
+
+    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
+        """As `Shard.page`. Raises Unanswered where a shard does not answer."""
+
+        def of_shard(entry: ShardEntry) -> Callable[[int, int], Page]:
+            def page(offset: int, limit: int) -> Page:
+                answers, silent = self._asked("page", list(words), object_id, offset, limit, entries=[entry])
+                if silent:
+                    raise self._unanswered(silent, self.described.photos - entry.photos)
+                found: Page = answers[0]
+                return found
+
+            return page
+
+        return one_page([of_shard(entry) for entry in self.entries], offset, limit)
+
+    def _asked(
+        self, method: str, *asked: Any, entries: Sequence[ShardEntry] | None = None
+    ) -> tuple[list[Any], list[ShardEntry]]:
+        """What shards answer, all of them unless `entries` says which, and those that do not in time."""
+        until = time.monotonic() + self._held.wait_s
+        wanted = self.entries if entries is None else entries
+        waiting = [(entry, self._send(entry, method, asked)) for entry in wanted]
+        answers, silent = [], []
+        for entry, response in waiting:
+            answer = self._answer(entry, response, method, asked, until)
+            if answer is None:
+                silent.append(entry)
+            elif isinstance(answer, Exception):
+                raise answer
+            else:
+                answers.append(answer)
+        return answers, silent
+
+    def _send(self, entry: ShardEntry, method: str, asked: Sequence[Any]) -> Any:
+        return getattr(self._handles[entry.folder], method).remote(*asked)
+
+    def _answer(self, entry: ShardEntry, response: Any, method: str, asked: Sequence[Any], until: float) -> Any:
+        """The answer of a shard, asked again where its replica was lost; None where it has none in time."""
+        from ray.exceptions import RayError
+        from ray.serve.exceptions import RayServeException
+
+        while (left := until - time.monotonic()) > 0:
+            try:
+                return response.result(timeout_s=left)
+            except TimeoutError:
+                break
+            except (RayError, RayServeException):
+                time.sleep(min(AGAIN_S, max(0.0, until - time.monotonic())))
+                response = self._send(entry, method, asked)
+        response.cancel()
+        return None
+
+    def _unanswered(self, silent: Sequence[ShardEntry], photos: int) -> Unanswered:
+        share = photos / self.described.photos
+        names = ", ".join(entry.folder for entry in silent)
+        return Unanswered(
+            f"no answer within {self._held.wait_s:g} s from {names}: {share:.3f} of the catalogue could be searched, "
+            f"and {self._held.least_share:g} was asked for; ask again, or admit less (--least-share)"
+        )
+
+
+class Deployments:
+    """The shards that Ray Serve holds for this process, by the digest of what they hold."""
+
+    def __init__(self, ray: Any, held: Held, verify: bool = True) -> None:
+        self._ray, self._held, self._verify = ray, held, verify
+        self._users: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        ray.serve.start(proxy_location="Disabled")
+
+    def open(self, cluster: Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
+        """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
+        require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
+        names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}" for entry in manifest.shards}
+        with self._lock:
+            self._deploy(names, cluster.resolve(), manifest, stored)
+            self._users.update(names.values())
+        handles = {folder: self._ray.serve.get_app_handle(name) for folder, name in names.items()}
+        opened = RayShards(described_cluster(manifest), manifest.shards, handles, self._held)
+        weakref.finalize(opened, self._let_go, list(names.values()))
+        return opened
+
+    def close(self) -> None:
+        """End all that this process asked for, where nobody else's Ray holds it."""
+        self._let_go(list(self._users.elements()))
+
+    def _deploy(
+        self,
+        names: dict[str, str],
+        cluster: Path,
+        manifest: ClusterManifest,
+        stored: Stored,
+    ) -> None:
+        serve, held = self._ray.serve, self._held
+        there = serve.status().applications
+        wanted = [entry for entry in manifest.shards if names[entry.folder] not in there]
+        made_by, model = dict(manifest.fingerprint), str(stored.path.resolve())
+        scale: dict[str, Any] = {"num_replicas": held.replicas}
+        if held.most_replicas is not None and held.most_replicas > held.replicas:
+            scale = {
+                "autoscaling_config": {
+                    "min_replicas": held.replicas,
+                    "max_replicas": held.most_replicas,
+                    "target_ongoing_requests": max(1, held.ongoing // 2),
+                }
+            }
+        deployment = serve.deployment(
+            ShardReplica,
+            name="shard",
+            max_ongoing_requests=held.ongoing,
+            ray_actor_options={"num_cpus": held.cpus},
+            health_check_period_s=2,
+            health_check_timeout_s=10,
+            graceful_shutdown_timeout_s=10,
+            **scale,
+        )
+        targets = [
+            serve.RunTarget(
+                deployment.bind(str(cluster), entry, made_by, model, self._verify),
+                name=names[entry.folder],
+                route_prefix=None,
+            )
+            for entry in wanted
+        ]
+        if targets:
+            try:
+                serve.run_many(targets)
+            except RuntimeError as error:
+                raise RetrievalError(f"{cluster}: shards could not be started on Ray ({error})") from error
+
+    def _let_go(self, names: Sequence[str]) -> None:
+        with self._lock:
+            self._users.subtract(names)
+            over = [name for name in set(names) if self._users[name] <= 0]
+        if self._ray.is_initialized():
+            for name in over:
+                self._ray.serve.delete(name, _blocking=False)
+
+
+def _or_error(function: Callable[[], T]) -> T | Exception:
+    try:
+        return function()
+    except (RetrievalError, IndexesError) as error:
+        return error

@@ -1,0 +1,359 @@
+"""Photos that lie elsewhere than in a folder of this machine: in an object store, behind HTTP, in Parquet files, in
+WebDataset archives. Whatever `fsspec` opens is read, by its URL.
+
+    s3://bucket/catalog                 a folder: `retrieval.data.catalogue` says how, its metadata.jsonl too
+    s3://bucket/photos/*.parquet        a row a photo: `path` (or `file_name`), or `image` with its bytes (plain, or as
+                                        {bytes, path}); `object_id`, or what the rule makes of the path; the rest is the
+                                        user's own metadata
+    s3://bucket/photos-{000..015}.tar   members `key.jpg`, and `key.json` with metadata and perhaps `object_id`
+
+Listing reads names, and of Parquet all columns but the pictures; the pictures are read one by one when they are
+embedded. What the storage refuses is asked for again; where it goes on, the job ends and can go on later: a photo is
+left out for what it is, never for what the network did.
+"""
+
+import json
+import math
+import re
+import tarfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol, TypeVar
+
+from retrieval.data.catalogue import (
+    METADATA_FILE,
+    Catalogue,
+    CataloguePhoto,
+    SkippedPhoto,
+    catalogue_of,
+    list_catalogue,
+)
+from retrieval.data.images import MAX_BYTES
+from retrieval.data.naming import Naming
+from retrieval.errors import BadInput, DatasetError, ImageError
+
+T = TypeVar("T")
+WAITS_S = (0.1, 0.4, 1.6, 3.2, 6.4)
+"""Between one try and the next."""
+_FINAL = (FileNotFoundError, IsADirectoryError, PermissionError, ValueError, tarfile.TarError)
+"""What another try would say again."""
+_PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
+_RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
+_GROUPS = 4
+"""Row groups of pictures that are held at once."""
+
+
+class Source(Protocol):
+    """Where photos lie, as it is sent to whoever reads them."""
+
+    def read(self, path: str) -> bytes:
+        """The bytes of a photo's file. Raises what `fsspec` raises."""
+
+
+@dataclass(frozen=True)
+class Fetched(Catalogue):
+    """A catalogue of another place than a folder of this machine. url: what it is called."""
+
+    source: Source | None = None
+    url: str = ""
+
+    @property
+    def where(self) -> str:
+        """As indexes name it."""
+        return self.url
+
+    def read(self, path: str) -> bytes:
+        """The bytes of a photo's file. Raises ImageError for one that is gone or too large, and DatasetError where the
+        storage does not answer."""
+        assert self.source is not None
+        try:
+            data = tried(f"{self.url}: {path}", lambda: self.source.read(path))  # type: ignore[union-attr]
+        except FileNotFoundError:
+            raise ImageError(path, "no such file") from None
+        except (PermissionError, IsADirectoryError, ValueError) as error:
+            raise ImageError(path, f"cannot be read: {error}") from error
+        if len(data) > MAX_BYTES:
+            raise ImageError(path, f"cannot be read: has {len(data)} bytes; at most {MAX_BYTES} are read")
+        return data
+
+
+def is_elsewhere(where: str | Path) -> bool:
+    """Whether this is read by `list_photos` alone, not as a folder."""
+    return "://" in str(where) or str(where).endswith((".parquet", ".tar"))
+
+
+def list_photos(where: str | Path, naming: Naming | None = None) -> Catalogue:
+    """The photos of a folder, or of a URL as the text above says. Raises DatasetError as `list_catalogue` does."""
+    if not is_elsewhere(where):
+        return list_catalogue(Path(where), naming)
+    url, naming = str(where), naming or Naming()
+    if url.endswith(".parquet"):
+        return _parquet(url, naming)
+    return _archives(url, naming) if url.endswith(".tar") else _folder(url, naming)
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """The `fsspec` file system of a URL, and the path in it. Raises BadInput for one that nothing opens."""
+    try:
+        import fsspec
+    except ImportError as error:
+        raise BadInput(f"{url}: fsspec is missing; run: pip install 'touch-retrieval[cluster]'") from error
+    try:
+        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
+        return found
+    except (ValueError, ImportError) as error:
+        raise BadInput(f"{url} cannot be opened ({error}); for S3: pip install 'touch-retrieval[cluster]'") from error
+
+
+def tried(what: str, function: Callable[[], T]) -> T:
+    """What `function` gives, asked again where a storage refuses. Raises DatasetError where it goes on refusing."""
+    for wait in (*WAITS_S, None):
+        try:
+            return function()
+        except _FINAL:
+            raise
+        except Exception as error:  # each storage has its own errors
+            if wait is None:
+                raise DatasetError(
+                    f"{what}: the storage refused {len(WAITS_S) + 1} times ({type(error).__name__}: {error}); the same "
+                    "command goes on where it stopped"
+                ) from error
+            time.sleep(wait)
+    raise AssertionError
+
+
+# A folder --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FolderSource:
+    """Files below a URL."""
+
+    url: str
+
+    def read(self, path: str) -> bytes:
+        """As `Source.read`."""
+        system, root = file_system(self.url)
+        data: bytes = system.cat_file(f"{root.rstrip('/')}/{path}" if "://" not in path else path)
+        return data
+
+
+def _folder(url: str, naming: Naming) -> Catalogue:
+    system, root = file_system(url)
+    below = root.rstrip("/") + "/"
+    try:
+        names = tried(url, lambda: sorted(system.find(root)))
+    except _FINAL as error:
+        raise DatasetError(f"the catalogue {url} cannot be listed: {error}") from error
+    files, skipped = [], list[SkippedPhoto]()
+    for name in (name.removeprefix(below) for name in names if name.startswith(below)):
+        if not any(part.startswith(".") for part in PurePosixPath(name).parts):
+            files.append(name)
+    source = FolderSource(url)
+    lines = tried(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
+    return _fetched(catalogue_of(Path(), url, files, skipped, naming, lines), source, url)
+
+
+def _fetched(listed: Catalogue, source: Source, url: str) -> Fetched:
+    return Fetched(
+        listed.folder, listed.photos, listed.ignored, listed.skipped, listed.notes, listed.unread, source, url
+    )
+
+
+def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source) -> Fetched:
+    """A catalogue of photos, each with its object's name where the file gives one."""
+    found, skipped, seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
+    for photo, object_id in photos:
+        parts = PurePosixPath(photo.path.removeprefix("/")).parts
+        name = object_id or naming.object_of(photo.path)
+        if photo.path in seen:
+            skipped.append(SkippedPhoto(photo.path, "comes twice"))
+        elif not parts or ".." in parts or photo.path.startswith("/") or "\0" in photo.path:
+            skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
+        elif not name:
+            skipped.append(SkippedPhoto(photo.path, f"does not fit --objects-from {naming.text}"))
+        else:
+            found.append(replace(photo, object_id=name))
+        seen.add(photo.path)
+    if not found:
+        why = f"; {skipped[0].path}: {skipped[0].reason}" if skipped else ""
+        raise DatasetError(f"no photo in the catalogue {url}{why}")
+    return Fetched(Path(), tuple(sorted(found, key=lambda photo: photo.path)), (), tuple(skipped), (), (), source, url)
+
+
+# Parquet ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ParquetSource:
+    """Pictures in a column. places: of each photo its file, its row group and its row there."""
+
+    column: str
+    places: Mapping[str, tuple[str, int, int]]
+
+    def read(self, path: str) -> bytes:
+        """As `Source.read`."""
+        file, group, row = self.places[path]
+        data = _row_group(file, group, self.column)[row]
+        if not isinstance(data, bytes):
+            raise ValueError("the row holds no picture")
+        return data
+
+
+_one_at_a_time = threading.Lock()
+
+
+def _row_group(file: str, group: int, column: str) -> list[Any]:
+    with _one_at_a_time:  # else each thread reads a group anew
+        return _read_group(file, group, column)
+
+
+@lru_cache(maxsize=_GROUPS)
+def _read_group(file: str, group: int, column: str) -> list[Any]:
+    with _parquet_file(file) as table:
+        values = table.read_row_group(group, columns=[column]).column(0).to_pylist()
+    return [value.get("bytes") if isinstance(value, dict) else value for value in values]
+
+
+def _parquet_file(url: str) -> Any:
+    try:
+        from pyarrow.parquet import ParquetFile
+    except ImportError as error:
+        raise BadInput(f"{url}: pyarrow is missing; run: pip install 'touch-retrieval[cluster]'") from error
+    system, path = file_system(url)
+    return ParquetFile(system.open(path, "rb"))
+
+
+def _matching(url: str) -> list[str]:
+    """URLs of the files that a pattern names."""
+    spread = _RANGE.search(url)
+    if spread:
+        low, high = spread.groups()
+        numbers = (f"{number:0{len(low)}d}" for number in range(int(low), int(high) + 1))
+        return [one for number in numbers for one in _matching(url[: spread.start()] + number + url[spread.end() :])]
+    system, path = file_system(url)
+    try:
+        found = tried(url, lambda: sorted(system.glob(path)) if "*" in path else [path])
+    except _FINAL as error:
+        raise DatasetError(f"{url} cannot be listed: {error}") from error
+    if not found:
+        raise DatasetError(f"{url} names no file")
+    return [system.unstrip_protocol(one) for one in found]
+
+
+def _parquet(url: str, naming: Naming) -> Catalogue:
+    photos, places, column = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]](), ""
+    for file in _matching(url):
+        try:
+            column = tried(file, lambda file=file: _list_parquet(file, photos, places))  # type: ignore[misc]
+        except _FINAL as error:
+            raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
+    source: Source = ParquetSource(column, places) if column else FolderSource(url.rpartition("/")[0] or ".")
+    return _named(url, photos, naming, source)
+
+
+def _list_parquet(
+    file: str, photos: list[tuple[CataloguePhoto, str | None]], places: dict[str, tuple[str, int, int]]
+) -> str:
+    """Add the rows of one file; the column with pictures, "" where rows name their files."""
+    with _parquet_file(file) as table:
+        names = list(table.schema_arrow.names)
+        picture = next((name for name in _PICTURES if name in names), "")
+        path = next((name for name in _PATHS if name in names), "")
+        if not picture and not path:
+            raise ValueError(f"it must have a column of {', '.join((*_PATHS, *_PICTURES))}; has {', '.join(names)}")
+        wanted, stem = [name for name in names if name != picture], PurePosixPath(file).stem
+        count = 0
+        for group in range(table.num_row_groups):
+            rows = table.metadata.row_group(group).num_rows
+            columns = table.read_row_group(group, columns=wanted).to_pylist() if wanted else [{}] * rows
+            for place, row in enumerate(columns):
+                own = row.pop(path, None) if path else None
+                name = str(own) if own else f"{stem}/{count + place:08d}"
+                object_id = row.pop("object_id", None)
+                metadata = {key: value for key, value in row.items() if _is_plain(value)}
+                photos.append((CataloguePhoto(name, "", metadata), None if object_id is None else str(object_id)))
+                if picture:
+                    places[name] = (file, group, place)
+            count += rows
+    return picture
+
+
+def _is_plain(value: object) -> bool:
+    return isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
+
+
+# WebDataset ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ArchiveSource:
+    """Members of tar files. places: of each photo its archive, and from where to where in it."""
+
+    places: Mapping[str, tuple[str, int, int]]
+
+    def read(self, path: str) -> bytes:
+        """As `Source.read`."""
+        url, start, end = self.places[path]
+        system, name = file_system(url)
+        data: bytes = system.cat_file(name, start=start, end=end)
+        if len(data) != end - start:
+            raise OSError("the archive was cut short")
+        return data
+
+
+def _archives(url: str, naming: Naming) -> Catalogue:
+    photos, places = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]]()
+    for file in _matching(url):
+        try:
+            members = tried(file, lambda file=file: list(_members(file)))  # type: ignore[misc]
+        except _FINAL as error:
+            raise DatasetError(f"{file} is not a readable tar file: {error}") from error
+        stem, about = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
+        for name, data, _, _ in members:
+            if data is not None:
+                about[_key(name)] = _metadata(data)
+        for name, data, start, end in members:
+            if data is None:
+                own = dict(about.get(_key(name), {}))
+                object_id = own.pop("object_id", None)
+                path = f"{stem}/{name}" if "/" not in name else name
+                photos.append((CataloguePhoto(path, "", own), None if object_id is None else str(object_id)))
+                places.setdefault(path, (file, start, end))
+    return _named(url, photos, naming, ArchiveSource(places))
+
+
+def _members(url: str) -> Iterator[tuple[str, bytes | None, int, int]]:
+    """Name, document (None for a picture), start and end of the members that matter."""
+    from retrieval.data.images import EXTENSIONS
+
+    system, path = file_system(url)
+    with system.open(path, "rb") as handle, tarfile.open(fileobj=handle, mode="r:") as archive:
+        for member in archive:
+            ending = PurePosixPath(member.name).suffix.lower()
+            if not member.isfile() or member.size > MAX_BYTES:
+                continue
+            name = member.name.removeprefix("./")
+            if ending in EXTENSIONS:
+                yield name, None, member.offset_data, member.offset_data + member.size
+            elif ending == ".json":
+                opened = archive.extractfile(member)
+                yield name, opened.read() if opened else b"", 0, 0
+
+
+def _key(name: str) -> str:
+    """What members of one sample share: the name up to the first dot after the folders."""
+    folder, _, last = name.rpartition("/")
+    return f"{folder}/{last.partition('.')[0]}"
+
+
+def _metadata(data: bytes) -> dict[str, Any]:
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError):
+        return {}
+    return {key: value for key, value in document.items() if _is_plain(value)} if isinstance(document, dict) else {}

@@ -1,0 +1,259 @@
+"""Photos that lie elsewhere: listed, read and embedded as those of a folder are, whatever the storage does."""
+
+import io
+import json
+import tarfile
+
+import fsspec
+import numpy as np
+import pytest
+
+from retrieval.data import sources
+from retrieval.data.catalogue import PhotoBytes, SkippedPhoto, list_catalogue, read_photo
+from retrieval.data.naming import Naming
+from retrieval.data.sources import list_photos
+from retrieval.errors import BadInput, DatasetError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.build_cluster import build_cluster
+from retrieval.search.searcher import Searcher
+
+pyarrow = pytest.importorskip("pyarrow")
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch):
+    monkeypatch.setattr(sources, "WAITS_S", (0.0,) * 5)
+    sources._read_group.cache_clear()
+
+
+def write_parquet(path, table):
+    import pyarrow.parquet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pyarrow.parquet.write_table(pyarrow.table(table), path, row_group_size=2)
+
+
+def write_tar(path, members):
+    with tarfile.open(path, "w") as archive:
+        for name, data in members:
+            about = tarfile.TarInfo(name)
+            about.size = len(data)
+            archive.addfile(about, io.BytesIO(data))
+
+
+def contents(catalogue):
+    """{path: (object, metadata, bytes)} of every photo."""
+    read = [read_photo(catalogue, photo) for photo in catalogue.photos]
+    return {item.photo.path: (item.photo.object_id, item.photo.metadata, item.data) for item in read}
+
+
+@pytest.fixture
+def memory():
+    """An empty object store in this process: its file system."""
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    yield system
+    system.store.clear()
+
+
+def put(system, folder, below="/bucket/catalog"):
+    for path in folder.rglob("*"):
+        if path.is_file():
+            system.pipe_file(f"{below}/{path.relative_to(folder)}", path.read_bytes())
+
+
+def test_a_folder_of_an_object_store_is_a_folder(catalogue, memory):
+    put(memory, catalogue)
+    memory.pipe_file("/bucket/catalog/.hidden/1.jpg", b"")
+    memory.pipe_file("/bucket/catalog/readme.txt", b"")
+    name = min(path.name for path in catalogue.iterdir())
+    memory.pipe_file("/bucket/catalog/metadata.jsonl", json.dumps({"object_id": name, "price": 3}).encode())
+    listed = list_photos("memory://bucket/catalog")
+    here = contents(list_catalogue(catalogue))
+    there = contents(listed)
+    assert {path: (of, data) for path, (of, _, data) in there.items()} == {
+        path: (of, data) for path, (of, _, data) in here.items()
+    }
+    assert {metadata.get("price") for of, metadata, _ in there.values() if of == name} == {3}
+    assert (listed.ignored, listed.where) == (("readme.txt",), "memory://bucket/catalog")
+
+
+def test_parquet_holds_pictures_or_their_names(catalogue, tmp_path):
+    photos = contents(list_catalogue(catalogue))
+    own = {path: of for path, (of, _, _) in photos.items()}
+    write_parquet(
+        tmp_path / "a.parquet",
+        {
+            "path": list(photos),
+            "image": [{"bytes": data, "path": path} for path, (_, _, data) in photos.items()],
+            "object_id": list(own.values()),
+            "price": list(range(len(own))),
+            "weight": [float("nan")] * len(own),
+        },
+    )
+    held = contents(list_photos(str(tmp_path / "a.parquet")))
+    assert {path: (of, data) for path, (of, _, data) in held.items()} == {
+        path: (of, data) for path, (of, _, data) in photos.items()
+    }
+    assert [metadata for _, metadata, _ in held.values()] == [{"price": number} for number in range(len(own))]
+    write_parquet(catalogue.parent / "names.parquet", {"file_name": [f"{catalogue.name}/{path}" for path in photos]})
+    named = contents(list_photos(str(catalogue.parent / "names.parquet"), Naming("{root}/{object}/{photo}")))
+    assert [data for _, _, data in named.values()] == [data for _, _, data in photos.values()]
+    assert [of for of, _, _ in named.values()] == list(own.values())
+
+
+def test_pictures_without_a_name_are_named_by_their_row(catalogue, tmp_path):
+    data = [item for _, _, item in contents(list_catalogue(catalogue)).values()][:5]
+    for part, rows in (("one", data[:3]), ("two", data[3:])):
+        write_parquet(tmp_path / f"{part}.parquet", {"image": rows, "object_id": ["mug"] * len(rows)})
+    held = contents(list_photos(f"{tmp_path}/*.parquet"))
+    assert list(held) == [f"one/{row:08d}" for row in range(3)] + [f"two/{row:08d}" for row in range(2)]
+    assert [item for _, _, item in held.values()] == data
+
+
+def test_archives_of_webdataset_hold_pictures_and_what_is_said_of_them(catalogue, tmp_path):
+    photos = contents(list_catalogue(catalogue))
+    for number, part in enumerate(np.array_split(np.array(list(photos)), 2)):
+        members = []
+        for place, path in enumerate(part):
+            members.append((f"{place:04d}.jpg", photos[path][2]))
+            members.append((f"{place:04d}.json", json.dumps({"object_id": photos[path][0], "from": path}).encode()))
+        write_tar(tmp_path / f"p-{number:03d}.tar", members)
+    held = contents(list_photos(f"{tmp_path}/p-{{000..001}}.tar"))
+    assert len(held) == len(photos)
+    for path, (of, metadata, data) in held.items():
+        assert path.startswith(("p-000/", "p-001/"))
+        assert (of, data) == (photos[metadata["from"]][0], photos[metadata["from"]][2])
+
+
+def test_names_that_lead_out_of_an_archive_and_twins_are_left_out_and_named(catalogue, tmp_path):
+    data = next(catalogue.rglob("*.jpg")).read_bytes()
+    write_tar(
+        tmp_path / "a.tar",
+        [("mug/1.jpg", data), ("../up.jpg", data), ("/root/1.jpg", data), ("mug/1.jpg", data), ("tin/1.jpg", b"")],
+    )
+    listed = list_photos(str(tmp_path / "a.tar"))
+    assert [photo.path for photo in listed.photos] == ["mug/1.jpg", "tin/1.jpg"]
+    assert {item.path: item.reason for item in listed.skipped} == {
+        "../up.jpg": "its name leads out of the catalogue",
+        "/root/1.jpg": "its name leads out of the catalogue",
+        "mug/1.jpg": "comes twice",
+    }
+
+
+@pytest.mark.parametrize("ending", ["parquet", "tar"])
+@pytest.mark.parametrize("content", [b"", b"no such format" * 100, b"PAR1" * 10])
+def test_files_that_are_none_are_refused_in_a_sentence(ending, content, tmp_path):
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"is not a readable|no photo in the catalogue"):
+        list_photos(str(path))
+
+
+def test_a_url_that_nothing_opens_is_refused():
+    with pytest.raises(BadInput, match="nosuch://bucket cannot be opened"):
+        list_photos("nosuch://bucket")
+
+
+def test_a_place_without_a_photo_is_refused(memory):
+    memory.pipe_file("/bucket/readme.txt", b"")
+    with pytest.raises(DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other files"):
+        list_photos("memory://bucket")
+
+
+# Storage that fails ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def refused(monkeypatch, memory):
+    """The storage refuses every so many-th reading: {"every": n, "times": how often in a row}."""
+    how, calls, plain = {"every": 20, "times": 1}, [], type(memory).cat_file
+
+    def cat_file(self, path, start=None, end=None, **kwargs):
+        calls.append(path)
+        if (len(calls) - 1) % how["every"] < how["times"]:
+            raise OSError("503 Slow Down")
+        return plain(self, path, start, end, **kwargs)
+
+    monkeypatch.setattr(type(memory), "cat_file", cat_file)
+    return how
+
+
+def test_a_storage_that_refuses_one_request_of_twenty_loses_nothing(catalogue, model, memory, refused, tmp_path, index):
+    put(memory, catalogue)
+    report = build_index("memory://bucket/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
+    assert (report.photos, report.skipped) == (24, [])
+    with Searcher.open(tmp_path / "index") as ours, Searcher.open(index) as theirs:
+        assert list(ours.generation.rows) == list(theirs.generation.rows)
+        np.testing.assert_array_equal(ours.generation.arrays["halves"], theirs.generation.arrays["halves"])
+
+
+def test_a_storage_that_goes_on_refusing_ends_the_build_which_goes_on_later(
+    catalogue, model, memory, refused, tmp_path, embedded
+):
+    put(memory, catalogue)
+    refused.update(every=40, times=21)
+    listed = list_photos("memory://bucket/catalog")
+    assert len(listed.photos) == 24
+    with pytest.raises(DatasetError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
+        read_photo(listed, listed.photos[0])
+    checkpoint = load_checkpoint(model)
+    refused.update(every=10**9, times=0)
+    build_cluster("memory://bucket/catalog", checkpoint, tmp_path / "c", 2, quiet=True)
+    assert sum(embedded) == 24
+
+
+def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, memory, tmp_path):
+    put(memory, catalogue)
+    listed = list_photos("memory://bucket/catalog")
+    memory.rm_file(f"/bucket/catalog/{listed.photos[0].path}")
+    assert read_photo(listed, listed.photos[0]) == SkippedPhoto(listed.photos[0].path, "no such file")
+    assert isinstance(read_photo(listed, listed.photos[1]), PhotoBytes)
+    torn = listed.photos[1].path
+    memory.pipe_file(f"/bucket/catalog/{torn}", memory.cat_file(f"/bucket/catalog/{torn}")[:100])
+    report = build_cluster("memory://bucket/catalog", load_checkpoint(model), tmp_path / "c", 2, quiet=True)
+    assert ([item.path for item in report.skipped], report.photos) == ([torn], 22)
+    assert report.embedded == 22
+
+
+# A real S3 server -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def s3(tmp_path_factory):
+    """The address of a server that speaks S3, on this machine alone."""
+    server = pytest.importorskip("moto.server", reason="needs moto[server]")
+    pytest.importorskip("s3fs", reason="needs s3fs")
+    running = server.ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    running.start()
+    host, port = running.get_host_and_port()
+    patch = pytest.MonkeyPatch()
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+    }.items():
+        patch.setenv(name, value)
+    yield f"http://{host}:{port}"
+    patch.undo()
+    running.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(s3, catalogue, model, index, tmp_path):
+    system = fsspec.filesystem("s3")
+    system.mkdir("photos")
+    put(system, catalogue, "photos/catalog")
+    report = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
+    assert (report.photos, report.skipped) == (24, [])
+    with Searcher.open(tmp_path / "index") as ours, Searcher.open(index) as theirs:
+        assert list(ours.generation.rows) == list(theirs.generation.rows)
+        assert ours.described.about["catalogue"] == "s3://photos/catalog"
+    for path in catalogue.rglob("1.jpg"):
+        system.rm_file(f"photos/catalog/{path.relative_to(catalogue)}")
+    fsspec.filesystem("s3").invalidate_cache()
+    again = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
+    assert (again.photos, again.embedded, again.removed) == (16, 0, 8)
