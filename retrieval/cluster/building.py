@@ -48,7 +48,7 @@ def by_ray(cpus: int | None = None, workers: int | None = None) -> Run:
             built = ray.data.from_items(items, override_num_blocks=len(items)).map_batches(
                 ShardBuilder,
                 batch_size=1,
-                concurrency=(1, most) if most > 1 else 1,
+                compute=ray.data.ActorPoolStrategy(min_size=1, max_size=most),
                 num_cpus=1,
                 fn_constructor_args=(checkpoint.path.resolve(),),
             )

@@ -26,8 +26,8 @@ from retrieval.search.opening import described_cluster, folder_shard
 from retrieval.search.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
 
 T = TypeVar("T")
-AGAIN_S = 0.05
-"""Before a shard whose replica was lost is asked again."""
+AGAIN_S, AT_HAND_S = 0.05, 0.005
+"""Before a shard whose replica was lost is asked again; to take an answer that is there."""
 
 
 @dataclass(frozen=True)
@@ -145,16 +145,17 @@ class RayShards:
         from ray.exceptions import RayError
         from ray.serve.exceptions import RayServeException
 
-        while (left := until - time.monotonic()) > 0:
-            try:
-                return response.result(timeout_s=left)
+        while True:
+            try:  # what came while another shard was waited for is taken, however late it is looked at
+                return response.result(timeout_s=max(AT_HAND_S, until - time.monotonic()))
             except TimeoutError:
-                break
+                response.cancel()
+                return None
             except (RayError, RayServeException):
-                time.sleep(min(AGAIN_S, max(0.0, until - time.monotonic())))
+                if time.monotonic() + AGAIN_S > until:
+                    return None
+                time.sleep(AGAIN_S)
                 response = self._send(entry, method, asked)
-        response.cancel()
-        return None
 
     def _unanswered(self, silent: Sequence[ShardEntry], photos: int) -> Unanswered:
         share = photos / self.described.photos

@@ -10,7 +10,7 @@ from retrieval.errors import BadInput, RetrievalError
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Of a Ray that is started here: what travels is small."""
-ADDRESS = "RAY_ADDRESS"
+ADDRESS, LOOPBACK = "RAY_ADDRESS", "127.0.0.1"
 _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_SERVE_LOG_TO_STDERR": "0",
@@ -51,8 +51,14 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
         what = f"the Ray cluster at {joined} cannot be joined" if joined else "Ray cannot be started here"
         raise RetrievalError(f"{what}: {error}") from error
-    logging.getLogger("ray").setLevel(logging.ERROR)
+    for part in ("ray", "ray.data", "ray.serve"):
+        logging.getLogger(part).setLevel(logging.ERROR)
     try:
+        if not joined and (address := ray.util.get_node_ip_address()) != LOOPBACK:
+            raise RetrievalError(
+                f"Ray would listen on {address}, for this process had imported it already: "
+                f"set {', '.join(_LOOPBACK)}=0 before that, or start Ray yourself and name it in RAY_ADDRESS"
+            )
         yield ray
     finally:
         ray.shutdown()
@@ -67,4 +73,4 @@ def on_loopback() -> None:
         return
     listen = getattr(replica, "add_port_to_grpc_server", None)
     if listen is not None:
-        replica.add_port_to_grpc_server = lambda server, address: listen(server, address.replace("[::]", "127.0.0.1"))
+        replica.add_port_to_grpc_server = lambda server, address: listen(server, address.replace("[::]", LOOPBACK))

@@ -54,6 +54,10 @@ def build_index(
         float | None,
         typer.Option(metavar="SHARE", help="of shards: photos that may be unreadable (default: 0.05 of all)"),
     ] = None,
+    cluster: Annotated[
+        bool,
+        typer.Option("--cluster", help="shards are built by Ray, side by side: that of RAY_ADDRESS, else one here"),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
@@ -78,14 +82,21 @@ def build_index(
     }
     if shards is None and is_cluster(out):
         shards = read_cluster(out).of
-    if shards is None and bad_share is not None:
-        raise BadInput("--bad-share is for a catalogue in shards; give --shards too")
+    if shards is None and (bad_share is not None or cluster):
+        raise BadInput("--bad-share and --cluster are for a catalogue in shards; give --shards too")
+    run = None
+    if cluster:
+        from retrieval.cluster.building import by_ray
+
+        run = by_ray()
     try:
         if shards is None:
             report = build.build_index(catalogue, checkpoint, out, **asked)
         else:
             allowed = build_cluster.BAD_SHARE if bad_share is None else bad_share
-            report = build_cluster.build_cluster(catalogue, checkpoint, out, shards, bad_share=allowed, **asked)
+            report = build_cluster.build_cluster(
+                catalogue, checkpoint, out, shards, bad_share=allowed, run=run, **asked
+            )
     except KeyboardInterrupt:
         say(f"what was embedded is kept in {out}; the same command goes on with it")
         raise

@@ -12,6 +12,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
+    from retrieval.search.opening import OpenShards
     from retrieval.serve.service import Bench
     from robot.recording.folder import RecordingWriter
 
@@ -44,6 +45,16 @@ def serve(
     workers: Annotated[int, typer.Option(help="requests in work at once")] = 1,
     batch_ms: Annotated[float, typer.Option(help="how long a query waits for others to be encoded with it")] = 0.0,
     deadline: Annotated[float, typer.Option(metavar="SECONDS", help="after which no answer is waited for")] = 30.0,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="Ray holds the shards of a cluster: that of RAY_ADDRESS, else one here")
+    ] = False,
+    replicas: Annotated[int, typer.Option(help="of --cluster: processes that hold the same shard")] = 1,
+    shard_wait: Annotated[
+        float, typer.Option(metavar="SECONDS", help="of --cluster: how long a shard is waited for")
+    ] = 5.0,
+    least_share: Annotated[
+        float, typer.Option(metavar="SHARE", help="of --cluster: of the catalogue, that an answer must have searched")
+    ] = 1.0,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
     no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
 ) -> None:
@@ -74,7 +85,8 @@ def serve(
     )
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
-        app = create_app(settings, _bench(rig, path), recorder, trials)
+        held = _held(path, closed, replicas, shard_wait, least_share, not no_verify) if cluster else None
+        app = create_app(settings, _bench(rig, path), recorder, trials, held)
 
         def started(bound: int) -> None:
             address = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
@@ -85,14 +97,30 @@ def serve(
         run(app, started)
 
 
+def _held(
+    index: Path, closed: ExitStack, replicas: int, wait_s: float, least_share: float, verify: bool
+) -> "OpenShards":
+    """Opens shards on Ray, which is joined or started. Raises BadInput where there is no cluster to hold."""
+    from indexes.store.cluster import is_cluster
+    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.session import connected
+
+    if not is_cluster(index):
+        raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
+    held = Held(replicas=replicas, wait_s=wait_s, least_share=least_share)
+    ray = closed.enter_context(connected())
+    deployments = Deployments(ray, held, verify)
+    closed.callback(deployments.close)
+    return deployments.open
+
+
 def _recorder(folder: Path, index: Path, closed: ExitStack) -> "RecordingWriter":
     """The writer of the recording of what people say. Raises RobotError."""
-    from indexes.store.folder import IndexStore
     from retrieval.model.stored import read_stored
-    from retrieval.search.defaults import model_of
+    from retrieval.search.defaults import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
 
-    stored = read_stored(model_of(IndexStore(index).open(verify=False).manifest))
+    stored = read_stored(model_of(manifest_of(index)))
     info = {"source": "what people said of queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
     say(f"queries and what is said of them are kept in {folder}")
     return closed.enter_context(RecordingWriter(folder / "recording", info))

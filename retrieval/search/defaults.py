@@ -45,14 +45,11 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     if given is not None:
         return Path(given), "given"
     from indexes.errors import IndexesError
-    from indexes.store.cluster import is_cluster, read_cluster
-    from indexes.store.folder import IndexStore
-    from indexes.store.manifest import read_manifest
 
     here = _trained_here()
     manifest: Manifest | ClusterManifest | None = None
     with suppress(IndexesError):  # no usable index is none
-        manifest = read_cluster(index) if is_cluster(index) else read_manifest(index / IndexStore(index).current())
+        manifest = manifest_of(index)
     if manifest is not None:
         own = model_of(manifest)
         newer = f"; {here} was trained in this folder too: name it to take it" if here not in (None, own) else ""
@@ -62,6 +59,15 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     if shipped_model().is_file():
         return shipped_model(), "shipped; trained on the simulated rig: train your own for real sensors"
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
+
+
+def manifest_of(index: Path) -> "Manifest | ClusterManifest":
+    """What an index folder, or a cluster of them, says of what it holds now. Raises the errors of `indexes.store`."""
+    from indexes.store.cluster import is_cluster, read_cluster
+    from indexes.store.folder import IndexStore
+    from indexes.store.manifest import read_manifest
+
+    return read_cluster(index) if is_cluster(index) else read_manifest(index / IndexStore(index).current())
 
 
 def model_of(manifest: "Manifest | ClusterManifest") -> Path:

@@ -1,5 +1,6 @@
 """Index folders and clusters, opened to be searched with the checkpoint that built them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from indexes.store.cluster import ClusterManifest, open_shard
@@ -8,7 +9,7 @@ from indexes.store.manifest import Manifest
 from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
 from retrieval.search import defaults
 from retrieval.search.objects import require_usable
-from retrieval.search.shard import Described, FolderShard, Shards
+from retrieval.search.shard import Described, FolderShard, Shard, Shards
 
 
 def stored_for(manifest: Manifest | ClusterManifest, model: str | Path | None) -> Stored:
@@ -31,7 +32,11 @@ def folder_shard(generation: Generation, stored: Stored) -> FolderShard:
     return FolderShard(generation, read_judge(stored.path), stored.config.has_embeddings)
 
 
-def open_cluster(cluster: Path, manifest: ClusterManifest, stored: Stored, *, verify: bool = True) -> Shards:
+OpenShards = Callable[[Path, ClusterManifest, Stored], Shard]
+"""Opens the shards of a cluster, wherever they are."""
+
+
+def open_cluster(cluster: Path, manifest: ClusterManifest, stored: Stored, verify: bool = True) -> Shard:
     """All shards of a cluster in this process. Raises as `folder_shard` and `indexes.store.cluster.open_shard` do."""
     require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
     shards = [

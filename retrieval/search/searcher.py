@@ -30,7 +30,7 @@ from retrieval.model.touches import (
 )
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
 from retrieval.search.objects import Objects
-from retrieval.search.opening import folder_shard, open_cluster, stored_for
+from retrieval.search.opening import OpenShards, folder_shard, open_cluster, stored_for
 from retrieval.search.shard import Felt, FolderShard, Judged, Shard
 
 Floats = NDArray[np.float32]
@@ -71,13 +71,19 @@ class Searcher:
 
     @classmethod
     def open(
-        cls, index: str | Path, *, model: str | Path | None = None, verify: bool = True, threads: int | None = None
+        cls,
+        index: str | Path,
+        *,
+        model: str | Path | None = None,
+        verify: bool = True,
+        threads: int | None = None,
+        shards: OpenShards | None = None,
     ) -> "Searcher":
         """Open the current generation of an index, or of a cluster of them, with the checkpoint that built it.
 
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
         threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
-        the choice to the library.
+        the choice to the library. shards: opens those of a cluster; None: in this process, `open_cluster`.
         Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) where there is one, and
         PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`, CheckpointError, and
         MismatchedIndex for another model.
@@ -94,7 +100,7 @@ class Searcher:
         if is_cluster(folder):
             manifest = read_cluster(folder)
             stored = stored_for(manifest, model)
-            shard: Shard = open_cluster(folder, manifest, stored, verify=verify)
+            shard = shards(folder, manifest, stored) if shards else open_cluster(folder, manifest, stored, verify)
         else:
             generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
             stored = stored_for(generation.manifest, model)

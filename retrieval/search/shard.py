@@ -156,6 +156,8 @@ class FolderShard:
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`."""
+        if object_id is None and not words:
+            return Page(self.generation.count, self.generation.rows[offset : offset + limit])
         found = np.arange(self.generation.count)
         if object_id is not None:
             found = found[self.generation.rows.keys("object_id") == key_of(object_id)]

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from threadpoolctl import threadpool_limits
 
+from retrieval.search.opening import OpenShards
 from retrieval.serve import bench, catalogue, errors, health, history, human, page_files, queries
 from retrieval.serve.generations import Generations
 from retrieval.serve.history import FeedbackBody
@@ -47,14 +48,17 @@ def create_app(
     beside: Bench | None = None,
     recorder: Recorder | None = None,
     trials: Path | None = None,
+    shards: OpenShards | None = None,
 ) -> FastAPI:
     """The service over the index of `settings`, which is opened when the application starts.
+
+    shards: opens those of a cluster; None: in this process.
 
     recorder: writes what people said into the recording in the history's folder; nothing is kept without it. trials: a
     recording with whose unseen objects people are tested. Raises BadInput.
     """
     metrics = Metrics()
-    generations = Generations(settings, metrics)
+    generations = Generations(settings, metrics, shards)
     parts = Service(
         settings,
         metrics,

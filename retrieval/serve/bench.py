@@ -9,7 +9,6 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from indexes.store.rows import key_of
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
@@ -42,13 +41,14 @@ async def grasp(parts: Parts, name: Named = None) -> GraspDocument:
 
 def _object_ids(opened: Opened, name: str | None) -> list[str]:
     """Names of objects, spread over the catalogue; the one that is named alone. Raises Problem."""
-    rows = opened.generation.rows
+    shard, photos = opened.shard, opened.searcher.described.photos
     if name is not None:
-        if not (rows.keys("object_id") == key_of(name)).any():
+        if not shard.page([], name, 0, 1).total:
             raise Problem("unknown", f"the index has no object {name!r}; /v1/catalogue lists them")
         return [name]
-    step = max(1, len(rows) // MOST_NAMES)
-    return sorted({str(rows[number]["object_id"]) for number in range(0, len(rows), step)})
+    step = max(1, photos // MOST_NAMES)
+    rows = [row for number in range(0, photos, step) for row in shard.page([], None, number, 1).rows]
+    return sorted({str(row["object_id"]) for row in rows})
 
 
 @router.get(

@@ -5,10 +5,8 @@ An id is looked up in the index, and the file is the one that the index names: n
 
 from typing import Annotated, Any
 
-import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 
-from indexes.store.rows import key_of
 from retrieval.data.images import read_bytes
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
@@ -42,10 +40,10 @@ def photo_of(opened: Opened, photo: str) -> ListedPhoto:
 
 
 def _row(opened: Opened, photo: str) -> dict[str, object]:
-    try:
-        return opened.generation.rows[opened.generation.row_number(photo)]
-    except KeyError:
-        raise Problem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them") from None
+    (row,) = opened.shard.rows([photo])
+    if row is None:
+        raise Problem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them")
+    return row
 
 
 def _gone(path: str) -> Problem:
@@ -66,19 +64,14 @@ def catalogue(
 ) -> CatalogueDocument:
     """Photos of the index, in its order, page by page."""
     opened = parts.generations.current
-    found = np.arange(opened.generation.count)
-    if name is not None:
-        found = found[opened.generation.rows.keys("object_id") == key_of(name)]
-    if words := search.casefold().split():
-        texts = opened.texts()
-        found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
-    end = min(offset + limit, len(found))
+    found = opened.shard.page(search.casefold().split(), name, offset, limit)
+    end = offset + len(found.rows)
     return CatalogueDocument(
         generation=opened.name,
-        total=len(found),
+        total=found.total,
         offset=offset,
-        next=end if end < len(found) else None,
-        items=[_document(listed_photo(opened.generation.rows[int(row)])) for row in found[offset:end]],
+        next=end if offset < end < found.total else None,
+        items=[_document(listed_photo(row)) for row in found.rows],
     )
 
 
@@ -157,13 +150,13 @@ def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)]
 def index(parts: Parts) -> IndexDocument:
     """What answers, and with what it is asked."""
     opened = parts.generations.current
-    searcher, manifest = opened.searcher, opened.generation.manifest
-    measured = manifest.about.get("candidates") or {}
+    searcher, described = opened.searcher, opened.searcher.described
+    measured = described.about.get("candidates") or {}
     return IndexDocument(
         generation=opened.name,
-        kind=manifest.kind,
-        photos=opened.generation.count,
-        objects=searcher.objects.count,
+        kind=described.kind,
+        photos=described.photos,
+        objects=described.objects,
         model=searcher.checkpoint.path.name,
         trained_on=str(searcher.checkpoint.provenance.get("source", "unknown")),
         encoder=searcher.encoder.name,

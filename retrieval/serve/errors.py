@@ -11,7 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from indexes.errors import IndexesError
-from retrieval.errors import BadInput, ImageError, RetrievalError
+from retrieval.errors import BadInput, ImageError, RetrievalError, Unanswered
 
 MEDIA_TYPE = "application/problem+json"
 PREFIX = "urn:touch-retrieval:problem:"
@@ -80,6 +80,8 @@ def problem_of(error: Exception) -> Problem:
             return Problem("bad-image", str(error))
         case BadInput():
             return Problem("bad-input", str(error))
+        case Unanswered():
+            return Problem("not-ready", str(error), {"retry-after": "1"})
         case RetrievalError() | IndexesError():
             return Problem("failed", str(error))
         case RequestValidationError():

@@ -7,8 +7,9 @@ import logging
 from functools import cached_property
 from threading import Lock
 
-from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.search.defaults import manifest_of
+from retrieval.search.opening import OpenShards
 from retrieval.search.searcher import Searcher
 from retrieval.serve.errors import Problem
 from retrieval.serve.metrics import Metrics
@@ -23,7 +24,7 @@ class Opened:
     """A generation that is served: its searcher, and what is made of it when it is first asked for."""
 
     def __init__(self, searcher: Searcher) -> None:
-        self.searcher, self.generation = searcher, searcher.generation
+        self.searcher, self.shard = searcher, searcher.shard
         self.model = searcher.checkpoint.digest
         self.fingers: int = searcher.checkpoint.config.matcher.fingers
         self._lock = Lock()
@@ -31,7 +32,7 @@ class Opened:
     @property
     def name(self) -> str:
         """Of the generation."""
-        return self.generation.name
+        return self.searcher.described.name
 
     def checkpoint(self) -> Checkpoint:
         """The whole model, photo tower too, which queries do without."""
@@ -42,26 +43,12 @@ class Opened:
     def _checkpoint(self) -> Checkpoint:
         return load_checkpoint(self.searcher.checkpoint.path, known=self.searcher.checkpoint)
 
-    def texts(self) -> list[str]:
-        """What each row is found by: object, path and metadata, without capitals."""
-        with self._lock:
-            return self._texts
-
-    @cached_property
-    def _texts(self) -> list[str]:
-        found = []
-        for row in self.generation.rows:
-            values = [row.get("object_id"), row.get("path"), *(row.get("metadata") or {}).values()]
-            found.append(" ".join(str(value) for value in values).casefold())
-        return found
-
 
 class Generations:
-    """The generations of one index folder, as they come."""
+    """The generations of one index folder, or of one cluster, as they come. shards: opens those of a cluster."""
 
-    def __init__(self, settings: ServiceSettings, metrics: Metrics) -> None:
-        self._settings, self._metrics = settings, metrics
-        self._store = IndexStore(settings.index)
+    def __init__(self, settings: ServiceSettings, metrics: Metrics, shards: OpenShards | None = None) -> None:
+        self._settings, self._metrics, self._shards = settings, metrics, shards
         self._current: Opened | None = None
 
     @property
@@ -79,7 +66,9 @@ class Generations:
     def open(self) -> None:
         """Open the newest generation. Raises the errors of `Searcher.open`."""
         said = self._settings
-        opened = Opened(Searcher.open(said.index, model=said.model, verify=said.verify, threads=said.threads))
+        opened = Opened(
+            Searcher.open(said.index, model=said.model, verify=said.verify, threads=said.threads, shards=self._shards)
+        )
         self._current = opened
         self._metrics.serves(opened.name)
         gc.collect()  # what the one before held in circles
@@ -91,7 +80,7 @@ class Generations:
             await asyncio.sleep(self._settings.poll_s)
             now = asyncio.get_running_loop().time()
             try:
-                name = await asyncio.to_thread(self._store.current)
+                name = (await asyncio.to_thread(manifest_of, self._settings.index)).generation
                 if name == self.current.name or (name == failed and now < again):
                     continue
                 failed, again = name, now + _AGAIN_S

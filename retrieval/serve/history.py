@@ -16,7 +16,6 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
-from indexes.store.rows import key_of
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
@@ -245,18 +244,18 @@ def _meant(body: FeedbackBody, kept: Kept, opened: Opened) -> tuple[str, str | N
 
 
 def _first_photo(opened: Opened, object_id: str) -> str:
-    rows = np.flatnonzero(opened.generation.rows.keys("object_id") == key_of(object_id))
-    if not len(rows):
+    rows = opened.shard.page([], object_id, 0, 1).rows
+    if not rows:
         raise Problem("bad-input", f'the index has no object {object_id!r}; say "none" where the catalogue lacks it')
-    return listed_photo(opened.generation.rows[int(rows[0])]).path
+    return listed_photo(rows[0]).path
 
 
 def _photo(opened: Opened, photo: str) -> bytes | None:
     """Its file; None where it is gone, and then the grasps are kept but in no recording."""
+    (row,) = opened.shard.rows([photo])
     try:
-        listed = listed_photo(opened.generation.rows[opened.generation.row_number(photo)])
-        return read_bytes(opened.searcher.catalogue / listed.path)
-    except (KeyError, ImageError):
+        return None if row is None else read_bytes(opened.searcher.catalogue / listed_photo(row).path)
+    except ImageError:
         return None
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from indexes.errors import IndexesError
+from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
 from retrieval.serve.service import Bench, Grasped
@@ -48,7 +49,8 @@ def of_index(index: Path) -> Bench | None:
 def _seed(index: Path) -> int | None:
     """Of the simulated objects that an index shows; None where its first is none."""
     try:
-        first = IndexStore(index).open(verify=False).rows[0]["object_id"]
+        folder = index / read_cluster(index).shards[0].folder if is_cluster(index) else index
+        first = IndexStore(folder).open(verify=False).rows[0]["object_id"]
     except IndexesError:
         return None  # said when it is opened
     found = _SIMULATED.fullmatch(str(first))

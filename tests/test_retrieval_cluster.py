@@ -1,0 +1,305 @@
+"""A catalogue on Ray: shards are embedded, held and asked there; no fault makes a wrong or a silently partial answer.
+
+One Ray serves all tests of this file: two processors, a small object store, 127.0.0.1. Processes are killed and stopped
+as machines are lost and hang.
+"""
+
+import math
+import os
+import shutil
+import signal
+import threading
+import time
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from indexes.store.cluster import read_cluster
+from indexes.store.folder import IndexStore
+from retrieval.data.catalogue import list_catalogue
+from retrieval.errors import BadInput, TooManyBad, Unanswered
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build_cluster import build_cluster
+from retrieval.search.opening import stored_for
+from retrieval.search.searcher import Searcher
+from tests import on_ray, synthetic
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore"),  # Ray's own warnings
+    pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`"),
+]
+
+LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
+SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
+
+
+@pytest.fixture(scope="module")
+def ray():
+    from retrieval.cluster.session import connected
+
+    with connected(2) as module:
+        yield module
+
+
+@pytest.fixture(scope="module")
+def grasps(tmp_path_factory):
+    """Files of three grasps of each of two objects."""
+    objects = synthetic.make_objects(2, seed=9)
+    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
+
+
+@pytest.fixture(scope="module")
+def cluster(catalogue, model, tmp_path_factory):
+    """The catalogue in four shards. Not to be changed."""
+    out = tmp_path_factory.mktemp("cluster") / "cluster"
+    build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
+    return out
+
+
+def deployments(ray, **held):
+    from retrieval.cluster.serving import Deployments, Held
+
+    return Deployments(ray, Held(cpus=0.1, **held))
+
+
+@pytest.fixture(scope="module")
+def held(ray, cluster):
+    """The cluster, held by Ray; an answer must have searched all of it, within two minutes."""
+    with Searcher.open(cluster, shards=deployments(ray, wait_s=120.0).open) as searcher:
+        yield searcher
+
+
+def numbers(answer):
+    return [answer.none_probability, *(part for match in answer.results for part in (match.logit, match.probability))]
+
+
+def names(answer):
+    return [(match.object_id, match.photo) for match in answer.results]
+
+
+# Answers --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_answers_are_those_of_the_folder(count, held, searcher, grasps):
+    for own in grasps:
+        ours, theirs = held.query(own[:count]), searcher.query(own[:count])
+        assert names(ours) == names(theirs)
+        assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5)
+        assert (ours.verdict, ours.posterior["judged_objects"]) == (theirs.verdict, 8)
+        assert (ours.index["shards"], ours.index["searched"]) == (4, 1.0)
+
+
+def test_with_candidates_a_shard_judges_as_many_as_the_folder(held, searcher, grasps):
+    for candidates in (1, 2, 5):
+        ours, theirs = (one.query(grasps[0], top=1, candidates=candidates) for one in (held, searcher))
+        assert ours.top.logit >= theirs.top.logit - 1e-5
+
+
+def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
+    rows = list(searcher.generation.rows)
+    ids = [row["id"] for row in rows[::7]] + ["absent"]
+    assert held.shard.rows(ids) == [*rows[::7], None]
+    pages = [held.shard.page([], None, offset, 7) for offset in range(0, 24, 7)]
+    assert {page.total for page in pages} == {24}
+    assert sorted(row["id"] for page in pages for row in page.rows) == sorted(row["id"] for row in rows)
+    name = rows[0]["object_id"]
+    assert held.shard.page([], name, 0, 10).total == 3
+    assert held.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
+
+
+def test_everything_listens_on_this_machine_alone(held, touch):
+    held.query(touch)
+    found = on_ray.listening()
+    assert found
+    assert found <= LOOPBACK
+
+
+def test_many_threads_ask_at_once(held, grasps):
+    expected = names(held.query(grasps[0]))
+    found, threads = [], []
+    for _ in range(8):
+        threads.append(threading.Thread(target=lambda: found.append(names(held.query(grasps[0])))))
+        threads[-1].start()
+    for thread in threads:
+        thread.join(300)
+    assert found == [expected] * 8
+
+
+# Faults ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_shard_that_is_killed_is_started_again_and_every_answer_is_whole(held, grasps):
+    expected = names(held.query(grasps[0]))
+    for turn in range(20):
+        process = on_ray.called(SHARD)[turn % len(on_ray.called(SHARD))]
+        os.kill(process, signal.SIGKILL)
+        answer = held.query(grasps[0])
+        assert names(answer) == expected
+        assert answer.index["searched"] == 1.0
+
+
+@pytest.fixture
+def stopped():
+    """Stops a shard's process, as a machine hangs; all go on at the end."""
+    done = []
+
+    def stop(count=1):
+        for process in on_ray.called(SHARD)[:count]:
+            os.kill(process, signal.SIGSTOP)
+            done.append(process)
+
+    yield stop
+    for process in done:
+        try:
+            os.kill(process, signal.SIGCONT)
+        except ProcessLookupError:  # Ray has given it up
+            continue
+
+
+def test_a_shard_that_hangs_is_told_and_never_passed_over_in_silence(ray, cluster, grasps, stopped):
+    whole = deployments(ray, wait_s=2.0)
+    part = deployments(ray, wait_s=2.0, least_share=0.1)
+    strict, lenient = Searcher.open(cluster, shards=whole.open), Searcher.open(cluster, shards=part.open)
+    expected = strict.query(grasps[0], top=8)
+    stopped()
+    with pytest.raises(Unanswered, match=r"no answer within 2 s from shard-0\d-of-04: 0\.\d+ of the catalogue"):
+        strict.query(grasps[0])
+    answer = lenient.query(grasps[0], top=8)
+    if answer.index["searched"] == 1.0:  # Ray has replaced it already
+        return
+    assert 0.1 <= answer.index["searched"] < 1
+    kept = [match for match in expected.results if match.object_id in {one.object_id for one in answer.results}]
+    assert [match.object_id for match in kept] == [match.object_id for match in answer.results]
+    shown = math.fsum(match.probability for match in answer.results)
+    assert answer.posterior["unjudged_probability"] > 0
+    assert answer.none_probability + shown + answer.posterior["unjudged_probability"] == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize("field", [{"replicas": 0}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}])
+def test_settings_that_are_none_are_refused(field):
+    from retrieval.cluster.serving import Held
+
+    with pytest.raises(BadInput):
+        Held(**field)
+
+
+def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluster, model, grasps, tmp_path):
+    shutil.copytree(catalogue, tmp_path / "catalog")
+    shutil.copytree(cluster, tmp_path / "cluster")
+    held = deployments(ray, wait_s=120.0)
+    current, told, stop = [Searcher.open(tmp_path / "cluster", shards=held.open)], [], threading.Event()
+
+    def ask():
+        while not stop.is_set():
+            answer = current[0].query(grasps[0], top=1)
+            told.append((answer.index["generation"], answer.index["photos"], answer.index["searched"]))
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        name = min(path.name for path in (tmp_path / "catalog").iterdir())
+        shutil.copy(next(catalogue.glob("*/2.jpg")), tmp_path / "catalog" / name / "new.jpg")
+        build_cluster(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4, quiet=True)
+        before = current[0]
+        current[0] = Searcher.open(tmp_path / "cluster", shards=held.open)
+        del before
+        count, until = len(told), time.monotonic() + 120
+        while len(told) < count + 3 and time.monotonic() < until:
+            time.sleep(0.05)
+    finally:
+        stop.set()
+        thread.join(300)
+    assert set(told) == {("cluster-000001", 24, 1.0), ("cluster-000002", 25, 1.0)}
+    assert told == sorted(told)
+
+
+# Building -------------------------------------------------------------------------------------------------------------
+
+
+def halves_of(cluster):
+    """{photo: its half}, of all shards."""
+    found = {}
+    for entry in read_cluster(cluster).shards:
+        generation = IndexStore(cluster / entry.folder).open(name=entry.generation)
+        found |= {
+            row["id"]: half.tobytes() for row, half in zip(generation.rows, generation.arrays["halves"], strict=True)
+        }
+    return found
+
+
+def test_shards_built_by_ray_are_those_built_here(ray, catalogue, cluster, model, tmp_path):
+    from retrieval.cluster.building import by_ray
+
+    report = build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray())
+    assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
+    ours, theirs = halves_of(tmp_path / "c"), halves_of(cluster)
+    assert ours.keys() == theirs.keys()
+    for name, half in ours.items():
+        np.testing.assert_allclose(np.frombuffer(half, np.float16), np.frombuffer(theirs[name], np.float16), atol=2e-3)
+
+
+def test_what_is_wrong_with_a_catalogue_is_a_sentence_from_afar_too(ray, catalogue, model, tmp_path):
+    from retrieval.cluster.building import by_ray
+
+    shutil.copytree(catalogue, tmp_path / "catalog")
+    for photo in list((tmp_path / "catalog").glob("*/2.jpg"))[:4]:
+        photo.write_bytes(b"no picture")
+    with pytest.raises(TooManyBad, match="4 of 24 photos cannot be read"):
+        build_cluster(tmp_path / "catalog", load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray())
+
+
+@pytest.fixture
+def many(tmp_path):
+    """A catalogue of 240 photos, no two alike."""
+    folder = tmp_path / "many"
+    base = next(
+        path for path in sorted(synthetic.write_catalogue(tmp_path / "few", synthetic.make_objects(1)).rglob("*.jpg"))
+    )
+    data = base.read_bytes()
+    for number in range(240):
+        place = folder / f"object-{number % 40:02d}" / f"{number}.jpg"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(data + b"\0" + str(number).encode())  # of another content; decoders stop at the end marker
+    return folder
+
+
+def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
+    """Codes are kept as they are made: what is embedded twice is what the killed process had in work."""
+    from retrieval.cluster.building import by_ray
+
+    done = {}
+
+    def build():
+        done["report"] = build_cluster(
+            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=by_ray(workers=1), bad_share=0
+        )
+
+    thread = threading.Thread(target=build)
+    thread.start()
+    until, killed = time.monotonic() + 240, 0
+    while thread.is_alive() and killed < 2 and time.monotonic() < until:
+        records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished/*.records"))
+        if records and (workers := on_ray.called(WORKER)):
+            os.kill(workers[0], signal.SIGKILL)
+            killed += 1
+            time.sleep(2)
+        time.sleep(0.002)
+    thread.join(600)
+    report = done["report"]
+    assert killed
+    assert (report.photos, report.objects, report.skipped) == (240, 40, [])
+    assert len(halves_of(tmp_path / "c")) == 240 == len(list_catalogue(many).photos)
+
+
+def test_without_a_cluster_the_service_says_what_to_do(index, capsys):
+    from retrieval.commands.main import main
+
+    assert main(["serve", "--index", str(index), "--cluster", "--no-history"]) == 2
+    assert "is one index folder; make a cluster by `retrieve build-index --shards`" in capsys.readouterr().err
+
+
+def test_the_checkpoint_of_a_cluster_is_found(cluster, model):
+    assert stored_for(read_cluster(cluster), None).path == model
