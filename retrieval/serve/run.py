@@ -1,5 +1,6 @@
 """The server around the application: it listens, and SIGTERM or Ctrl-C lets it finish what is in flight."""
 
+import asyncio
 import contextlib
 import signal
 import socket
@@ -15,6 +16,8 @@ from retrieval.serve.service import Service
 
 KEEP_ALIVE_S = 5
 MOST_CONNECTIONS = 512
+LAST_CALL_S = 0.5
+"""For which, told to end, it still takes requests: those that were sent before, and lie unread in a socket."""
 
 
 class Server(uvicorn.Server):
@@ -29,6 +32,11 @@ class Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._say_started(self.servers[0].sockets[0].getsockname()[1])
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Answer what was sent until now, and end."""
+        await asyncio.sleep(LAST_CALL_S)
+        await super().shutdown(sockets)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
