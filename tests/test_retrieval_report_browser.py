@@ -51,7 +51,8 @@ def test_a_click_on_a_confusion_shows_touches_that_were_mistaken_with_their_pict
     shown = opened.get_by_role("region", name="Grasps that were clicked")
     assert shown.get_by_role("heading").inner_text() == told
     cards = shown.locator(".cards li")
-    assert all(text.startswith(told.split(" taken for ")[0]) for text in cards.locator("p").all_inner_texts())
+    names = cards.locator("figcaption").filter(has_text="the object: ").all_inner_texts()
+    assert set(names) == {f"the object: {told.split(' taken for ')[0]}"}
     pictures = shown.locator("img")
     assert (cards.count(), pictures.count()) == (2, 8)  # two gels, the object, and what was found, of each
     assert pictures.evaluate_all("all => all.every((one) => one.complete && one.naturalWidth > 0)")

@@ -97,19 +97,6 @@ def test_what_is_no_picture_is_refused_before_it_is_sent(opened, tmp_path):
     assert opened.locator(".grasp").count() == 0
 
 
-def test_the_answer_is_photos_with_bars_that_add_up_to_1_none_of_these_among_them(opened, files):
-    ask(opened, files)
-    bars = [float(one) for one in opened.locator("[data-p]").evaluate_all("all => all.map((one) => one.dataset.p)")]
-    assert len(bars) == 9  # eight objects, none of these
-    assert sum(bars) == pytest.approx(1, abs=1e-6)
-    assert bars == sorted(bars, reverse=True)
-    assert opened.locator(".photo .name", has_text="None of these").is_visible()
-    verdicts = ("Most likely", "Nearest", "Nothing was felt", "Nothing is named")
-    assert opened.locator(".above").inner_text() in verdicts
-    assert opened.locator(".photo img").count() == 8
-    assert opened.locator(".photo img").evaluate_all("all => all.every((one) => one.loading === 'lazy')")
-
-
 def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
     opened.get_by_text("Options").click()
     opened.get_by_label("Objects to show").fill("3")
@@ -118,26 +105,6 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
     bars = [float(one) for one in opened.locator("[data-p]").evaluate_all("all => all.map((one) => one.dataset.p)")]
     assert (len(bars), sum(bars)) == (5, pytest.approx(1, abs=1e-6))
     assert opened.get_by_text("5 other objects").is_visible()
-
-
-def test_a_click_shows_all_photos_of_an_object_beside_the_touch_and_enlarges_them(opened, files):
-    ask(opened, files)
-    name = opened.locator(".photo.object .name").first.inner_text()
-    opened.locator(".photo.object button").first.click()
-    dialog = opened.get_by_role("dialog", name=name)
-    dialog.locator(".film").first.locator("li").nth(2).wait_for()
-    assert dialog.get_by_label("Photos of this object").get_by_role("button").count() == 3
-    assert dialog.get_by_alt_text("Gel image: Grasp 1, finger a").is_visible()
-    dialog.get_by_label("Touch beside the photo").select_option("Grasp 2, finger b")
-    assert dialog.get_by_alt_text("Gel image: Grasp 2, finger b").is_visible()
-    dialog.get_by_role("button", name="Photo 2 of 3").click()
-    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
-    small = dialog.get_by_alt_text(f"Photo {name}/2.jpg").bounding_box()["height"]
-    dialog.get_by_role("button", name="Enlarge the photo").click()
-    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").bounding_box()["height"] > small
-    assert not dialog.get_by_alt_text("Gel image").is_visible()
-    opened.keyboard.press("Escape")
-    assert dialog.count() == 0
 
 
 def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):

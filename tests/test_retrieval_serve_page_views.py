@@ -5,8 +5,10 @@ import json
 import zipfile
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
 
+from retrieval.search.searcher import Searcher
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.browser import address, ask, chromium, gel_files, page, serious
@@ -53,12 +55,31 @@ def to(opened, name):
 def test_how_the_answer_changed_grasp_by_grasp_is_drawn_and_told_in_numbers(opened, files):
     ask(opened, files)
     section = opened.get_by_role("region", name="Grasp by grasp")
-    section.get_by_text("told most").wait_for()
+    section.get_by_text("changed the answer most").wait_for()
     assert section.locator("svg .none circle").count() == 2  # after one grasp, after two
     section.get_by_text("As numbers").click()
     assert section.get_by_role("columnheader").all_inner_texts() == ["Object", "Grasp 1", "Grasp 2"]
     last = section.get_by_role("row", name="None of these").get_by_role("cell").last.inner_text()
     assert last == opened.locator(".photo.none .p").inner_text()
+
+
+def test_which_grasp_would_tell_most_by_itself_is_said_in_bits(opened, files, index):
+    with Searcher.open(index) as searcher:
+        expected = [divergence_bits(searcher.query([files[at : at + 2]], top=100)) for at in (0, 2)]
+    ask(opened, files)
+    section = opened.get_by_role("region", name="Grasp by grasp")
+    said = section.get_by_text("would tell most").inner_text()
+    assert f"grasp {1 + int(np.argmax(expected))} would tell most: {max(expected):.1f} of the 4.0 bits" in said
+    section.get_by_text("As numbers").click()
+    row = section.get_by_role("row", name="The grasp by itself tells").get_by_role("cell")
+    assert [float(text.split()[0]) for text in row.all_inner_texts()] == pytest.approx(expected, abs=0.0051)
+
+
+def divergence_bits(answer):
+    """Of the probabilities of eight objects and none from those before, 1/16 each and 1/2."""
+    now = np.array([*(match.probability for match in answer.results), answer.none_probability])
+    before = np.array([1 / 16] * 8 + [1 / 2])
+    return float(np.sum(now * np.log2(now / before)))
 
 
 def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):
@@ -173,6 +194,8 @@ def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
 
 def test_ten_choices_are_made_by_mouse_and_by_key_and_the_result_stands_beside_the_models(opened):
     to(opened, "Test")
+    opened.get_by_role("button", name="Begin").wait_for()
+    assert opened.locator("main").get_by_text("false", exact=True).count() == 0
     opened.get_by_label("Trials").fill("2")
     opened.get_by_label("Your name, if you like").fill("Ada")
     opened.get_by_role("button", name="Begin").click()

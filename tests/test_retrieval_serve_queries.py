@@ -55,8 +55,13 @@ def test_a_batch_gives_an_answer_for_each_object_in_their_order(client, searcher
         assert same(answer, expected)
 
 
-def test_a_growing_query_answers_after_each_grasp(client, searcher, grasps):
-    answers = client.post("/v1/query/growing", json={"touches": encoded(grasps)}).json()["answers"]
+def test_a_growing_query_answers_after_each_grasp_and_for_each_alone_where_asked(client, searcher, grasps):
+    asked = {"touches": encoded(grasps)}
+    assert client.post("/v1/query/growing", json=asked).json()["alone"] == []
+    found = client.post("/v1/query/growing?alone=true", json=asked).json()
+    for answer, expected in zip(found["alone"], searcher.query_many([[grasp] for grasp in grasps]), strict=True):
+        assert same(answer, expected)
+    answers = found["answers"]
     assert [len(answer["query"]["touches"]) for answer in answers] == [1, 2]
     for answer, expected in zip(answers, searcher.query_growing(grasps), strict=True):
         assert same(answer, expected)

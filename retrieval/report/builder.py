@@ -47,9 +47,12 @@ class Builder:
         taken = found.object_id if found else shown["found"]
         touches = own.touches if own else ()
         gels = [(f"finger {ascii_lowercase[place]}", path) for place, path in enumerate(touches)]
-        right = "found first" if taken == shown["object_id"] else "found first, wrongly"
-        photos = [("the object", own.photo if own else None), (f"{right}: {taken}", found.photo if found else None)]
-        return Card(f"{shown['object_id']}, grasp {shown['grasp_id']}", (*gels, *photos))
+        right = "found first" if taken == shown["object_id"] else "found first, wrong"
+        photos = [
+            (f"the object: {shown['object_id']}", own.photo if own else None),
+            (f"{right}: {taken}", found.photo if found else None),
+        ]
+        return Card(f"Grasp {shown['grasp_id']}", (*gels, *photos))
 
     def any(self, *measures: str) -> bool:
         return any(self.results.summary(name, key) for name in self.results.methods for key in measures)

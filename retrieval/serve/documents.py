@@ -71,9 +71,11 @@ class BatchDocument(BaseModel):
 
 
 class GrowingDocument(BaseModel):
-    """The answer after the first grasp, after the first two, and so on."""
+    """The answer after the first grasp, after the first two, and so on. alone: what each grasp says by itself, where
+    that was asked."""
 
     answers: list[QueryDocument]
+    alone: list[QueryDocument]
 
 
 class PhotoDocument(BaseModel):

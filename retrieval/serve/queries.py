@@ -5,6 +5,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from retrieval.search.agreement import agreement
+from retrieval.search.answer import QueryResult
 from retrieval.serve.catalogue import photo_of
 from retrieval.serve.documents import AgreementDocument, BatchDocument, GrowingDocument, QueryDocument
 from retrieval.serve.errors import problems
@@ -45,16 +46,21 @@ async def query(request: Request, parts: Parts) -> JSONResponse:
 @router.post(
     "/v1/query/growing", response_model=GrowingDocument, responses=_PROBLEMS, openapi_extra={"requestBody": QUERY_BODY}
 )
-async def query_growing(request: Request, parts: Parts) -> JSONResponse:
-    """How the answer changes grasp by grasp: after the first, after the first two, and so on."""
+async def query_growing(request: Request, parts: Parts, alone: bool = False) -> JSONResponse:
+    """How the answer changes grasp by grasp: after the first, after the first two, and so on; `alone`: and what each
+    grasp says by itself."""
     parts.queue.require_room()
     asked = await read_query(request, parts.generations.current.fingers)
-    answers = await parts.queue.do(
-        lambda opened: opened.searcher.query_growing(asked.touches, **asked.keywords),
-        request,
-        asked.options.deadline_ms,
-    )
-    return JSONResponse({"answers": [answer.to_dict() for answer in answers]})
+
+    def work(opened: Opened) -> dict[str, list[QueryResult]]:
+        searcher, each = opened.searcher, [[grasp] for grasp in asked.touches if alone]
+        return {
+            "answers": searcher.query_growing(asked.touches, **asked.keywords),
+            "alone": searcher.query_many(each, **asked.keywords),
+        }
+
+    found = await parts.queue.do(work, request, asked.options.deadline_ms)
+    return JSONResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
 
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))

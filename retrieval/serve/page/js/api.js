@@ -86,8 +86,8 @@ export async function query(touches, background, options) {
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
-export const growing = async (touches, background, options) =>
-  (await json("/v1/query/growing", form(touches, background, options))).answers;
+export const growing = (touches, background, options) =>
+  json("/v1/query/growing?alone=true", form(touches, background, options));
 
 /** The simulated jaws close on an object, that one where it is named. */
 export async function grasp(objectId = null) {

@@ -5,7 +5,7 @@ import { h, problemCard, svg } from "./dom.js";
 import { percent } from "./words.js";
 
 const MOST_LINES = 5;
-const [WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [720, 250, 46, 16, 14, 30];
+const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [250, 46, 16, 14, 30];
 
 /** The section; it asks for the answers itself. */
 export function growingPanel(asked) {
@@ -20,24 +20,26 @@ export function growingPanel(asked) {
 
   async function load() {
     try {
-      const answers = await api.growing(asked.touches, asked.background, { ...asked.options, top: 100 });
-      element.replaceChildren(h("h3", {}, "Grasp by grasp"), ...content(answers));
+      const { answers, alone } = await api.growing(asked.touches, asked.background, { ...asked.options, top: 100 });
+      element.replaceChildren(h("h3", {}, "Grasp by grasp"), ...content(answers, alone));
     } catch (error) {
       element.replaceChildren(h("h3", {}, "Grasp by grasp"), problemCard(error, load));
     }
   }
 }
 
-function content(answers) {
+function content(answers, alone) {
   const told = answers.filter((answer) => answer.none_probability !== null).length;
   if (told < 2)
     return [h("p", { class: "faint" }, "Fewer than two grasps felt something; there is nothing to compare.")];
   const lines = linesOf(answers);
+  const toldBits = alone.map(bits);
   return [
     h("p", { class: "turn" }, turningPoint(answers, lines)),
+    h("p", { class: "turn" }, mostByItself(alone, toldBits)),
     plot(answers, lines),
     legend(lines),
-    numbers(answers, lines),
+    numbers(answers, lines, toldBits),
   ];
 }
 
@@ -60,7 +62,30 @@ function linesOf(answers) {
   ];
 }
 
-/** Which grasp told most: after which the probabilities moved furthest. */
+/** What an answer tells beyond what was believed before it: the Kullback-Leibler divergence of the two, in bits. Objects
+ * that are not listed count as one. */
+function bits({ results, none_probability: none, posterior }) {
+  if (none === null || !posterior) return 0; // nothing was felt
+  const { objects, none_prior: before } = posterior;
+  const each = (1 - before) / objects;
+  const listed = results.reduce((sum, match) => sum + match.probability, 0);
+  const pairs = [
+    ...results.map((match) => [match.probability, each]),
+    [none, before],
+    [Math.max(0, 1 - none - listed), (objects - results.length) * each],
+  ];
+  return pairs.reduce((sum, [now, was]) => sum + (now > 0 && was > 0 ? now * Math.log2(now / was) : 0), 0);
+}
+
+/** Which grasp would tell most, were it the only one. */
+function mostByItself(alone, told) {
+  const most = told.indexOf(Math.max(...told));
+  const { objects, none_prior: before } = alone[most].posterior;
+  const all = Math.log2(objects / (1 - before));
+  return `By itself, grasp ${most + 1} would tell most: ${told[most].toFixed(1)} of the ${all.toFixed(1)} bits that name an object for certain.`;
+}
+
+/** After which grasp the probabilities moved furthest. */
 function turningPoint(answers, lines) {
   let [most, where] = [-1, 1];
   for (let step = 1; step < answers.length; step += 1) {
@@ -70,14 +95,15 @@ function turningPoint(answers, lines) {
   }
   const { name, values } = lines[0];
   const say = (value) => (value === null ? "nothing said" : percent(value));
-  return `After the first grasp, grasp ${where + 1} told most: ${name} went from ${say(values[where - 1])} to ${say(values[where])}.`;
+  return `After the first grasp, grasp ${where + 1} changed the answer most: ${name} went from ${say(values[where - 1])} to ${say(values[where])}.`;
 }
 
 function plot(answers, lines) {
-  const x = (step) => LEFT + (step * (WIDTH - LEFT - RIGHT)) / Math.max(1, answers.length - 1);
+  const width = matchMedia("(max-width: 560px)").matches ? 320 : 720; // letters are as large on either
+  const x = (step) => LEFT + (step * (width - LEFT - RIGHT)) / Math.max(1, answers.length - 1);
   const y = (p) => HEIGHT - BOTTOM - p * (HEIGHT - TOP - BOTTOM);
   const grid = [0, 0.5, 1].map((p) => [
-    svg("line", { x1: LEFT, x2: WIDTH - RIGHT, y1: y(p), y2: y(p), class: "rule" }),
+    svg("line", { x1: LEFT, x2: width - RIGHT, y1: y(p), y2: y(p), class: "rule" }),
     svg("text", { x: LEFT - 8, y: y(p) + 4, "text-anchor": "end" }, `${100 * p} %`),
   ]);
   const steps = answers.map((_, step) => {
@@ -96,7 +122,7 @@ function plot(answers, lines) {
   });
   return svg(
     "svg",
-    { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, "aria-hidden": "true", class: "plot" },
+    { viewBox: `0 0 ${width} ${HEIGHT}`, "aria-hidden": "true", class: "plot" },
     grid.flat(),
     steps,
     drawn,
@@ -112,7 +138,7 @@ function legend(lines) {
 }
 
 /** The same as numbers, for those who want them or cannot see the plot. */
-function numbers(answers, lines) {
+function numbers(answers, lines, toldBits) {
   const head = h(
     "tr",
     {},
@@ -127,6 +153,8 @@ function numbers(answers, lines) {
       values.map((p) => h("td", {}, p === null ? "-" : percent(p))),
     ),
   );
+  const told = toldBits.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
+  rows.push(h("tr", {}, h("th", { scope: "row" }, "The grasp by itself tells"), told));
   return h(
     "details",
     {},

@@ -68,7 +68,7 @@ export function trialsView() {
             `A trial takes ${known.choices} objects that the model was not trained on; this recording has ${known.objects}.`,
           ),
       problems,
-      known.runs.length > 0 && h("h2", {}, "Series so far"),
+      ...(known.runs.length ? [h("h2", {}, "Series so far")] : []),
       h("ul", { class: "series" }, known.runs.map(seriesCard)),
     );
   }

@@ -1,10 +1,10 @@
 // How numbers and verdicts are said.
 
-/** A probability as people read it. */
+/** A probability as people read it; number and sign stay on one line. */
 export function percent(p) {
-  if (p > 0.999) return "over 99.9 %";
-  if (p < 0.001) return "under 0.1 %";
-  return `${(100 * p).toFixed(1)} %`;
+  if (p > 0.999) return "over 99.9\u00a0%";
+  if (p < 0.001) return "under 0.1\u00a0%";
+  return `${(100 * p).toFixed(1)}\u00a0%`;
 }
 
 /** "1 photo", "2,000 photos". */
