@@ -17,6 +17,8 @@ from retrieval.commands import main as command_line
 from retrieval.data import views
 from retrieval.data.dataset import PairBatch
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.evaluation import real
+from retrieval.evaluation.real.protocol import Protocol, first_guess
 from retrieval.lab import frontier, hard_cases
 from retrieval.lab.frontier.points import Row
 from retrieval.lab.hard_cases import linear
@@ -101,6 +103,14 @@ def add_a_metric(monkeypatch):
     table = ScoreTable(np.eye(3, dtype=np.float32), owner, owner, np.zeros((3, 3), bool))
     scored = registry.Scored(table, table, {}, None, 0)
     assert registry.take(scored, ["mine"])["mine"].values.shape == (3, 1)
+
+
+def add_a_protocol_of_real_data(monkeypatch):
+    monkeypatch.setitem(real.PROTOCOLS, "mine", f"{HERE}:MY_PROTOCOL")
+    assert real.load_protocol("mine").main == "guesses_k3"
+
+
+MY_PROTOCOL = Protocol("vt60", "Mine", "Nothing is split.", lambda facts, seed: [], first_guess(3))
 
 
 def add_a_kind_of_index(monkeypatch):

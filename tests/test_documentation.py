@@ -18,7 +18,7 @@ from retrieval.model.towers import build_tower
 from retrieval.search.answer import EXIT_CODES
 from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
-from tests import serving, synthetic
+from tests import real_data_sets, serving, synthetic
 from tests.documents import PAGES, README, ROOT, blocks, text_of
 from tests.reference import COMMANDS
 from tests.reference import commands as commands_page
@@ -41,6 +41,7 @@ SHORTER = {
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--quick", "--only", "closing"],
     "serve": ["--port", "0"],
+    "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca_pca"],
 }
 """The commands, and what makes each of them quick."""
 
@@ -57,8 +58,8 @@ def of_program(name, *pages):
 
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
-    """Everything that the commands name: catalog/, gel images, recording/, billets/, pictures/, model.safetensors,
-    rig.toml, mobilenet_v2.pth, tests/shipped_rig.toml."""
+    """Everything that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
+    model.safetensors, rig.toml, mobilenet_v2.pth, tests/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copy(model, tmp_path / "model.safetensors")
@@ -75,6 +76,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         (tmp_path / "pictures" / name).mkdir(parents=True)
         shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
+    real_data_sets.write_billets(tmp_path / "data" / "billets")
     (tmp_path / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "shipped_rig.toml", tmp_path / "tests")
     (tmp_path / "points.csv").write_text(POINTS)

@@ -13,6 +13,7 @@ from retrieval.model.stored import read_header
 from retrieval.search.answer import EXIT_CODES
 from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter, read_recording
+from tests import real_data_sets
 from tests.documents import ROOT, text_of
 
 PAGE = ROOT / "docs" / "formats.md"
@@ -82,6 +83,25 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     check(8, method)
     said = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
     assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_accuracy"])
+
+
+@pytest.mark.slow
+def test_the_results_of_the_benchmark_of_real_data(tmp_path):
+    real_data_sets.write_billets(tmp_path / "billets")
+    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,rct"]
+    assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    check(9, results)
+    assert set(results["skipped"]) == {"rct"}
+    entry = results["protocols"]["billets-places"]
+    check(10, entry)
+    row, control = entry["rows"]["cca_pca"], entry["controls"]["dealt"]
+    page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
+    said = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
+    assert {*row, *row["verdict"], *row["differences"]["pair_auc"]} == set(re.findall(r"`(\w+)`", said["rows"])) - {
+        "rows"
+    }
+    assert set(control) == set(re.findall(r"`(\w+)`", said["controls"])) - {"controls"}
 
 
 def test_what_a_service_keeps(tmp_path):

@@ -174,6 +174,8 @@ def test_indexes_import_with_numpy_alone():
         ["evaluate"],
         ["frontier"],
         ["serve"],
+        ["benchmark"],
+        ["benchmark", "real"],
         ["rig"],
         ["rig", "check"],
         ["rig", "calibrate"],

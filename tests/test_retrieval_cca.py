@@ -86,6 +86,14 @@ def test_many_items_of_few_directions_give_what_the_whole_decomposition_gives(mo
         np.testing.assert_allclose(np.abs(mine[:, :4]), np.abs(theirs[:, :4]), atol=1e-5)
 
 
+def test_of_a_view_the_widest_directions_are_kept_where_so_many_are_asked():
+    x = np.random.default_rng(0).standard_normal((50, 12)) * np.arange(1, 13)
+    whole, few = decompose(x), decompose(x, 4)
+    assert (whole.rank, few.rank) == (12, 4)
+    np.testing.assert_array_equal(few.singular, whole.singular[:4])
+    assert decompose(x, 96).rank == 12
+
+
 def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
     monkeypatch.setattr(cca, "MOST_ROWS", 100)
     monkeypatch.setattr(cca, "LEADING", 3)

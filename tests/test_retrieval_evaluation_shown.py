@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.shown import Shown
 from retrieval.metrics.table import ScoreTable
 
@@ -17,8 +16,16 @@ def shown():
     scores = 3.0 * (owner[:, None] == owner[None])
     scores[0, 2:4], scores[1, 3] = (5, 4), 2
     table = ScoreTable(scores.astype(np.float32), owner, owner, np.eye(10, dtype=bool))
-    queries = Queries(every, every, every, owner, owner, NAMES, ("test",) * 5, {})
-    return Shown(table, queries, [f"g{number}" for number in every])
+    names = [f"g{number}" for number in every]
+    return Shown(table, NAMES, names, names)
+
+
+def test_of_every_object_that_is_found_the_best_photo_alone_is_shown_where_so_asked(shown):
+    worst = shown.examples(one_of_each=True)["worst"][0]
+    assert (worst["grasp_id"], worst["true_rank"]) == ("g0", 3)
+    assert worst["ranked"][:2] == ["g2", "g1"]
+    assert len(set(worst["ranked"])) == 5
+    assert shown.examples()["worst"][0]["ranked"][:3] == ["g2", "g3", "g1"]
 
 
 def test_of_a_confusion_the_touches_come_first_that_speak_most_for_it_with_the_photo_that_does(shown):

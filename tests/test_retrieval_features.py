@@ -2,13 +2,15 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from retrieval.data.dataset import load_grasps
+from retrieval.data.resize import resize
 from retrieval.errors import BadInput, DatasetError, NumericalError
-from retrieval.training.features import Features, blurred, by_image, encode_recording
+from retrieval.training.features import SHOWN, Features, blurred, by_image, encode_recording, margin
 from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
@@ -145,6 +147,35 @@ def test_a_blur_keeps_colour_and_size_and_nothing_fine():
     halves[:, 40:] = 1  # what is coarse stays
     assert blurred(halves)[:, :10].max() < 0.1
     assert blurred(halves)[:, -10:].min() > 0.9
+
+
+@pytest.mark.parametrize("size", [(240, 320), (32, 48), (7, 9), (1, 3)])
+def test_a_blur_is_that_of_the_whole_picture_made_small_and_large_again(size):
+    image = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), size[1] / 10), dtype=np.float32)
+    np.testing.assert_allclose(blurred(image), resize(resize(smooth, (6, 8)), size), atol=2e-6)  # float32 sums
+
+
+def test_of_a_photo_its_margin_stays_and_nothing_inside():
+    image = np.zeros((80, 160, 3), dtype=np.float32)
+    image[:10], image[-10:], image[:, :20], image[:, -20:] = 1, 1, 1, 1
+    image[40, 80] = 0.5
+    assert (margin(image) == 1).all()
+    noise = np.random.default_rng(1).random((80, 160, 3), dtype=np.float32)
+    found = margin(noise)
+    np.testing.assert_array_equal(found[:10], noise[:10])
+    assert len(np.unique(found[10:-10, 20:-20].reshape(-1, 3), axis=0)) == 1
+    assert margin(noise[:1, :1]).shape == (1, 1, 3)
+
+
+def test_the_margin_of_photos_is_encoded_beside_whole_photos(grasps, matcher, tmp_path):
+    whole, framed = (encode_recording(grasps, matcher, TINY, tmp_path, shown=shown, quiet=True) for shown in SHOWN)
+    np.testing.assert_array_equal(whole.touch, framed.touch)
+    assert np.abs(whole.photo - framed.photo).max() > 0.01
+    with pytest.raises(BadInput, match="photo, margin; got 'inside'"):
+        encode_recording(grasps, matcher, TINY, None, shown="inside", quiet=True)
+    with pytest.raises(BadInput, match="two controls"):
+        encode_recording(grasps, matcher, TINY, None, variant="blurred", shown="margin", quiet=True)
 
 
 def some_features():

@@ -3,7 +3,7 @@
 import shlex
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,9 @@ from retrieval.commands.options import Values
 from retrieval.console.output import say, show
 from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
+
+if TYPE_CHECKING:
+    from robot.recording.folder import Recording
 
 
 def import_(
@@ -38,25 +41,31 @@ def import_(
     if name not in IMPORTERS:
         for line in _list():
             say(line)
-    importer = load_importer(name)
-    options = read_options(importer, option or ())
+    options = read_options(load_importer(name), option or ())
     if source is None or out is None:
         raise BadInput(
             f"an import needs a folder to read and one to write: retrieve import {name} SRC --out recording/"
         )
+    recording = run_importer(name, source, out, **options)
+    for note in recording.notes:
+        say(note)
+    objects = len({grasp.object_id for grasp in recording.grasps})
+    say(f"{out}: {len(recording.grasps)} grasps of {objects} objects")
+
+
+def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recording":
+    """Import with a bar on stderr. Raises what the importer raises."""
+    from robot.importers import load_importer
+
     bars: list[Bar] = []
     with ExitStack() as shown:
 
         def progress(done: int, total: int) -> None:
             if not bars:
-                bars.append(shown.enter_context(Bar("import", total, "grasps")))
+                bars.append(shown.enter_context(Bar(f"import {name}", total, "grasps")))
             bars[0].advance(done - bars[0].done)
 
-        recording = importer(source, out, progress, **options)
-    for note in recording.notes:
-        say(note)
-    objects = len({grasp.object_id for grasp in recording.grasps})
-    say(f"{out}: {len(recording.grasps)} grasps of {objects} objects")
+        return load_importer(name)(source, out, progress, **options)
 
 
 def _list() -> list[str]:

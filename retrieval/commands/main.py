@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands import rig
+from retrieval.commands import benchmark, rig
 from retrieval.commands.adapt import adapt
 from retrieval.commands.build_index import build_index
 from retrieval.commands.check import check
@@ -61,6 +61,7 @@ for _command in (
 ):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)
+app.add_typer(benchmark.app)
 app.add_typer(rig.app)
 
 

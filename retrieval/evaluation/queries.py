@@ -1,7 +1,7 @@
 """What all methods are asked alike: the touches, the sets of grasps and the photos, drawn once."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -54,8 +54,8 @@ class Queries:
         return digest.hexdigest()
 
 
-def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int) -> Queries:
-    """Judge all grasps of test objects and some of the others (`MOST_GRASPS`), drawn by `seed`.
+def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping[str, int] = MOST_GRASPS) -> Queries:
+    """Judge all grasps of test objects and some of the others, drawn by `seed`; most: grasps of an object, by part.
 
     Sets of each of `SET_SIZES` are drawn for test and validation objects, without replacement within a set, where
     they leave the object `SHOWN_PHOTOS` photos of other grasps. Shown by fewer than its rivals are, the true object
@@ -67,7 +67,7 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int) -> Queries:
     parts = tuple(part_of[name] for name in objects)
     _require_objects(parts)
     rng = np.random.default_rng([seed, 11])
-    judged = [_judged(grasps, name, MOST_GRASPS.get(part_of[name]), rng) for name in objects]
+    judged = [_judged(grasps, name, most.get(part_of[name]), rng) for name in objects]
     touches = np.concatenate(judged)
     owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in judged])
     column: dict[Path, int] = {}

@@ -77,6 +77,14 @@ class MethodScores:
         """For calibration: single touches, and sets of more grasps."""
         return {1: self.touches(part, part)} | {size: table for size, table in self.sets(part).items() if size > 1}
 
+    def ids(self, grasp_ids: Sequence[str], part: str) -> tuple[list[str], list[str]]:
+        """Grasp ids of the touches (rows) and the photos (columns) of a part."""
+        asked = self.queries
+        return (
+            [grasp_ids[row] for row in asked.touches[_of(asked, asked.touch_owner, part)]],
+            [grasp_ids[row] for row in asked.photos[_of(asked, asked.photo_owner, part)]],
+        )
+
     def scored(self, calibration: Calibration) -> Scored:
         """What metrics are taken of; calibration: of single touches, fitted on validation objects."""
         return Scored(
@@ -111,7 +119,7 @@ def score_method(
     "reject" is None where validation or test objects are fewer than three.
     """
     judged = [MethodScores(queries, predictions, seed) for predictions in by_seed]
-    shown = Shown(judged[0].touches("test", "test"), queries, grasp_ids)
+    shown = Shown(judged[0].touches("test", "test"), queries.objects, *judged[0].ids(grasp_ids, "test"))
     calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in judged]
     measures = [take(one.scored(fitted.pairs[1])) for one, fitted in zip(judged, calibrations, strict=True)]
     entry = {

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.evaluation.queries import Queries
 from retrieval.metrics import protocols
 from retrieval.metrics.registry import guesses
 from retrieval.metrics.table import ScoreTable
@@ -17,26 +16,35 @@ _EXAMPLES, _RANKED, _EACH = 6, 6, 4
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """The test touches of one method and seed with the test photos, and what they are called in results.json."""
+    """The touches of one method and seed with photos, and what they are called in results.json.
+
+    objects: names by number; touch_ids, photo_ids: the grasps of the table's rows and columns.
+    """
 
     table: ScoreTable
-    queries: Queries
-    grasp_ids: Sequence[str]
+    objects: Sequence[str]
+    touch_ids: Sequence[str]
+    photo_ids: Sequence[str]
 
-    def examples(self) -> dict[str, list[dict[str, Any]]]:
-        """The best and the worst queries, one of an object: by the rank of its first photo, then by the margin."""
+    def examples(self, *, one_of_each: bool = False) -> dict[str, list[dict[str, Any]]]:
+        """The best and the worst queries, one of an object: by the rank of its first photo, then by the margin.
+
+        one_of_each: of every object that is found, its best photo alone.
+        """
         ranks, seen = protocols.true_ranks(self.table), self._seen()
         margin = self._best(self.table.relevant) - self._best(~self.table.relevant)
         order = [row for row in np.lexsort((-margin, ranks)) if self.table.askable[row]]
 
         def example(row: int) -> dict[str, Any]:
-            columns = np.argsort(-seen[row], kind="stable")[:_RANKED]
+            columns = np.argsort(-seen[row], kind="stable").tolist()
+            if one_of_each:
+                columns = _one_each(columns, self.table.photo_owner)
             return self._query(row) | {
                 "true_rank": float(ranks[row]),
-                "ranked": [self._photo(column) for column in columns],
+                "ranked": [self._photo(column) for column in columns[:_RANKED]],
             }
 
-        first, last = (self._one_each(rows, _EXAMPLES) for rows in (order, order[::-1]))
+        first, last = (_one_each(rows, self.table.touch_owner)[:_EXAMPLES] for rows in (order, order[::-1]))
         return {"best": [example(row) for row in first], "worst": [example(row) for row in last]}
 
     def mistaken(self, true: int, guessed: int) -> list[dict[str, Any]]:
@@ -61,7 +69,7 @@ class Shown:
             found.append(
                 [
                     self._query(row) | {"found": self._photo(self._first(every, row))}
-                    for row in self._one_each(asked[rows].tolist(), _EACH)
+                    for row in _one_each(asked[rows].tolist(), self.table.touch_owner)[:_EACH]
                 ]
             )
         return found
@@ -78,20 +86,16 @@ class Shown:
         return int(np.where(among[row], self._seen()[row], -np.inf).argmax())
 
     def _query(self, row: int) -> dict[str, Any]:
-        touches = self.queries.of_part(self.queries.touch_owner, "test")
-        return {
-            "grasp_id": self.grasp_ids[int(self.queries.touches[touches[row]])],
-            "object_id": self.queries.objects[self.table.touch_owner[row]],
-        }
+        return {"grasp_id": self.touch_ids[row], "object_id": self.objects[self.table.touch_owner[row]]}
 
     def _photo(self, column: int) -> str:
         """The grasp in which it was taken."""
-        photos = self.queries.of_part(self.queries.photo_owner, "test")
-        return self.grasp_ids[int(self.queries.photos[photos[column]])]
+        return self.photo_ids[column]
 
-    def _one_each(self, rows: Sequence[int], count: int) -> list[int]:
-        """The first row of each object, the first few of these."""
-        first: dict[int, int] = {}
-        for row in rows:
-            first.setdefault(int(self.table.touch_owner[row]), int(row))
-        return list(first.values())[:count]
+
+def _one_each(rows: Sequence[int], owner: NDArray[np.int64]) -> list[int]:
+    """The first row of each object."""
+    first: dict[int, int] = {}
+    for row in rows:
+        first.setdefault(int(owner[row]), int(row))
+    return list(first.values())

@@ -18,10 +18,14 @@ METHODS = {
     "contrastive": "retrieval.methods.contrastive:Contrastive",
     "contrastive_sigmoid": "retrieval.methods.contrastive:ContrastiveSigmoid",
     "cca": "retrieval.methods.cca:Cca",
+    "cca_pca": "retrieval.methods.cca_pca:CcaPca",
     "plsca": "retrieval.methods.plsca:Plsca",
     "chance": "retrieval.methods.chance:Chance",
     "constant": "retrieval.methods.constant:Constant",
 }
+
+KNOW_NOTHING = frozenset({"chance", "constant"})
+"""Methods that do not look at their input."""
 
 
 def build_method(name: str, setting: "Setting") -> "Method":

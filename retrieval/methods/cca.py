@@ -68,13 +68,14 @@ class Canonical:
     photo_weights: Matrix
 
 
-def decompose(x: NDArray[Any]) -> View:
-    """View of items x (n, ...). Raises NumericalError unless finite, BadInput unless something varies."""
+def decompose(x: NDArray[Any], most: int | None = None) -> View:
+    """View of items x (n, ...), of at most the `most` widest directions. Raises NumericalError unless finite, BadInput
+    unless something varies."""
     if not np.isfinite(x).all():
         raise NumericalError("features must be finite to be correlated; got a NaN or infinite one")
     standardise = Standardiser.fit(x)
-    left, singular, right = svd(standardise(x)) if len(x) <= MOST_ROWS else leading(standardise(x))
-    rank = int((singular > RANK_CUT * singular[0]).sum())
+    left, singular, right = svd(standardise(x)) if len(x) <= MOST_ROWS else leading(standardise(x), most or LEADING)
+    rank = min(int((singular > RANK_CUT * singular[0]).sum()), len(singular) if most is None else most)
     return View(standardise, left[:, :rank], singular[:rank], right[:rank])
 
 
@@ -115,13 +116,13 @@ def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     return left, singular, right
 
 
-def leading(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """The same for the LEADING widest directions of many items, from the eigenvectors of X'X.
+def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
+    """The same for the `most` widest directions of many items, from the eigenvectors of X'X.
 
     Its squared condition number costs the thinnest directions, which are not asked for.
     """
     width = x.shape[1]
-    values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - LEADING, 0), width - 1))
+    values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - most, 0), width - 1))
     singular = np.sqrt(np.maximum(values[::-1], (RANK_CUT * RANK_CUT) * values[-1]))
     right = vectors.T[::-1]
     return x @ right.T / singular, singular, right
@@ -165,8 +166,10 @@ class CcaCell:
 class Cca(Method):
     """Cosine of canonical variates weighted by rho^p; ridge, components and p by ranking on validation objects."""
 
+    most_directions: int | None = None
+
     def _fit(self, train: "Features", validation: "Features") -> None:
-        touch, photo = decompose(train.touch), decompose(train.photo)
+        touch, photo = (decompose(part, self.most_directions) for part in (train.touch, train.photo))
         self._standardise = touch.standardise, photo.standardise
         # The decompositions are made once; a ridge only damps them.
         found = ((ridge, canonical(touch, photo, train.owner, ridge)) for ridge in RIDGES)

@@ -1,5 +1,6 @@
 """What a measure says of every query, and its means by object."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,26 @@ class Measure:
     def by_object(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Numbers of the objects (R,), ascending, and the mean value of the queries of each (R, m)."""
         return object_means(self.values, self.owner)
+
+
+def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]]) -> Measure:
+    """One measure of queries that were asked in several galleries, such as those of folds.
+
+    units: for each part, what stands for an object's number in the whole: the object, or a group of objects that only
+    together say how much others differ. Values keep their order within a unit; chance is averaged as they are. Raises
+    BadInput for no parts.
+    """
+    if not parts:
+        raise BadInput("measures are pooled of one gallery at least; got none")
+    owner = np.concatenate([[unit[int(name)] for name in part.owner] for part, unit in zip(parts, units, strict=True)])
+    order = np.argsort(owner, kind="stable")
+    chances = np.concatenate([np.tile(part.chance, (len(part.owner), 1)) for part in parts])
+    return Measure(
+        np.concatenate([part.values for part in parts])[order],
+        owner[order].astype(np.int64),
+        object_means(chances, owner)[1].mean(0),
+        parts[0].gallery,
+    )
 
 
 def object_means(

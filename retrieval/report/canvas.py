@@ -52,6 +52,7 @@ _STYLES = {
     "contrastive": Style("#d55e00", "^"),
     "contrastive_sigmoid": Style("#e69f00", "v"),
     "cca": Style("#aa3377", "P"),
+    "cca_pca": Style("#882255", "p"),
     "plsca": Style("#6f4e37", "X"),
     "chance": Style("#6b7580", ".", ":"),
     "constant": Style("#aab2ba", "|", ":"),

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.methods import KNOW_NOTHING
 from retrieval.metrics.registry import SET_SIZES, of_grasps
 from retrieval.report.canvas import FAINT, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
-from retrieval.report.results import KNOW_NOTHING, Results, measure_label, method_label, percent, short
+from retrieval.report.results import Results, measure_label, method_label, percent, short
 
 OVERVIEW = ("pair_accuracy", "guesses_k5", "guesses_k10", of_grasps(5), "map")
 _LABELLED_OBJECTS = 130

@@ -9,6 +9,7 @@ from typing import Any
 from indexes.store.regular import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
+from retrieval.methods import KNOW_NOTHING
 from retrieval.metrics.intervals import FEW_OBJECTS
 from retrieval.metrics.registry import METRICS
 
@@ -22,11 +23,11 @@ METHODS = {
     "contrastive": "contrastive, InfoNCE",
     "contrastive_sigmoid": "contrastive, sigmoid",
     "cca": "CCA",
+    "cca_pca": "CCA, principal components",
     "plsca": "PLS-CA",
     "chance": "random scores",
     "constant": "constant score",
 }
-KNOW_NOTHING = frozenset({"chance", "constant"})
 Summary = Mapping[str, Any]
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -35,6 +35,9 @@ log = logging.getLogger(__name__)
 
 VARIANTS = ("touch", "blurred", "before")
 """What stands for a touch: the gel images; an 8 x 6 blur of each; the frames taken before the contact."""
+SHOWN = ("photo", "margin")
+"""What of a photo is shown: all of it; its margin, where the object mostly is not."""
+_MARGIN = 8  # the share of a side that it takes
 _PART, _FORMAT = 512, 1
 _BATCH = 32
 
@@ -128,15 +131,39 @@ def blurred(image: RgbImage) -> RgbImage:
     Gaussian blur of a tenth of the width, then 8 x 6 pixels: lamps and gel drift of the capture stay, and coarse
     shape; whatever a method still finds in it is no sense of touch.
     """
+    height, width = image.shape[:2]
+    down, across = _blur(height, 6, width / 10), _blur(width, 8, width / 10)
+    small = np.einsum("ih,hwc,jw->ijc", down, image, across, optimize=True)
+    return resize(np.ascontiguousarray(small, dtype=np.float32), (height, width))
+
+
+@lru_cache(maxsize=16)
+def _blur(old: int, new: int, sigma: float) -> NDArray[np.float32]:
+    """(new, old): one axis of a Gaussian blur and of the resizing after it, as one matrix: to blur whole pictures this
+    widely takes longer than a tower does."""
     import cv2
 
-    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), image.shape[1] / 10), dtype=np.float32)
-    return resize(resize(smooth, (6, 8)), image.shape[:2])
+    kernel = cv2.getGaussianKernel(round(8 * sigma) + 1 | 1, sigma, cv2.CV_32F)
+    smooth = cv2.sepFilter2D(np.eye(old, dtype=np.float32), -1, np.ones(1, np.float32), kernel)
+    return resize(np.repeat(smooth[..., None], 3, axis=2), (new, old))[..., 0]
 
 
 class _Blurred(Preprocessing):
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         return self.touch(blurred(read_rgb(path)), None if reference is None else blurred(read_rgb(reference)))
+
+
+def margin(image: RgbImage) -> RgbImage:
+    """A photo (H, W, 3) of which nothing is left but a frame of an eighth of each side, around its mean colour."""
+    high, wide = (max(1, side // _MARGIN) for side in image.shape[:2])
+    inside = np.zeros(image.shape[:2], dtype=np.bool_)
+    inside[high:-high, wide:-wide] = True
+    return np.where(inside[..., None], image[~inside].mean(0), image).astype(np.float32)
+
+
+class _Margin(Preprocessing):
+    def load_photo(self, path: str | Path) -> RgbImage:
+        return self.photo(margin(read_rgb(path)))
 
 
 def encode_recording(
@@ -146,26 +173,27 @@ def encode_recording(
     cache: Path | None,
     *,
     variant: str = "touch",
+    shown: str = "photo",
     photos_of: Features | None = None,
     quiet: bool = False,
 ) -> Features:
     """Features of all grasps by the towers of `matcher`, which stand still; each photo file is encoded once.
 
     cache: folder where they are kept in parts of 512, each under a digest of tower, preprocessing, variant and image
-    files: a run that was stopped goes on, a second one reads. None keeps nothing. variant: one of `VARIANTS`.
-    photos_of: features of these grasps and perhaps more, whose photos need no encoding again. Raises BadInput for
-    another variant, DatasetError where a no-contact frame is needed and missing.
+    files: a run that was stopped goes on, a second one reads. None keeps nothing. variant: one of `VARIANTS`; shown:
+    one of `SHOWN`. photos_of: features of these grasps and perhaps more, whose photos need no encoding again. Raises
+    BadInput for another variant, DatasetError where a no-contact frame is needed and missing.
     """
-    shown = [_as_shown(grasp, variant) for grasp in grasps]
+    felt = [_as_shown(grasp, variant) for grasp in grasps]
     device = default_device()
     matcher = deepcopy(matcher).to(device).eval()
-    settings = _as_variant(config, variant)
+    settings = _as_variant(config, variant, shown)
     with BatchImages(settings, device, keep_bytes=0) as images:
         touch_made_by = (variant, _digest_of(matcher.touch_tower), settings.preprocessing.digest())
         touches = _Parts(cache, touch_made_by, images.touch, partial(touch_features, matcher), images.files, quiet)
-        touch = touches.rows(shown)
+        touch = touches.rows(felt)
         if photos_of is None:
-            photo = _photos(grasps, images, matcher, cache, quiet)
+            photo = _photos(grasps, shown, images, matcher, cache, quiet)
         else:
             row_of = {grasp_id: row for row, grasp_id in enumerate(photos_of.grasp_ids)}
             photo = photos_of.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
@@ -178,10 +206,10 @@ def encode_recording(
 
 
 def _photos(
-    grasps: Sequence[Grasp], images: BatchImages, matcher: Matcher, cache: Path | None, quiet: bool
+    grasps: Sequence[Grasp], shown: str, images: BatchImages, matcher: Matcher, cache: Path | None, quiet: bool
 ) -> NDArray[np.float32]:
-    """(G, F): the features of each grasp's photo."""
-    made_by = ("photo", _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
+    """(G, F): the features of each grasp's photo, of what of it is shown."""
+    made_by = (shown, _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
     files = list(dict.fromkeys(grasp.photo for grasp in grasps))
     encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), lambda file: (file,), quiet).rows(
         files
@@ -190,12 +218,19 @@ def _photos(
     return np.asarray(encoded[[row_of[grasp.photo] for grasp in grasps]])
 
 
-def _as_variant(config: Config, variant: str) -> Config:
-    if variant not in VARIANTS:
-        raise BadInput(f"what stands for a touch must be one of {', '.join(VARIANTS)}; got {variant!r}")
-    if variant != "blurred":
+def _as_variant(config: Config, variant: str, shown: str) -> Config:
+    for what, one, known in (
+        ("what stands for a touch", variant, VARIANTS),
+        ("what of a photo is shown", shown, SHOWN),
+    ):
+        if one not in known:
+            raise BadInput(f"{what} must be one of {', '.join(known)}; got {one!r}")
+    if variant == "blurred" and shown == "margin":
+        raise BadInput("a blurred touch and the margin of a photo are two controls; ask for one of them")
+    as_shown = _Blurred if variant == "blurred" else _Margin if shown == "margin" else None
+    if as_shown is None:
         return config
-    return dataclasses.replace(config, preprocessing=_Blurred(**config.preprocessing.to_dict()))
+    return dataclasses.replace(config, preprocessing=as_shown(**config.preprocessing.to_dict()))
 
 
 def _as_shown(grasp: Grasp, variant: str) -> Grasp:
@@ -232,7 +267,7 @@ class _Parts(Generic[T]):
     def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
         """(len(items), F)."""
         shown = self.made_by[0]
-        unit = "photos" if shown == "photo" else "grasps"
+        unit = "photos" if shown in SHOWN else "grasps"
         with Bar(f"encode {shown}", len(items), unit, quiet=self.quiet) as bar, ThreadPoolExecutor(2) as pool:
             return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
 

@@ -1,5 +1,6 @@
 """Three places of two billets, and what lies beside them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.miniatures import picture
@@ -7,9 +8,11 @@ from tests.miniatures import picture
 GRASPS = 3
 
 
-def write(folder: Path) -> None:
-    places = [("welded1", "01"), ("welded1", "02"), ("ground1", "01")]
+PLACES = (("welded1", "01"), ("welded1", "02"), ("ground1", "01"))
+
+
+def write(folder: Path, places: Sequence[tuple[str, str]] = PLACES) -> None:
     for seed, (billet, place) in enumerate(places):
         picture(folder / billet / f"{place}_touch.png", seed)
-        picture(folder / billet / f"{place}_photo.jpg", 10 + seed)
+        picture(folder / billet / f"{place}_photo.jpg", 1000 + seed)
     (folder / "LICENSE").write_text("GPL")

@@ -1,5 +1,6 @@
 """Two files of the published form: twelve grasps, so that i10 comes after i9, and one. A grasp slips."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,22 @@ from tests.miniatures import pixels
 
 GRASPS = 13
 FILES = (12, 1)
+NAMES = ("soda_can", "lemon")
 
 
-def write(folder: Path) -> None:
+def write(folder: Path, files: Sequence[int] = FILES, of_an_object: int = 10) -> None:
+    """Objects follow each other, each with so many grasps; the first two have names."""
     folder.mkdir(parents=True, exist_ok=True)
-    for number, count in enumerate(FILES):
+    for number, count in enumerate(files):
         with h5py.File(folder / f"calandra_corl2017_{number:03}.h5", "w") as file:
             file.attrs["DEEPDISH_IO_VERSION"] = 10
             file.attrs["DEEPDISH_IO_DEEPDISH_IO_UNPACK"] = 1
             data = file.create_group("data")
             data.attrs["TITLE"] = np.bytes_(f"list:{count}")
             for grasp in range(count):
-                write_grasp(data, f"i{grasp}", 1000 * number + 20 * grasp, name=(b"soda_can", b"lemon")[grasp >= 10])
+                place = grasp // of_an_object
+                name = NAMES[place] if place < len(NAMES) else f"object_{place}"
+                write_grasp(data, f"i{grasp}", 1000 * number + 20 * grasp, name=name.encode())
 
 
 def write_grasp(data: Any, group: str, seed: int, name: bytes, **compression: Any) -> Any:

@@ -4,6 +4,7 @@
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tests.miniatures import picture
@@ -14,14 +15,19 @@ GRASPS = len(OBJECTS) * len(INSTANCES)
 SPLIT = {"train": ["2", "31"], "val": ["10"], "test": ["100"]}
 
 
-def write(folder: Path, width: int = 32) -> None:
-    for number, name in enumerate(OBJECTS):
+def write(
+    folder: Path,
+    width: int = 32,
+    objects: Sequence[str] = OBJECTS,
+    split: Mapping[str, Sequence[str]] = SPLIT,
+) -> None:
+    for number, name in enumerate(objects):
         for instance in INSTANCES:
             picture(folder / "touch" / name / f"{instance}.png", 100 * number + instance, (24, width))
             picture(folder / "vision" / name / f"{instance}.png", 100 * number + 50 + instance, (16, 16))
     (folder / "audio_spectrogram/2").mkdir(parents=True)
     (folder / "audio_spectrogram/2/1.npy").write_bytes(b"\x93NUMPY")
-    parts = {part: {name: list(INSTANCES) for name in names} for part, names in SPLIT.items()}
+    parts = {part: {name: list(INSTANCES) for name in names} for part, names in split.items()}
     (folder / "split.json").write_text(json.dumps(parts))
 
 

@@ -1,6 +1,7 @@
 """RCT: three materials, two positions, two sensors, three frames of each press; pictures where the options say by
 themselves; one row without a picture, one without a sensor."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.miniatures import picture
@@ -9,10 +10,10 @@ MATERIALS, POSITIONS, SENSORS, FRAMES = ("ABS-01", "PTFE-02", "Cork 03"), (0, 1)
 GRASPS = len(MATERIALS) * len(POSITIONS) * len(SENSORS) * len(FRAMES)
 
 
-def write(folder: Path) -> None:
+def write(folder: Path, materials: Sequence[str] = MATERIALS) -> None:
     lines = ["material_id,position,sensor,z_frame,raw_fz"]
     seed = 0
-    for material in MATERIALS:
+    for material in materials:
         seed += 1
         picture(folder / "rgb" / f"{material}.jpg", 5000 + seed, (20, 30))
         for position in POSITIONS:

@@ -1,0 +1,150 @@
+"""From the predictions of one fold to its measures: the galleries of the protocol, then one measure of all of them."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from retrieval.errors import BadInput, CheckpointError
+from retrieval.evaluation.calibrate import calibrate_pairs
+from retrieval.evaluation.real.protocol import Facts, Protocol
+from retrieval.evaluation.scoring import MethodScores
+from retrieval.evaluation.shown import Shown
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.registry import Scored
+from retrieval.metrics.table import ScoreTable
+from retrieval.model.checkpoint import read_tensors, write_tensors
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What came out of one fold: measures by name, whose owners are numbers in `Units`; chosen: what the method chose;
+    examples: best and worst queries."""
+
+    measures: Mapping[str, Measure]
+    chosen: Mapping[str, Any]
+    examples: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Units:
+    """What intervals resample: objects, or their sequences. number_of: object_id -> number in `names`."""
+
+    names: tuple[str, ...]
+    number_of: Mapping[str, int]
+
+    @classmethod
+    def of(cls, facts: Facts, protocol: Protocol) -> "Units":
+        """Those of a recording under a protocol."""
+        unit_of = facts.sequence_of if protocol.by_sequence else {name: name for name in facts.names}
+        names = tuple(sorted(set(unit_of.values())))
+        return cls(names, {name: names.index(unit) for name, unit in unit_of.items()})
+
+
+def measure(judged: MethodScores, protocol: Protocol, facts: Facts, units: Units, grasp_ids: Sequence[str]) -> Measured:
+    """The measures of one fold by one method. Raises BadInput where its main measure cannot be taken."""
+    objects = judged.queries.objects
+
+    def shown(table: ScoreTable) -> ScoreTable:
+        return table.with_own() if protocol.own_photos else table
+
+    calibration = calibrate_pairs(shown(judged.touches("validation", "validation")), seed=judged.seed)
+    whole = shown(judged.touches("test", "test"))
+    sets = {size: shown(table) for size, table in judged.sets("test").items()}
+    sequence_of = [facts.sequence_of[name] for name in objects] if protocol.by_sequence else [""] * len(objects)
+    found: dict[str, list[Measure]] = {}
+    shown_ids = judged.ids(grasp_ids, "test")
+    queries: dict[str, list[Any]] = {"best": [], "worst": []}
+    for sequence in sorted({sequence_of[number] for number in whole.objects}):
+        mine = np.array([one == sequence for one in sequence_of])
+        gallery = _of(whole, mine)
+        ids = (
+            list(compress(*pair))
+            for pair in zip(shown_ids, (mine[whole.touch_owner], mine[whole.photo_owner]), strict=True)
+        )
+        for kind, some in Shown(gallery, objects, *ids).examples(one_of_each=True).items():
+            queries[kind] += some
+        scored = Scored(
+            gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, calibration, judged.seed
+        )
+        for name, metric in protocol.measures.items():
+            if (taken := metric.take(scored)) is not None:
+                found.setdefault(name, []).append(taken)
+    if protocol.main not in found:
+        raise BadInput(
+            f"{protocol.title}: a gallery holds {len(whole.objects)} objects, too few for "
+            f"{protocol.measures[protocol.main].label}; give more of the data set"
+        )
+    number = {place: units.number_of[name] for place, name in enumerate(objects)}
+    return Measured(
+        {name: pooled(parts, [number] * len(parts)) for name, parts in found.items()},
+        judged.predictions.chosen,
+        queries,
+    )
+
+
+def _of(table: ScoreTable, mine: Any) -> ScoreTable:
+    """The rows and columns of the objects that are marked; the table itself where all are."""
+    rows, columns = mine[table.touch_owner], mine[table.photo_owner]
+    return table if rows.all() and columns.all() else table.select(rows, columns)
+
+
+# Kept on disk ----------------------------------------------------------------------------------------
+
+
+def digest(made_by: Mapping[str, Any]) -> str:
+    """SHA-256 of what made something, in JSON types."""
+    return hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
+
+
+def write_measured(path: Path, measured: Measured, made_by: str) -> None:
+    """Keep the measures of a fold; `made_by` is a digest."""
+    tensors = {
+        f"{name}/{part}": torch.from_numpy(np.ascontiguousarray(getattr(found, part)))
+        for name, found in measured.measures.items()
+        for part in ("values", "owner", "chance")
+    }
+    galleries = {name: found.gallery for name, found in measured.measures.items()}
+    about = {"galleries": galleries, "chosen": dict(measured.chosen), "examples": dict(measured.examples)}
+    write_tensors(path, tensors, {"made_by": made_by, **about})
+
+
+def read_measured(path: Path, made_by: str) -> Measured | None:
+    """What `write_measured` kept; None where it lies not there, is damaged, or was made by something else."""
+    if not path.is_file():
+        return None
+    try:
+        tensors, header = read_tensors(path)
+    except CheckpointError:
+        return None
+    if header.get("made_by") != made_by:
+        return None
+    measures = {
+        name: Measure(
+            tensors[f"{name}/values"].numpy(),
+            tensors[f"{name}/owner"].numpy(),
+            tensors[f"{name}/chance"].numpy(),
+            gallery,
+        )
+        for name, gallery in header["galleries"].items()
+    }
+    return Measured(measures, header["chosen"], header["examples"])
+
+
+def joined(folds: Sequence[Measured]) -> dict[str, Measure]:
+    """The measures of all folds of one seed, over all their queries; those that every fold has."""
+    names = [name for name in folds[0].measures if all(name in each.measures for each in folds)]
+    return {name: pooled([each.measures[name] for each in folds], [_Same()] * len(folds)) for name in names}
+
+
+class _Same(dict[int, int]):
+    """Every number stands for itself."""
+
+    def __missing__(self, number: int) -> int:
+        return number

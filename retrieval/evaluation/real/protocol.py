@@ -1,0 +1,129 @@
+"""What a protocol is: a rule that splits, a rule for the gallery, and what is measured."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexes.store.regular import read_json
+from retrieval.data.dataset import Grasp, Split, load_grasps
+from retrieval.errors import DatasetError
+from retrieval.metrics.registry import METRICS, Metric, guesses
+
+CHOOSING = 5
+"""Objects, of those that do not test, by which methods choose their settings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """A recording as protocols see it.
+
+    objects: object_id -> what the data set says of it; splits: name -> a published split.
+    """
+
+    source: str
+    grasps: list[Grasp]
+    objects: Mapping[str, Mapping[str, Any]]
+    splits: Mapping[str, Split]
+
+    @property
+    def names(self) -> list[str]:
+        """The objects that were touched, sorted."""
+        return sorted({grasp.object_id for grasp in self.grasps})
+
+    @property
+    def sequence_of(self) -> dict[str, str]:
+        """The sequence of each object's first grasp; the object itself where there is none."""
+        found: dict[str, str] = {}
+        for grasp in self.grasps:
+            found.setdefault(grasp.object_id, grasp.sequence_id or grasp.object_id)
+        return found
+
+
+def read_facts(folder: Path) -> Facts:
+    """Read a recording. Raises DatasetError."""
+    grasps = load_grasps(folder)  # which checks the files that are read here
+    info = read_json(folder / "recording.json")
+    said = info.get("objects")
+    objects = {name: about for name, about in said.items() if isinstance(about, dict)} if isinstance(said, dict) else {}
+    splits = {}
+    for path in sorted((folder / "splits").glob("*.json")):
+        try:
+            splits[path.stem] = Split.from_dict(read_json(path))
+        except ValueError as error:
+            raise DatasetError(f"{path} is not a JSON file: {error}") from error
+    return Facts(str(info["source"]), grasps, objects, splits)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """One way to ask one data set.
+
+    data_set: the importer that reads it. rule: how it is split, in words, as a sentence. folds: the splits for a seed;
+    the test objects of all folds together are the same for every seed. measures: by name; the first of them decides
+    whether a result counts as touch. own_photos: a touch may be shown the photo of its own grasp (its data set pairs
+    them by lot, or has one photo of an object). by_sequence: a gallery holds the objects of one sequence, and sequences
+    are what intervals resample. counted: a measure of right and wrong answers alone, which are counted too, with an
+    exact binomial interval. anchors: what others reached, a sentence each.
+    """
+
+    data_set: str
+    title: str
+    rule: str
+    folds: Callable[[Facts, int], list[Split]]
+    measures: Mapping[str, Metric]
+    own_photos: bool = False
+    by_sequence: bool = False
+    counted: str | None = None
+    anchors: tuple[str, ...] = ()
+
+    @property
+    def main(self) -> str:
+        """The measure that decides."""
+        return next(iter(self.measures))
+
+
+def fold(rest: Sequence[str], test: Sequence[str], seed: Sequence[int]) -> Split:
+    """Test on `test`; of the rest a few choose, as many as `CHOOSING` or a quarter, and the others train."""
+    order = np.random.default_rng([*seed, 17]).permutation(len(rest))
+    count = max(2, min(CHOOSING, len(rest) // 4))
+    return Split(
+        seed=seed[0],
+        train=tuple(sorted(rest[place] for place in order[count:])),
+        validation=tuple(sorted(rest[place] for place in order[:count])),
+        test=tuple(sorted(test)),
+    )
+
+
+def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> list[Split]:
+    """A fold for each set of test objects; of `names` the others train and choose."""
+    return [
+        fold([name for name in names if name not in set(test)], test, (seed, number))
+        for number, test in enumerate(tests)
+    ]
+
+
+# Measures --------------------------------------------------------------------------------------------
+
+
+def registered(*names: str) -> dict[str, Metric]:
+    """Metrics of every evaluation, by name."""
+    return {name: METRICS[name] for name in names}
+
+
+def first_guess(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
+    """The first guess among k objects, after so many touches, each object shown by so many photos."""
+    name = f"guesses_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
+    label = f"first guess of {k}"
+    label += f", {grasps} touches" if grasps > 1 else ""
+    label += f", {photos} photos" if photos > 1 else ""
+    return {
+        name: Metric(
+            label,
+            label,
+            "real",
+            lambda of: guesses(of.test if grasps == 1 else of.sets.get(grasps), k, of.seed, photos),
+        )
+    }

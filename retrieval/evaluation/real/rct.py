@@ -1,0 +1,25 @@
+"""RCT: which material was pressed, of materials that nothing has seen."""
+
+import numpy as np
+
+from retrieval.data.dataset import Split
+from retrieval.evaluation.real.protocol import Facts, Protocol, first_guess, folds, registered
+
+_FOLDS = 5
+
+
+def _materials(facts: Facts, seed: int) -> list[Split]:
+    names = facts.names
+    order = [names[place] for place in np.random.default_rng([seed, 31]).permutation(len(names))]
+    return folds(names, [order[turn::_FOLDS] for turn in range(_FOLDS)], seed)
+
+
+MATERIALS = Protocol(
+    "rct",
+    "RCT: unseen materials",
+    "Materials are dealt by lot into five folds, again for each seed; all presses of a material stay together. "
+    "There is one photo of a material, which every press of it is shown.",
+    _materials,
+    {**first_guess(10), **first_guess(5), **registered("pair_auc")},
+    own_photos=True,
+)

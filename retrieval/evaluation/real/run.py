@@ -1,0 +1,280 @@
+"""The benchmark of real data: every protocol, seed, fold and line is measured once and kept; then all is summed up."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from indexes.store.files import write_atomically
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Split, data_digest
+from retrieval.errors import BadInput, Interrupted
+from retrieval.evaluation.experiment import Experiment
+from retrieval.evaluation.queries import draw_queries
+from retrieval.evaluation.real import SCHEMA_VERSION, load_protocol
+from retrieval.evaluation.real.controls import CONTROL_METHOD, CONTROLS, by_clock, why_not_untouched
+from retrieval.evaluation.real.measuring import Measured, Units, digest, joined, measure, read_measured, write_measured
+from retrieval.evaluation.real.protocol import Facts, Protocol, read_facts
+from retrieval.evaluation.real.towers import Row, Towers
+from retrieval.evaluation.real.verdict import control_entry, row_entry
+from retrieval.evaluation.scoring import MethodScores
+from retrieval.methods import KNOW_NOTHING, require_known
+from retrieval.model.config import Config
+from retrieval.training.features import Features
+from retrieval.version import __version__
+
+DRAWS = 10_000
+MOST = {"train": 1, "validation": 12, "test": 40}
+"""Judged grasps of an object, by part."""
+EXAMPLES = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """What is fitted and asked in every fold: a row of the table, and what stands for touch and photo in it.
+
+    kind: "touch", "blurred" or one of `CONTROLS`.
+    """
+
+    row: Row
+    kind: str
+
+    @property
+    def method(self) -> str:
+        """The method that is fitted."""
+        return CONTROL_METHOD if self.kind in CONTROLS else self.row.method
+
+    @property
+    def key(self) -> str:
+        """What files of it are called."""
+        return self.kind if self.kind in CONTROLS else f"{self.row.name}-{self.kind}"
+
+    def features(self) -> Features:
+        """What it is fitted on and asked."""
+        towers = self.row.towers
+        if self.kind == "order":
+            return by_clock(towers.features())
+        if self.kind == "background":
+            return towers.features(shown="margin")
+        return towers.features({"blurred": "blurred", "untouched": "before"}.get(self.kind, "touch"))
+
+
+def benchmark(
+    recordings: Mapping[str, Path],
+    out: Path,
+    *,
+    config: Config,
+    preset: str,
+    protocols: Sequence[str],
+    methods: Sequence[str],
+    models: Mapping[str, Path],
+    seeds: int,
+    skipped: Mapping[str, str],
+    cache: Path,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Ask the protocols; writes `out`/results.json and returns its content.
+
+    recordings: by data set. protocols: names, of data sets that are there. methods: fitted on the frozen towers of
+    `config`, which is called `preset`; models: name -> checkpoint, each a row that is asked as it is. seeds: how often
+    folds are drawn and methods are fitted. skipped: protocol -> why it is not asked. What is kept under `cache` from
+    the same settings is used again. Raises ConfigError, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+    """
+    require_known(*methods)
+    if not (methods or models) or seeds < 1:
+        raise BadInput("give one method or model and one seed at least")
+    facts = {name: read_facts(folder) for name, folder in recordings.items()}
+    tables: dict[str, Any] = {}
+    rows: dict[str, list[Row]] = {}
+    try:
+        for name in protocols:
+            protocol = load_protocol(name)
+            of = protocol.data_set
+            if of not in rows:
+                rows[of] = _rows(facts[of], config, methods, models, cache / "features", quiet)
+            tables[name] = _Asked(name, protocol, facts[of], rows[of], list(range(seeds)), cache, quiet).entry()
+    except Interrupted as error:
+        raise Interrupted(f"stopped; what was made is kept in {cache}, and the same command goes on with it") from error
+    results = {
+        "schema_version": SCHEMA_VERSION,
+        "software": __version__,
+        "setting": {
+            "preset": preset,
+            "config": _without_paths(config),
+            "seeds": list(range(seeds)),
+            "draws": DRAWS,
+            "judged_grasps": MOST,
+        },
+        "protocols": tables,
+        "skipped": dict(skipped),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    text = f"{json.dumps(results, sort_keys=True, indent=1, allow_nan=False)}\n"
+    write_atomically(out / "results.json", text.encode())
+    return results
+
+
+def _without_paths(config: Config) -> dict[str, Any]:
+    tables = config.to_dict()
+    for name in ("init", "init_photo", "init_touch"):
+        tables["training"][name] = Path(tables["training"][name]).name
+    return tables
+
+
+def _rows(
+    facts: Facts, config: Config, methods: Sequence[str], models: Mapping[str, Path], cache: Path, quiet: bool
+) -> list[Row]:
+    towers = Towers.of_config(facts.grasps, config, cache, quiet)
+    rows = [Row(name, name, towers) for name in dict.fromkeys(methods)]
+    for name, path in models.items():
+        rows.append(Row(name, "late_fusion", Towers.of_model(facts.grasps, path, cache, quiet)))
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """One protocol on one recording."""
+
+    name: str
+    protocol: Protocol
+    facts: Facts
+    rows: list[Row]
+    seeds: list[int]
+    cache: Path
+    quiet: bool
+
+    def entry(self) -> dict[str, Any]:
+        """The protocol's entry of results.json."""
+        folds = {seed: self.protocol.folds(self.facts, seed) for seed in self.seeds}
+        lines = self._lines()
+        found: dict[str, list[list[Measured]]] = {line.key: [] for line in lines}
+        count = len(lines) * sum(map(len, folds.values()))
+        with Bar(self.name, count, "fits", quiet=self.quiet) as bar:
+            for seed, splits in folds.items():
+                for line in lines:
+                    some = []
+                    for number, split in enumerate(splits):
+                        some.append(self._measured(line, seed, number, split))
+                        bar.advance(note=line.key)
+                    found[line.key].append(some)
+        return {
+            "title": self.protocol.title,
+            "rule": self.protocol.rule,
+            "anchors": list(self.protocol.anchors),
+            "main": self.protocol.main,
+            "labels": {name: metric.label for name, metric in self.protocol.measures.items()},
+            "unit": "sequence" if self.protocol.by_sequence else "object",
+            "recording": {
+                "data_set": self.protocol.data_set,
+                "source": self.facts.source,
+                "digest": data_digest(self.facts.grasps),
+                "objects": len(self.facts.names),
+                "grasps": len(self.facts.grasps),
+            },
+            "folds": [[dataclasses.asdict(split) for split in splits] for splits in folds.values()],
+            "rows": {row.name: self._row(row, found) for row in self.rows},
+            "controls": self._controls(found),
+            "examples": self._examples(found),
+        }
+
+    def _lines(self) -> list[Line]:
+        lines = []
+        for row in self.rows:
+            lines += [Line(row, kind) for kind in (("touch",) if row.method in KNOW_NOTHING else ("touch", "blurred"))]
+        first = Row(CONTROL_METHOD, CONTROL_METHOD, self._frozen)
+        return lines + [Line(first, kind) for kind in CONTROLS if self._why_not(kind) is None]
+
+    @property
+    def _frozen(self) -> Towers:
+        """The towers that controls stand on."""
+        return self.rows[0].towers
+
+    def _why_not(self, kind: str) -> str | None:
+        return why_not_untouched(self.facts.grasps) if kind == "untouched" else None
+
+    def _row(self, row: Row, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
+        touch = [joined(folds) for folds in found[f"{row.name}-touch"]]
+        blurred = [joined(folds) for folds in found.get(f"{row.name}-blurred", ())]
+        model = row.towers.checkpoint
+        return {
+            "method": row.method,
+            "model": model.digest if model else None,
+            **row_entry(self.protocol, touch, blurred, draws=DRAWS, seed=self.seeds[0]),
+            "chosen": [[one.chosen for one in folds] for folds in found[f"{row.name}-touch"]],
+        }
+
+    def _controls(self, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
+        entries: dict[str, Any] = {}
+        for kind, what in CONTROLS.items():
+            taken = [joined(folds) for folds in found.get(kind, ())]
+            why = self._why_not(kind)
+            entries[kind] = control_entry(self.protocol, what, why, taken, draws=DRAWS, seed=self.seeds[0])
+        return entries
+
+    def _examples(self, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
+        """Of the first row that looks at its input, first seed: the best and the worst queries of all folds."""
+        row = next((row for row in self.rows if row.method not in KNOW_NOTHING), self.rows[0])
+        folds = found[f"{row.name}-touch"][0]
+        every = {kind: [one for fold in folds for one in fold.examples[kind]] for kind in ("best", "worst")}
+        best = sorted(every["best"], key=lambda one: float(one["true_rank"]))
+        worst = sorted(every["worst"], key=lambda one: -float(one["true_rank"]))
+        return {"row": row.name, "best": best[:EXAMPLES], "worst": worst[:EXAMPLES]}
+
+    # One fold ----------------------------------------------------------------------------------------
+
+    def _measured(self, line: Line, seed: int, number: int, split: Split) -> Measured:
+        """Of one line in one fold: what is kept, else fitted and asked, and then kept. Scores are not kept: those of
+        all folds fill gigabytes."""
+        self._require_unseen(line, split)
+        features, towers = line.features(), line.row.towers
+        made_by = digest(
+            {
+                "protocol": self.name,
+                "measures": list(self.protocol.measures),
+                "shown": [self.protocol.own_photos, self.protocol.by_sequence],
+                "line": [line.key, line.method],
+                "features": features.digest,
+                "split": split.to_dict(),
+                "seed": seed,
+                "config": _without_paths(towers.config),
+                "model": towers.checkpoint.digest if towers.checkpoint else None,
+                "judged": MOST,
+                "software": __version__,
+            }
+        )
+        path = self.cache / "measures" / self.name / f"{line.key}-{seed}-{number}.safetensors"
+        if (kept := read_measured(path, made_by)) is not None:
+            return kept
+        work = self.cache / "fits" / f"{self.name}-{line.key}-{seed}-{number}"
+        experiment = Experiment(
+            folder=work,
+            config=towers.config,
+            split=split,
+            features=features,
+            pairs=None,
+            queries=draw_queries(self.facts.grasps, split, seed, MOST),
+            checkpoint=towers.checkpoint if line.kind in ("touch", "blurred") else None,
+            shuffled=line.kind == "dealt",
+            quiet=True,
+        )
+        experiment.predict(line.method, seed)
+        judged = MethodScores(experiment.queries, experiment.predictions(line.method, seed), seed)
+        units = Units.of(self.facts, self.protocol)
+        measured = measure(judged, self.protocol, self.facts, units, features.grasp_ids)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_measured(path, measured, made_by)
+        shutil.rmtree(work)
+        return measured
+
+    def _require_unseen(self, line: Line, split: Split) -> None:
+        """A model must not have been trained on the objects that it is tested with."""
+        model = line.row.towers.checkpoint
+        seen = {*model.split.train, *model.split.validation} if model and model.split else set()
+        if shared := seen & set(split.test):
+            raise BadInput(
+                f"the model {line.row.name} was trained on {len(shared)} of the objects that {self.name} tests, such "
+                f"as {min(shared)}; give one that has not seen them"
+            )

@@ -1,0 +1,259 @@
+"""The report of the benchmark of real data: its results.json and the recordings' pictures in, Markdown, HTML and
+figures out."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from indexes.store.regular import read_json
+from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
+from retrieval.console.output import show
+from retrieval.data.dataset import load_grasps
+from retrieval.errors import BadInput
+from retrieval.evaluation.real import SCHEMA_VERSION
+from retrieval.evaluation.real.verdict import RULE
+from retrieval.report import galleries
+from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
+from retrieval.report.document import (
+    Block,
+    Details,
+    Document,
+    Listing,
+    Picture,
+    Section,
+    Table,
+    Text,
+    to_html,
+    to_markdown,
+)
+from retrieval.report.galleries import Grasps
+from retrieval.report.results import (
+    FEW,
+    FEW_MEANS,
+    METHODS,
+    NOTHING,
+    few,
+    file_name,
+    method_label,
+    percent,
+    with_interval,
+)
+from retrieval.report.tables import probability
+from retrieval.report.terminal import print_columns
+
+Entry = Mapping[str, Any]
+INTERVALS = (
+    "In percent; brackets hold 95 % intervals that resample {unit}s, since queries of one {unit} are alike; seeds are "
+    "averaged first. Equal scores count by their expected rank, so that a constant scorer gets exactly chance."
+)
+BLURRED = "the same, touches blurred to 8 x 6"
+
+
+def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
+    """Write report.md, report.html and figures/ under `out` from its results.json.
+
+    recordings: by data set, for the pictures of queries; those that are missing are left out. Returns the files
+    written. Raises BadInput for results that cannot be read, RetrievalError where matplotlib is missing.
+    """
+    results = _read(out / "results.json")
+    entries: Mapping[str, Entry] = results["protocols"]
+    figures = [out / "figures" / "overview.png"]
+    draw(figures[0], overview, entries)
+    sections = []
+    for name, entry in entries.items():
+        recording = recordings.get(entry["recording"]["data_set"])
+        grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}
+        sections.append(Section(entry["title"], tuple(_section(name, entry, grasps, out, figures))))
+    lead: tuple[Block, ...] = (
+        Text(RULE),
+        Picture("figures/overview.png", _overview_words(entries), OVERVIEW),
+        *(Text(f"{name} was not asked: {why}.") for name, why in results["skipped"].items()),
+    )
+    settings = Section("How this was made", (Details("Settings", (Listing.of_json(results["setting"]),)),))
+    document = Document("What a touch says, on real data", lead, (*sections, settings))
+    text, page = out / "report.md", out / "report.html"
+    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
+    write_output(page, text_bytes(to_html(document, out)), PAGE)
+    return [text, page, *figures]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        results = read_json(path)
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve benchmark real`") from error
+    if not isinstance(results, dict) or results.get("schema_version") != SCHEMA_VERSION:
+        raise BadInput(f"{path} must hold results of version {SCHEMA_VERSION}; run `retrieve benchmark real`")
+    return results
+
+
+def print_verdicts(results: Mapping[str, Any]) -> None:
+    """Print a table for each protocol, and what its rows say of touch."""
+    for entry in results["protocols"].values():
+        table = numbers(entry)
+        print_columns(entry["title"], table.header, table.rows, words=(0,))
+        for line in verdicts(entry):
+            show(line)
+
+
+def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[Path]) -> Iterator[Block]:
+    recording = entry["recording"]
+    seeds = len(entry["folds"])
+    yield Text(
+        f"{entry['rule']} {recording['objects']} objects, {recording['grasps']:,} grasps, {seeds} seed(s), "
+        f"{len(entry['folds'][0])} fold(s) each."
+    )
+    yield from (Text(line, warn="does not count" in line) for line in verdicts(entry))
+    yield numbers(entry)
+    yield from (Text(anchor) for anchor in entry["anchors"])
+    yield Text("Controls:")
+    yield controls(entry)
+    yield Details("Against the blurred control, all measures", (differences(entry),))
+    for kind in ("best", "worst"):
+        if grasps and (queries := entry["examples"][kind]):
+            file = f"{file_name(name)}-{kind}.jpg"
+            figures.append(out / "figures" / file)
+            draw(figures[-1], galleries.examples, queries, grasps)
+            yield Picture(
+                f"figures/{file}",
+                f"{kind.capitalize()} queries: {', '.join(one['object_id'] for one in queries)}.",
+                f"The {kind} queries of {method_label(entry['examples']['row'])}, first seed: the touch, then the best "
+                "photo of each object, most likely first; the true object framed green.",
+            )
+
+
+# Words and tables --------------------------------------------------------------------------------------
+
+
+def verdicts(entry: Entry) -> list[str]:
+    """A sentence for each row that looks at its input."""
+    label = entry["labels"][entry["main"]]
+    return [
+        f"{_label(name, row)}, {label}: {with_interval(row['measures'][entry['main']])}, "
+        f"{'above' if row['verdict']['above_chance'] else 'not apart from'} chance "
+        f"({percent(row['measures'][entry['main']]['chance'][0])}); {row['verdict']['words']}."
+        for name, row in entry["rows"].items()
+        if row["verdict"]
+    ]
+
+
+def _label(name: str, row: Entry) -> str:
+    """A method as elsewhere; a model by the name that it was given."""
+    return method_label(name) if row["model"] is None and name in METHODS else f"{name} (as it is)"
+
+
+def numbers(entry: Entry) -> Table:
+    """A row for each method with touches, one with blurred touches, those of the controls, and chance."""
+    labels: Mapping[str, str] = entry["labels"]
+    counted = any(row["counted"] for row in entry["rows"].values())
+    rows = []
+    for name, row in entry["rows"].items():
+        rows.append(
+            (_label(name, row), *_values(row["measures"], labels), *_counts(row["counted"], counted), _yes(row))
+        )
+        if row["blurred"]:
+            rows.append((BLURRED, *_values(row["blurred"], labels), *_counts(None, counted), ""))
+    for name, one in entry["controls"].items():
+        if one["measures"]:
+            rows.append((f"control: {name}", *_values(one["measures"], labels), *_counts(one["counted"], counted), ""))
+    first = next(iter(entry["rows"].values()))["measures"]
+    chance = [percent(first[key]["chance"][0]) if key in first else NOTHING for key in labels]
+    rows.append(("chance, closed form", *chance, *_counts(None, counted), ""))
+    basis = next(iter(first.values()))
+    notes = [
+        INTERVALS.format(unit=entry["unit"]),
+        f"{basis['queries']:,} queries of {basis['objects']} {entry['unit']}s a seed. Gallery: {basis['gallery']}.",
+    ]
+    if counted:
+        notes.append(
+            "Right: right first guesses, mean of the seeds, with an exact binomial interval: of "
+            f"{labels[next(row['counted']['measure'] for row in entry['rows'].values() if row['counted'])]}."
+        )
+    if any(FEW in cell for row in rows for cell in row):
+        notes.append(FEW_MEANS)
+    header = ("method", *labels.values(), *(("right",) if counted else ()), "counts as touch")
+    return Table(header, tuple(rows), tuple(notes))
+
+
+def _values(measures: Mapping[str, Any], labels: Mapping[str, str]) -> list[str]:
+    return [with_interval(measures.get(key)) for key in labels]
+
+
+def _counts(counted: Mapping[str, Any] | None, wanted: bool) -> list[str]:
+    if not wanted or counted is None:
+        return [""] if wanted else []
+    right = sum(counted["right"]) / len(counted["right"])
+    return [f"{right:.3g} of {counted['asked']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
+
+
+def _yes(row: Entry) -> str:
+    return "" if row["verdict"] is None else "yes" if row["verdict"]["counts_as_touch"] else "no"
+
+
+def controls(entry: Entry) -> Table:
+    """What each control is, and what it gives by the measure that decides."""
+    rows = [("blurred", "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging", "see above")]
+    for name, one in entry["controls"].items():
+        value = with_interval(one["measures"].get(entry["main"])) if one["measures"] else f"none: {one['why_not']}"
+        rows.append((name, one["what"], value))
+    header = ("control", "what was done", f"{entry['labels'][entry['main']]}, %")
+    return Table(header, tuple(rows), words=frozenset({1, 2}))
+
+
+def differences(entry: Entry) -> Table:
+    """Paired differences of each row from the same with blurred touches."""
+    rows = [
+        (
+            _label(name, row),
+            entry["labels"][key],
+            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}",
+            probability(one["p"]),
+        )
+        for name, row in entry["rows"].items()
+        for key, one in (row["differences"] or {}).items()
+    ]
+    return Table(("method", "measure", "touch less blurred, points", "p"), tuple(rows), words=frozenset({1}))
+
+
+# Figure ------------------------------------------------------------------------------------------------
+
+OVERVIEW = (
+    "The measure that decides, of each protocol: filled with touches, hollow with blurred ones, and 95 % intervals; "
+    "dashed: chance."
+)
+
+
+def _overview_words(entries: Mapping[str, Entry]) -> str:
+    return " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
+
+
+def overview(entries: Mapping[str, Entry]) -> Figure:
+    """A panel for each protocol, a line for each row: with touches and with blurred ones."""
+    most = max(len(entry["rows"]) for entry in entries.values())
+    columns = min(2, len(entries))
+    lines = -(-len(entries) // columns)
+    figure = canvas(5.2 * columns, lines * (1.1 + 0.42 * most))
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for panel, entry in zip(panels, entries.values(), strict=False):
+        names = list(entry["rows"])
+        for place, name in enumerate(names):
+            row, style = entry["rows"][name], style_of(name)
+            for measures, shift, fill in ((row["measures"], -0.13, style.colour), (row["blurred"], 0.13, "white")):
+                if measures is None:
+                    continue
+                found = measures[entry["main"]]
+                low, value, high = (100 * found[key][0] for key in ("low", "value", "high"))
+                panel.plot([low, high], [place + shift] * 2, color=style.colour, lw=2, solid_capstyle="butt")
+                panel.plot(value, place + shift, "o", ms=6, mec=style.colour, mfc=fill)
+        chance = entry["rows"][names[0]]["measures"][entry["main"]]["chance"][0]
+        panel.axvline(100 * chance, color=FAINT, ls="--", lw=1, zorder=0)
+        panel.set_yticks(range(len(names)), [_label(name, entry["rows"][name]) for name in names])
+        panel.set_ylim(len(names) - 0.5, -0.5)
+        panel.set_title(entry["title"], fontsize=9, loc="left")
+        panel.set_xlabel(f"{entry['labels'][entry['main']]}, %")
+        panel.set_xlim(0, None)
+        panel.tick_params(axis="y", length=0)
+        panel.grid(axis="y", visible=False)
+    for panel in panels[len(entries) :]:
+        panel.set_axis_off()
+    return figure

@@ -1,0 +1,244 @@
+"""`retrieve benchmark real` on miniatures: from data sets' own folders to tables, with controls, again and stopped."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from retrieval.commands.main import main
+from retrieval.evaluation.real import PROTOCOLS, run
+from retrieval.evaluation.real.measuring import read_measured, write_measured
+from retrieval.methods.base import Method
+from tests import real_data_sets
+from tests.data import touch_data
+
+TINY = ["--preset", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca_pca,chance"]
+ASKED = ("vt60-random", "billets-places")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """A folder with vt60/ and billets/."""
+    folder = tmp_path_factory.mktemp("data")
+    real_data_sets.write_vt60(folder / "vt60")
+    real_data_sets.write_billets(folder / "billets")
+    return folder
+
+
+def benchmark(data, out, *more, methods=TINY):
+    return main(["benchmark", "real", str(data), "--out", str(out), *methods, *more])
+
+
+@pytest.fixture(scope="module")
+def out(data, tmp_path_factory):
+    """The report of two protocols. Copy it before changing it."""
+    folder = tmp_path_factory.mktemp("made") / "report"
+    assert benchmark(data, folder, "--protocols", ",".join(ASKED)) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(out):
+    return json.loads((out / "results.json").read_text())
+
+
+def test_every_row_has_its_blurred_control_and_a_verdict_and_chance_has_neither(results):
+    assert list(results["protocols"]) == sorted(ASKED)
+    for entry in results["protocols"].values():
+        assert set(entry["rows"]) == {"cca_pca", "chance"}
+        row, nothing = entry["rows"]["cca_pca"], entry["rows"]["chance"]
+        assert set(row["measures"]) == set(row["blurred"]) == set(row["differences"])
+        difference = row["differences"][entry["main"]]
+        assert row["verdict"]["counts_as_touch"] == (difference["low"] > 0)
+        by_hand = row["measures"][entry["main"]]["value"][0] - row["blurred"][entry["main"]]["value"][0]
+        assert difference["difference"] == pytest.approx(by_hand)
+        assert (nothing["blurred"], nothing["verdict"]) == (None, None)
+
+
+def test_a_seed_asks_every_object_and_chance_is_that_of_the_gallery(results):
+    summary = results["protocols"]["vt60-random"]["rows"]["cca_pca"]["measures"]["guesses_k9"]
+    assert (summary["objects"], summary["queries"], len(summary["by_seed"])) == (18, 18 * 4, 2)
+    assert summary["chance"][0] == pytest.approx(1 / 9)
+
+
+def test_a_gallery_of_billets_holds_the_places_of_one_and_right_answers_are_counted(results):
+    entry = results["protocols"]["billets-places"]
+    summary = entry["rows"]["cca_pca"]["measures"]["guesses_k4"]
+    assert (entry["unit"], summary["objects"], summary["queries"]) == ("sequence", 3, 48)
+    assert summary["few_objects"]
+    assert "4 test objects, 4 photos" in summary["gallery"]
+    counted = entry["rows"]["cca_pca"]["counted"]
+    assert counted["asked"] == 48
+    assert np.mean(counted["right"]) / 48 == pytest.approx(summary["value"][0])
+    assert counted["low"] < summary["value"][0] < counted["high"]
+
+
+def test_controls_say_what_was_done_and_why_one_is_not_there(results):
+    for entry in results["protocols"].values():
+        assert list(entry["controls"]) == ["background", "dealt", "order", "untouched"]
+        assert all(control["what"] for control in entry["controls"].values())
+    assert "one untouched frame serves all" in results["protocols"]["vt60-random"]["controls"]["untouched"]["why_not"]
+    assert "lacks untouched" in results["protocols"]["billets-places"]["controls"]["untouched"]["why_not"]
+    dealt = results["protocols"]["vt60-random"]["controls"]["dealt"]["measures"]["guesses_k9"]
+    assert dealt["low"][0] < 1 / 9 < dealt["high"][0]
+
+
+def test_the_report_says_the_verdict_in_words_and_shows_tables_and_queries(out, results):
+    text, page = (out / "report.md").read_text(), (out / "report.html").read_text()
+    for entry in results["protocols"].values():
+        assert entry["title"] in text
+        words = entry["rows"]["cca_pca"]["verdict"]["words"].split(":")[0]
+        assert f"{words}:" in re.sub(r"\\", "", text)
+        assert words in page
+    assert "counts as touch only where" in text
+    assert "control: order" in text
+    assert "exact binomial interval" in text
+    for name in ("overview.png", "vt60-random-best.jpg", "vt60-random-worst.jpg", "billets-places-best.jpg"):
+        assert (out / "figures" / name).is_file()
+        assert f"figures/{name}" in text
+
+
+def test_what_is_made_is_not_made_again_and_comes_out_the_same_to_the_byte(data, out, tmp_path, monkeypatch):
+    again = tmp_path / "again"
+    shutil.copytree(out, again)
+    monkeypatch.setattr(Method, "fit", lambda *_: pytest.fail("fitted"))
+    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 0
+    for name in ("results.json", "report.md"):
+        assert (again / name).read_bytes() == (out / name).read_bytes()
+
+
+def test_a_stopped_run_goes_on(data, out, tmp_path, monkeypatch, capsys):
+    again = tmp_path / "again"
+    shutil.copytree(out, again)
+    for path in sorted((again / "cache" / "measures" / "billets-places").iterdir())[:2]:
+        path.unlink()
+    fitted = []
+    fit = Method.fit
+
+    def stopping(self, *parts):
+        fitted.append(self)
+        if len(fitted) == 2:
+            raise KeyboardInterrupt
+        fit(self, *parts)
+
+    monkeypatch.setattr(Method, "fit", stopping)
+    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 1
+    assert "goes on with it" in capsys.readouterr().err
+    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 0
+    assert len(fitted) == 3
+    assert (again / "results.json").read_bytes() == (out / "results.json").read_bytes()
+
+
+def test_measures_of_other_settings_and_damaged_ones_are_not_taken(out, tmp_path):
+    path = next((out / "cache" / "measures" / "vt60-random").glob("cca_pca-touch-*"))
+    made_by = json.loads(path.read_bytes()[8 : 8 + int.from_bytes(path.read_bytes()[:8], "little")])
+    key = json.loads(made_by["__metadata__"]["touch_retrieval"])["made_by"]
+    kept = read_measured(path, key)
+    assert kept is not None
+    write_measured(tmp_path / "copy.safetensors", kept, key)
+    copy = read_measured(tmp_path / "copy.safetensors", key)
+    np.testing.assert_array_equal(copy.measures["guesses_k9"].values, kept.measures["guesses_k9"].values)
+    assert read_measured(path, "other") is None
+    assert read_measured(tmp_path / "none.safetensors", key) is None
+    (tmp_path / "copy.safetensors").write_bytes(path.read_bytes()[:-9])
+    assert read_measured(tmp_path / "copy.safetensors", key) is None
+
+
+def test_no_scores_and_no_fits_are_left_on_the_disk(out):
+    assert not list((out / "cache").rglob("predictions"))
+    assert not list((out / "cache" / "fits").iterdir())
+
+
+def test_who_lacks_a_data_set_is_told_the_command(data, tmp_path, capsys):
+    assert benchmark(data, tmp_path / "out", "--protocols", "rct,objectfolder") == 2
+    said = capsys.readouterr().err
+    assert f"retrieve benchmark real {data} --out {tmp_path / 'out'} --protocols objectfolder" in said
+    assert f"retrieve import rct RCT --out {data / 'rct'} --option touch=... photo=... && " in said
+    assert "must hold data of a protocol" in said
+
+
+@pytest.mark.slow
+def test_a_recording_of_a_data_set_is_as_good_as_its_own_folder(out, tmp_path):
+    recordings = tmp_path / "data"
+    shutil.copytree(out / "cache" / "recordings" / "billets", recordings / "my-billets")
+    assert benchmark(recordings, tmp_path / "out", "--protocols", "billets-places", "--seeds", "1") == 0
+    assert not (tmp_path / "out" / "cache" / "recordings").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--protocols", "ycb"], "protocol must be one of"),
+        (["--methods", "mine"], "method must be one of"),
+        (["--model", "alone"], "NAME=FILE"),
+        (["--seeds", "0"], "one seed at least"),
+    ],
+)
+def test_wrong_use_is_one_line(data, tmp_path, options, said, capsys):
+    wanted = [*options] if "--protocols" in options else [*options, "--protocols", "billets-places"]
+    assert benchmark(data, tmp_path / "out", *wanted) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_checkpoint_is_a_row_as_it_is_and_one_finger_is_shown_to_both_of_its(data, model, tmp_path):
+    asked = ["--protocols", "billets-places", "--seeds", "1", "--methods", "chance", "--model", f"mine={model}"]
+    assert benchmark(data, tmp_path, *asked) == 0
+    row = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-places"]["rows"]["mine"]
+    assert row["model"]
+    assert row["verdict"]
+    assert "mine (as it is)" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_checkpoint_that_was_trained_on_what_is_tested_is_refused(data, out, tmp_path, capsys):
+    recording = out / "cache" / "recordings" / "billets"
+    trained = ["train", str(recording), "--out", str(tmp_path / "seen.safetensors"), "--config", "tiny"]
+    assert main([*trained, "--iterations", "1"]) == 0
+    asked = ["--protocols", "billets-places", "--model", f"seen={tmp_path / 'seen.safetensors'}"]
+    assert benchmark(data, tmp_path / "out", *asked) == 2
+    assert "the model seen was trained on" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_every_protocol_runs_on_its_miniature(tmp_path):
+    data = tmp_path / "data"
+    real_data_sets.write(data)
+    assert benchmark(data, tmp_path / "out", "--seeds", "1", "--methods", "cca_pca,late_fusion,set_fusion,chance") == 0
+    entries = json.loads((tmp_path / "out" / "results.json").read_text())["protocols"]
+    assert set(entries) == set(PROTOCOLS)
+    assert entries["feeling-of-success"]["controls"]["untouched"]["measures"]
+    assert "pair_accuracy" in entries["feeling-of-success"]["rows"]["cca_pca"]["measures"]
+    assert any("64.3" in anchor for anchor in entries["feeling-of-success"]["anchors"])
+    for entry in entries.values():
+        assert set(entry["rows"]) == {"cca_pca", "late_fusion", "set_fusion", "chance"}
+
+
+@pytest.mark.slow
+def test_real_bottles_and_balls_are_told_better_by_touch_than_by_its_blur(tmp_path, monkeypatch):
+    """VT60, seen classes: the number of docs/real.md, with one seed."""
+    weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
+    data = touch_data("vt60").parent
+    monkeypatch.setattr(run, "MOST", {"train": 1, "validation": 12, "test": 20})
+    asked = ["--protocols", "vt60-seen-classes", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
+    assert benchmark(data, tmp_path, methods=asked) == 0
+    entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["vt60-seen-classes"]
+    row = entry["rows"]["cca_pca"]
+    assert row["measures"]["guesses_k9"]["value"][0] > 0.55
+    assert row["differences"]["guesses_k9"]["difference"] > 0.04
+    assert entry["controls"]["dealt"]["measures"]["guesses_k9"]["value"][0] < 0.2
+
+
+@pytest.mark.slow
+def test_real_billets_never_seen_are_about_chance(tmp_path):
+    weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
+    data = touch_data("billets").parent
+    asked = ["--protocols", "billets-unseen", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
+    assert benchmark(data, tmp_path, methods=asked) == 0
+    entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-unseen"]
+    counted = entry["rows"]["cca_pca"]["counted"]
+    assert counted["asked"] == 80
+    assert counted["low"] < 0.25
+    assert (tmp_path / "report.html").is_file()

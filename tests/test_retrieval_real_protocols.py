@@ -1,0 +1,218 @@
+"""Protocols of real data: nothing that tests is trained on, every object is tested once a seed, galleries as told."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from retrieval.data.dataset import Grasp, Split
+from retrieval.errors import ConfigError, DatasetError
+from retrieval.evaluation.real import PROTOCOLS, load_protocol
+from retrieval.evaluation.real.controls import by_clock, clock, why_not_untouched
+from retrieval.evaluation.real.protocol import Facts
+from retrieval.evaluation.real.verdict import verdict
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.training.features import Features
+
+
+def facts(sequence_of, about=None, splits=None):
+    grasps = [
+        Grasp(f"{name}-{turn}", name, sequence, Path(f"{name}.jpg"), (Path(f"{name}-{turn}.png"),), ())
+        for name, sequence in sequence_of.items()
+        for turn in range(2)
+    ]
+    return Facts("drawn", grasps, about or {}, splits or {})
+
+
+def vt60(instances=4):
+    classes = ["bottleempty", "ball", "bottlefull", *(f"kind{number}" for number in range(7))]
+    about = {f"{kind}-{n}": {"class": kind} for kind in classes for n in range(instances)}
+    return facts(dict.fromkeys(about), about)
+
+
+def billets():
+    kinds = (*(f"welded{n}" for n in range(5)), *(f"ground{n}" for n in range(4)))
+    return facts({f"{kind}-{place:02}": kind for kind in kinds for place in range(16)})
+
+
+MADE = {
+    "vt60-seen-classes": vt60(),
+    "vt60-random": vt60(),
+    "vt60-classes": vt60(),
+    "billets-unseen": billets(),
+    "billets-places": billets(),
+    "objectfolder": facts(
+        dict.fromkeys("abcdefgh"), splits={"published": Split(0, tuple("abcd"), tuple("ef"), tuple("gh"))}
+    ),
+    "rct": facts(dict.fromkeys(f"m{n}" for n in range(60))),
+    "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
+}
+
+
+def folds(name, seed=0):
+    return load_protocol(name).folds(MADE[name], seed)
+
+
+def test_there_is_a_recording_here_for_every_protocol():
+    assert set(MADE) == set(PROTOCOLS)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_no_object_stands_in_two_parts_and_two_objects_at_least_in_each(name):
+    for split in folds(name):
+        parts = [set(part) for part in (split.train, split.validation, split.test)]
+        assert sum(map(len, parts)) == len(set.union(*parts))
+        assert min(map(len, parts)) >= 2
+        assert set.union(*parts) <= set(MADE[name].names)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_seed_tests_the_same_objects_each_once(name):
+    tested = [Counter(each for split in folds(name, seed) for each in split.test) for seed in range(3)]
+    assert tested[0] == tested[1] == tested[2]
+    assert set(tested[0].values()) == {1}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_seed_draws_the_same_folds_each_time_and_another_one_others(name):
+    assert folds(name, 1) == folds(name, 1)
+    if name != "objectfolder":  # which is split as published
+        assert [set(one.train) for one in folds(name, 0)] != [set(one.train) for one in folds(name, 1)]
+
+
+def test_full_bottles_are_in_no_part():
+    for name in ("vt60-seen-classes", "vt60-random", "vt60-classes"):
+        for split in folds(name):
+            assert not [each for each in (*split.train, *split.validation, *split.test) if "bottlefull" in each]
+        assert sum(len(split.test) for split in folds(name)) == 36
+
+
+def test_a_fold_of_seen_classes_tests_one_instance_of_each_and_knows_the_others():
+    for split in folds("vt60-seen-classes"):
+        kinds = [each.split("-")[0] for each in split.test]
+        assert len(kinds) == len(set(kinds)) == 9
+        assert set(kinds) == {each.split("-")[0] for each in (*split.train, *split.validation)}
+
+
+def test_a_fold_of_unseen_classes_tests_all_of_three_and_knows_none_of_them():
+    for split in folds("vt60-classes"):
+        kinds = {each.split("-")[0] for each in split.test}
+        assert len(kinds) == 3
+        assert len(split.test) == 12
+        assert not kinds & {each.split("-")[0] for each in (*split.train, *split.validation)}
+
+
+def test_random_folds_hold_nine_objects():
+    assert [len(split.test) for split in folds("vt60-random")] == [9] * 4
+
+
+def test_a_recording_that_names_no_classes_is_refused():
+    with pytest.raises(DatasetError, match="retrieve import vt60"):
+        load_protocol("vt60-random").folds(facts(dict.fromkeys("ab")), 0)
+
+
+def test_a_billet_that_tests_is_seen_by_nothing_and_ground_ones_are_left_out():
+    tested = []
+    for split in folds("billets-unseen"):
+        sides = [{each.split("-")[0] for each in part} for part in (split.train, split.validation, split.test)]
+        assert [len(side) for side in sides] == [3, 1, 1]
+        assert len(set.union(*sides)) == 5
+        tested += sides[2]
+    assert sorted(tested) == [f"welded{n}" for n in range(5)]
+
+
+def test_places_of_all_welded_billets_test_and_train():
+    for split in folds("billets-places"):
+        for part, count in ((split.train, 8), (split.validation, 4), (split.test, 4)):
+            assert Counter(each.split("-")[0] for each in part) == {f"welded{n}": count for n in range(5)}
+
+
+def test_two_billets_are_too_few():
+    with pytest.raises(DatasetError, match="3 billets at least; there are 2"):
+        load_protocol("billets-unseen").folds(facts({"a-1": "a", "b-1": "b"}), 0)
+
+
+def test_the_papers_protocol_takes_98_objects_and_tests_18():
+    (split,) = folds("feeling-of-success")
+    assert (len(split.test), len(split.train) + len(split.validation)) == (18, 80)
+
+
+def test_objectfolder_takes_the_published_split_and_asks_for_it_where_there_is_none():
+    (split,) = folds("objectfolder", seed=2)
+    assert (split.seed, split.train, split.validation, split.test) == (2, tuple("abcd"), tuple("ef"), tuple("gh"))
+    with pytest.raises(DatasetError, match=r"split\.json"):
+        load_protocol("objectfolder").folds(facts(dict.fromkeys("ab")), 0)
+
+
+def test_an_unknown_protocol_lists_the_known_ones():
+    with pytest.raises(ConfigError, match=r"vt60-seen-classes, .*; got 'ycb'"):
+        load_protocol("ycb")
+
+
+# Controls and verdicts -------------------------------------------------------------------------------
+
+
+def test_places_near_in_the_order_of_capture_are_alike_and_far_ones_are_not():
+    found = clock(100)
+    assert found.shape == (100, 84)
+    steps = np.linalg.norm(found - found[50], axis=1)
+    assert (np.diff(steps[50:56]) > 0).all()
+    assert steps[51] < steps[90] / 3
+
+
+def test_the_clock_stands_in_for_the_touch_alone():
+    features = Features(
+        ("a", "b"), ("mug", "tin"), np.zeros((2, 3, 5), np.float32), np.arange(4, dtype=np.float32).reshape(2, 2)
+    )
+    made = by_clock(features)
+    np.testing.assert_array_equal(made.touch[:, 0], clock(2))
+    np.testing.assert_array_equal(made.photo, features.photo)
+    assert made.object_ids == features.object_ids
+
+
+def test_one_untouched_frame_for_all_and_none_at_all_cannot_stand_in_for_touches():
+    grasps = MADE["rct"].grasps[:4]
+    assert "lacks" in why_not_untouched(grasps)
+
+    def with_frames(names):
+        return [
+            Grasp(one.grasp_id, one.object_id, None, one.photo, one.touches, (Path(name),))
+            for one, name in zip(grasps, names, strict=True)
+        ]
+
+    assert "one untouched frame" in why_not_untouched(with_frames("xxxx"))
+    assert why_not_untouched(with_frames("xxxy")) is None
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "counts", "words"),
+    [
+        (0.01, 0.2, True, "counts as touch: +10.0 points [+1.0, +20.0] over"),
+        (-0.01, 0.2, False, "does not count as touch: +10.0 points [-1.0, +20.0] against the blurred control, an"),
+        (0.0, 0.2, False, "does not count as touch"),
+        (-0.2, -0.01, False, "does not count as touch: +10.0 points [-20.0, -1.0] below"),
+    ],
+)
+def test_a_result_counts_as_touch_only_where_the_whole_interval_lies_above_the_blurred_control(
+    low, high, counts, words
+):
+    summary = {"low": [0.3], "chance": [0.2]}
+    found = verdict(summary, {"difference": 0.1, "low": low, "high": high})
+    assert found["counts_as_touch"] is counts
+    assert found["words"].startswith(words)
+    assert found["above_chance"]
+
+
+def test_a_value_whose_interval_holds_chance_is_not_above_it():
+    found = verdict({"low": [0.2], "chance": [0.2]}, {"difference": 0.1, "low": 0.01, "high": 0.2})
+    assert not found["above_chance"]
+
+
+def test_pooled_galleries_hold_every_query_of_each_under_its_unit():
+    one = Measure(np.array([[0.5], [1.0]]), np.array([3, 7]), np.array([0.25]), "four")
+    two = Measure(np.array([[0.0]]), np.array([3]), np.array([0.5]), "two")
+    whole = pooled([one, two], [{3: 1, 7: 0}, {3: 1}])
+    assert whole.owner.tolist() == [0, 1, 1]
+    assert whole.values.ravel().tolist() == [1.0, 0.5, 0.0]
+    assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # units alike
