@@ -6,14 +6,15 @@ from pathlib import Path
 
 
 def parents():
-    """{process: its parent}, of all of this machine."""
+    """{process: its parent}, of all of this machine that have not ended."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             after = path.read_text().rpartition(")")[2].split()
         except OSError:  # it has ended
             continue
-        found[int(path.parent.name)] = int(after[1])
+        if after[0] != "Z":  # nobody has taken note of its end
+            found[int(path.parent.name)] = int(after[1])
     return found
 
 

@@ -12,9 +12,11 @@ import threading
 import time
 from importlib.util import find_spec
 
+import httpx
 import numpy as np
 import pytest
 
+import retrieval
 from indexes.store.cluster import read_cluster
 from indexes.store.folder import IndexStore
 from retrieval.data.catalogue import list_catalogue
@@ -23,7 +25,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build_cluster import build_cluster
 from retrieval.search.opening import stored_for
 from retrieval.search.searcher import Searcher
-from tests import on_ray, synthetic
+from tests import on_ray, serving, synthetic
 
 pytestmark = [
     pytest.mark.slow,
@@ -292,6 +294,30 @@ def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, m
     assert killed
     assert (report.photos, report.objects, report.skipped) == (240, 40, [])
     assert len(halves_of(tmp_path / "c")) == 240 == len(list_catalogue(many).photos)
+
+
+def test_the_service_over_a_cluster_is_that_over_the_folder_and_lives_again_after_a_kill(cluster, searcher, touch):
+    """Without RAY_ADDRESS its Ray is its own, ends with it however it ends, and listens on this machine alone."""
+    expected = searcher.query(touch)
+    for how in (signal.SIGKILL, signal.SIGTERM):
+        with serving.command("--index", cluster, "--cluster", "--no-history", "--port", 0) as (process, address, _):
+            client = retrieval.Client(address)
+            answer = client.query(touch)
+            assert names(answer) == names(expected)
+            assert numbers(answer) == pytest.approx(numbers(expected), abs=1e-5)
+            assert (answer.index["shards"], answer.index["searched"]) == (4, 1.0)
+            found = httpx.get(f"{address}/v1/catalogue", params={"limit": 500}).json()
+            assert {item["id"] for item in found["items"]} == {row["id"] for row in searcher.generation.rows}
+            assert httpx.get(f"{address}/v1/photos/{answer.top.photo}").status_code == 200
+            assert httpx.get(f"{address}/v1/nearest/{answer.top.photo}").status_code == 422
+            below = on_ray.descendants(process.pid)
+            assert on_ray.listening(process.pid) <= LOOPBACK
+            process.send_signal(how)
+            assert process.wait(120) == (0 if how == signal.SIGTERM else -signal.SIGKILL)
+        until = time.monotonic() + 240  # an agent of Ray asks once in a while whether its raylet lives
+        while (left := set(below) & set(on_ray.parents())) and time.monotonic() < until:
+            time.sleep(0.2)
+        assert not left
 
 
 def test_without_a_cluster_the_service_says_what_to_do(index, capsys):

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -22,6 +23,14 @@ _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
 @contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the warnings of Ray's own making, most of which are about Ray."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(ray|pydantic|google)(\.|$)")
+        yield
+
+
+@contextmanager
 def connected(cpus: int | None = None) -> Iterator[Any]:
     """Ray with its parts `data` and `serve`, connected to the cluster that the variable RAY_ADDRESS names ("auto": one
     of this machine), else to one that is started here, on 127.0.0.1 alone, and ends with the block.
@@ -33,9 +42,10 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
     if not joined:
         os.environ.update(_LOOPBACK)
     try:
-        import ray
-        import ray.data
-        import ray.serve
+        with _quiet():
+            import ray
+            import ray.data
+            import ray.serve
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[cluster]'") from error
     said: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "ignore_reinit_error": True}
@@ -47,7 +57,8 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
             "runtime_env": {"worker_process_setup_hook": "retrieval.cluster.session.on_loopback"},
         }
     try:
-        ray.init(address=joined, **said)
+        with _quiet():
+            ray.init(address=joined, **said)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
         what = f"the Ray cluster at {joined} cannot be joined" if joined else "Ray cannot be started here"
         raise RetrievalError(f"{what}: {error}") from error
@@ -59,7 +70,8 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
                 f"Ray would listen on {address}, for this process had imported it already: "
                 f"set {', '.join(_LOOPBACK)}=0 before that, or start Ray yourself and name it in RAY_ADDRESS"
             )
-        yield ray
+        with _quiet():
+            yield ray
     finally:
         ray.shutdown()
 

@@ -34,7 +34,7 @@ from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.data.naming import FOLDER as BY_FOLDER
-from retrieval.data.naming import Naming, per_object
+from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -224,7 +224,7 @@ def _report(
         objects_from=naming.text,
         per_object=per_object(counts),
         examples=reports[0].examples,
-        doubts=list(dict.fromkeys(doubt for report in reports for doubt in report.doubts)),
+        doubts=doubts(Counter(photo.object_id for photo in catalogue.photos), naming),
         embedded=sum(report.embedded for report in reports),
         reused=sum(report.reused for report in reports),
         renamed=sum(report.renamed for report in reports),
