@@ -19,7 +19,7 @@ def write_billets(folder: Path) -> None:
 
 
 def write(folder: Path) -> None:
-    write_vt60(folder / "vt60")
+    write_vt60(folder / "vt60", instances=3)
     write_billets(folder / "billets")
     rct.write(folder / "rct", [f"material-{number}" for number in range(50)])
     names = [str(number) for number in range(1, 25)]

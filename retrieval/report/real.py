@@ -10,7 +10,7 @@ from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.console.output import show
 from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput
-from retrieval.evaluation.real import SCHEMA_VERSION
+from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.verdict import RULE
 from retrieval.report import galleries
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
@@ -56,7 +56,7 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     written. Raises BadInput for results that cannot be read, RetrievalError where matplotlib is missing.
     """
     results = _read(out / "results.json")
-    entries: Mapping[str, Entry] = results["protocols"]
+    entries = _ordered(results)
     figures = [out / "figures" / "overview.png"]
     draw(figures[0], overview, entries)
     sections = []
@@ -87,9 +87,27 @@ def _read(path: Path) -> dict[str, Any]:
     return results
 
 
+def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The protocols, their measures and rows in the order in which they are known; the file's is that of letters."""
+    entries: Mapping[str, Entry] = results["protocols"]
+    known = list(METHODS)
+
+    def place(name: str) -> tuple[int, str]:
+        return known.index(name) if name in known else len(known), name
+
+    return {
+        name: {
+            **entries[name],
+            "labels": dict(entries[name]["labels"]),
+            "rows": {row: entries[name]["rows"][row] for row in sorted(entries[name]["rows"], key=place)},
+        }
+        for name in sorted(entries, key=list(PROTOCOLS).index)
+    }
+
+
 def print_verdicts(results: Mapping[str, Any]) -> None:
     """Print a table for each protocol, and what its rows say of touch."""
-    for entry in results["protocols"].values():
+    for entry in _ordered(results).values():
         table = numbers(entry)
         print_columns(entry["title"], table.header, table.rows, words=(0,))
         for line in verdicts(entry):

@@ -165,7 +165,7 @@ class _Asked:
             "rule": self.protocol.rule,
             "anchors": list(self.protocol.anchors),
             "main": self.protocol.main,
-            "labels": {name: metric.label for name, metric in self.protocol.measures.items()},
+            "labels": [[name, metric.label] for name, metric in self.protocol.measures.items()],
             "unit": "sequence" if self.protocol.by_sequence else "object",
             "recording": {
                 "data_set": self.protocol.data_set,
