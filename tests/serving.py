@@ -16,17 +16,17 @@ from tests.waiting import running
 
 
 @contextmanager
-def service(index, beside=None, recorder=None, trials=None, **settings):
+def service(index, rig=None, recorder=None, trials=None, **settings):
     """A client of the application, which runs in this process."""
-    app = create_app(ServiceSettings(index=index, **settings), beside, recorder, trials)
+    app = create_app(ServiceSettings(index=index, **settings), rig, recorder, trials)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
 
 
 @contextmanager
-def listening(index, beside=None, recorder=None, trials=None, **settings):
+def listening(index, rig=None, recorder=None, trials=None, **settings):
     """Address of the application on a port of its own, served by a thread, and its parts."""
-    app = create_app(ServiceSettings(index=index, port=0, **settings), beside, recorder, trials)
+    app = create_app(ServiceSettings(index=index, port=0, **settings), rig, recorder, trials)
     ports = queue.Queue()
     server = Server(configured(app), app.state.service, ports.put)
     thread = threading.Thread(target=server.run)

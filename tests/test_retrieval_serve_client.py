@@ -71,6 +71,8 @@ def test_what_cannot_be_asked_raises_as_the_searcher_does(client, touch, tmp_pat
         client.query([touch[0]])
     with pytest.raises(BadInput, match="top: Input should be greater than or equal to 1"):
         client.query(touch, top=0)
+    with pytest.raises(BadInput, match="tip: Extra inputs are not permitted"):
+        client.query(touch, tip=3)
     with pytest.raises(ImageError, match="an array must hold uint8"):
         client.query([np.zeros((4, 4, 3))] * 2)
 

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_info
 
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
-from retrieval.serve.service import Bench
+from retrieval.serve.service import LiveRig
 from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
 from tests.serving import command, listening, problem, service
@@ -224,9 +224,9 @@ def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign,
 
 def test_a_stream_ends_when_the_service_does(index):
     pictures = iter(range(10**6))
-    beside = Bench({"a": lambda: b"picture %d" % next(pictures)})
+    rig = LiveRig({"a": lambda: b"picture %d" % next(pictures)})
     with (
-        listening(index, beside) as (url, parts),
+        listening(index, rig) as (url, parts),
         httpx.stream("GET", f"{url}/v1/sensors/a/stream", params={"rate": 30}, timeout=30) as stream,
     ):
         parts_seen = b""
@@ -246,8 +246,8 @@ def status(address):
 
 
 def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
-    beside = Bench({"a": lambda: b"picture", "b": lambda: 1 / 0})
-    with listening(index, beside, streams=1) as (url, _):
+    rig = LiveRig({"a": lambda: b"picture", "b": lambda: 1 / 0})
+    with listening(index, rig, streams=1) as (url, _):
         address = f"{url}/v1/sensors/a/stream"
         with httpx.stream("GET", address, timeout=30) as stream:
             chunks = stream.iter_raw()

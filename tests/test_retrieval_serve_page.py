@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from retrieval.serve.service import Bench, Grasped
+from retrieval.serve.service import Grasped, LiveRig
 from tests import synthetic
 from tests.browser import address, ask, choose, chromium, gel_files, page, serious
 
@@ -32,7 +32,7 @@ def touches():
 
 
 @pytest.fixture(scope="module")
-def bench(touches):
+def rig(touches):
     """Jaws that close on the object that is named, else on one after the other; the gels of two sensors."""
     drawn = itertools.cycle(sorted(touches))
 
@@ -40,12 +40,12 @@ def bench(touches):
         name = names[0] if len(names) == 1 else next(drawn)
         return Grasped(name, list(touches[name][0].values()))
 
-    return Bench({"a": lambda: JPEG, "b": lambda: JPEG}, close)
+    return LiveRig({"a": lambda: JPEG, "b": lambda: JPEG}, close)
 
 
 @pytest.fixture(scope="module")
-def url(index, bench):
-    with address(index, bench) as found:
+def url(index, rig):
+    with address(index, rig) as found:
         yield found
 
 

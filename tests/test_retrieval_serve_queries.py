@@ -4,6 +4,7 @@ import base64
 
 import pytest
 
+from retrieval.serve.documents import MatchDocument, QueryDocument
 from tests import synthetic
 from tests.serving import problem, service
 
@@ -37,6 +38,13 @@ def same(document, result):
     return {**document, "timing_ms": 0} == {**expected, "timing_ms": 0} and set(document["timing_ms"]) == set(
         expected["timing_ms"]
     )
+
+
+def test_openapi_says_the_form_that_answers_have(client, searcher, grasps):
+    answer = searcher.query(grasps).to_dict()
+    assert set(answer) == set(QueryDocument.model_fields)
+    assert set(answer["results"][0]) == set(MatchDocument.model_fields)
+    assert QueryDocument(**answer).model_dump() == answer
 
 
 def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):

@@ -13,7 +13,7 @@ from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
     from retrieval.search.opening import OpenShards
-    from retrieval.serve.service import Bench
+    from retrieval.serve.service import LiveRig
     from robot.recording.folder import RecordingWriter
 
 TOKEN = "RETRIEVE_TOKEN"
@@ -86,7 +86,7 @@ def serve(
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
         held = _held(path, closed, replicas, shard_wait, least_share, not no_verify) if cluster else None
-        app = create_app(settings, _bench(rig, path), recorder, trials, held)
+        app = create_app(settings, _live_rig(rig, path), recorder, trials, held)
 
         def started(bound: int) -> None:
             address = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
@@ -137,7 +137,7 @@ def _token(file: Path | None) -> str | None:
         raise ConfigError(f"{file} must hold a token in ASCII: {error}") from error
 
 
-def _bench(rig: str | None, index: Path) -> "Bench | None":
+def _live_rig(rig: str | None, index: Path) -> "LiveRig | None":
     """What the rig gives the service; without --rig, the simulated one where the index shows its objects."""
     from retrieval.serve.rig import of_index, of_rig
 

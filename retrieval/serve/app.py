@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.opening import OpenShards
-from retrieval.serve import bench, catalogue, errors, health, history, human, page_files, queries
+from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
 from retrieval.serve.generations import Generations
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
@@ -23,7 +23,7 @@ from retrieval.serve.queries import AgreementBody
 from retrieval.serve.queue import Queue
 from retrieval.serve.recording import Recorder
 from retrieval.serve.security import Guard
-from retrieval.serve.service import Bench, Service
+from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.thumbnails import Thumbnails
 from retrieval.serve.trials import Trials
@@ -45,7 +45,7 @@ _BODIES: tuple[type[BaseModel], ...] = (
 
 def create_app(
     settings: ServiceSettings,
-    beside: Bench | None = None,
+    rig: LiveRig | None = None,
     recorder: Recorder | None = None,
     trials: Path | None = None,
     shards: OpenShards | None = None,
@@ -64,7 +64,7 @@ def create_app(
         metrics,
         generations,
         Queue(generations, settings, metrics),
-        beside or Bench(),
+        rig or LiveRig(),
         Thumbnails(),
         Keeping(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
         Trials(trials) if trials else None,
@@ -81,7 +81,7 @@ def create_app(
     )
     app.state.service = parts
     errors.install(app)
-    for paths in (queries, catalogue, bench, history, human, health):
+    for paths in (queries, catalogue, live, history, human, health):
         app.include_router(paths.router)
     app.include_router(page_files.router_of())
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]

@@ -7,14 +7,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypedDict, Unpack
 
 import numpy as np
 from PIL import Image
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.model.posterior import NONE_PRIOR
 from retrieval.model.touches import AnyImage, AnyTouches, GivenImage, read_grasps
 from retrieval.search.answer import Match, QueryResult
 
@@ -25,6 +24,15 @@ except ImportError as missing:
 
 _AS_PNG = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
 _REFUSED = frozenset({"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"})
+
+
+class QueryOptions(TypedDict, total=False):
+    """The keywords of `Searcher.query`, which says what they mean and what holds where one is left out."""
+
+    background: Sequence[AnyImage] | None
+    top: int
+    candidates: int | None
+    none_prior: float
 
 
 class Client:
@@ -59,82 +67,37 @@ class Client:
     ) -> None:
         self.close()
 
-    def query(
-        self,
-        touches: AnyTouches,
-        *,
-        background: Sequence[AnyImage] | None = None,
-        top: int = 10,
-        candidates: int | None = None,
-        none_prior: float = NONE_PRIOR,
-    ) -> QueryResult:
-        """`Searcher.query`, answered there. Paths are of this machine, `Match.photo_path` is of the other: `photo` gets
-        the picture. Raises what `Searcher.query` raises, and RetrievalError where no answer can be had."""
-        return self._ask("query", touches, background, top, candidates, none_prior)[0]
+    def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
+        """`Searcher.query` with its keywords, answered there. Paths are of this machine, `Match.photo_path` is of the
+        other: `photo` gets the picture. Raises what that raises, and RetrievalError where no answer can be had."""
+        return self._ask("query", touches, options)[0]
 
-    def query_growing(
-        self,
-        touches: AnyTouches,
-        *,
-        background: Sequence[AnyImage] | None = None,
-        top: int = 10,
-        candidates: int | None = None,
-        none_prior: float = NONE_PRIOR,
-    ) -> list[QueryResult]:
+    def query_growing(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> list[QueryResult]:
         """`Searcher.query_growing`, answered there; see `query`."""
-        return self._ask("query/growing", touches, background, top, candidates, none_prior)
+        return self._ask("query/growing", touches, options)
 
-    def query_many(
-        self,
-        objects: Sequence[AnyTouches],
-        *,
-        background: Sequence[AnyImage] | None = None,
-        top: int = 10,
-        candidates: int | None = None,
-        none_prior: float = NONE_PRIOR,
-    ) -> list[QueryResult]:
+    def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
         """`Searcher.query_many`, answered there; see `query`."""
         if not objects:
             return []
         asked = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
-        body = self._body(background, top, candidates, none_prior)
-        answers = self._post("query/batch", {"objects": [_encoded(grasps) for grasps in asked], **body})["answers"]
+        body = {"objects": [_encoded(grasps) for grasps in asked], **_said(options)}
+        answers = self._send("POST", "query/batch", json=body).json()["answers"]
         return [_result(answer, grasps) for answer, grasps in zip(answers, asked, strict=True)]
 
     def photo(self, match: Match) -> bytes:
         """The file of a match's photo. Raises BadInput where it is gone."""
         return self._send("GET", f"photos/{match.photo}").content
 
-    def _ask(
-        self,
-        path: str,
-        touches: AnyTouches,
-        background: Sequence[AnyImage] | None,
-        top: int,
-        candidates: int | None,
-        none_prior: float,
-    ) -> list[QueryResult]:
+    def _ask(self, path: str, touches: AnyTouches, options: QueryOptions) -> list[QueryResult]:
         grasps = self._grasps(touches)
-        body = self._body(background, top, candidates, none_prior)
-        answer = self._post(path, {"touches": _encoded(grasps), **body})
+        answer = self._send("POST", path, json={"touches": _encoded(grasps), **_said(options)}).json()
         return [_result(one, grasps) for one in answer.get("answers", [answer])]
 
     def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
         if self._fingers is None:
             self._fingers = int(self._send("GET", "index").json()["fingers"])
         return read_grasps(touches, self._fingers, of=of)
-
-    def _body(
-        self, background: Sequence[AnyImage] | None, top: int, candidates: int | None, none_prior: float
-    ) -> dict[str, Any]:
-        frames = None
-        if background is not None:
-            frames = [_base64(GivenImage(image, f"background {n}")) for n, image in enumerate(background, start=1)]
-        return {"background": frames, "top": top, "candidates": candidates, "none_prior": none_prior}
-
-    def _post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        answer: dict[str, Any] = self._send("POST", path, json=body).json()
-        return answer
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
         """The response; where the service is busy, it is asked again when it says so, until the time is over."""
@@ -173,6 +136,15 @@ def _result(answer: dict[str, Any], grasps: list[list[GivenImage]]) -> QueryResu
     result = QueryResult.from_dict(answer)
     names = [[image.name for image in grasp] for grasp in grasps]
     return replace(result, touches=names[: len(result.touches)])
+
+
+def _said(options: QueryOptions) -> dict[str, Any]:
+    """Of the body: what was said beside the touches."""
+    frames = options.get("background")
+    if frames is None:
+        return dict(options)
+    images = [GivenImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
+    return {**options, "background": [_base64(image) for image in images]}
 
 
 def _encoded(grasps: list[list[GivenImage]]) -> list[list[str]]:

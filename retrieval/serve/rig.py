@@ -18,7 +18,7 @@ from indexes.errors import IndexesError
 from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
-from retrieval.serve.service import Bench, Grasped
+from retrieval.serve.service import Grasped, LiveRig
 from robot.devices import TactileSensor
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
@@ -30,17 +30,17 @@ _FRESH = 10_000
 _TRIES = 20
 
 
-def of_rig(spec: str, index: Path) -> Bench:
+def of_rig(spec: str, index: Path) -> LiveRig:
     """The sensors of a rig, which are connected at once. Raises RobotError."""
     rig = load_rig(spec, seed=_seed(index) or 0)
     if isinstance(rig, SimRig):
         return _simulated(rig)
     for sensor in rig.sensors.values():
         sensor.connect()
-    return Bench({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
+    return LiveRig({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
 
 
-def of_index(index: Path) -> Bench | None:
+def of_index(index: Path) -> LiveRig | None:
     """The simulated rig, where the index shows its objects."""
     seed = _seed(index)
     return None if seed is None else _simulated(SimRig(seed))
@@ -87,10 +87,10 @@ class _Jaws:
             return _encoded(".jpg", self._gels[finger])
 
 
-def _simulated(rig: SimRig) -> Bench:
+def _simulated(rig: SimRig) -> LiveRig:
     jaws = _Jaws(rig)
     sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
-    return Bench(sensors, jaws.grasp)
+    return LiveRig(sensors, jaws.grasp)
 
 
 def _jpeg_of(sensor: TactileSensor, lock: Lock) -> bytes:

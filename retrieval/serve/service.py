@@ -28,8 +28,8 @@ class Grasped:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """What stands beside the service, as callables that may be asked from any thread.
+class LiveRig:
+    """What a rig gives the service (`retrieval.serve.rig`), as callables that may be asked from any thread.
 
     sensors: name -> the newest picture as a JPEG file. grasp: closes jaws on one of the objects of these names; None
     where nothing can be closed. Both may raise anything; the sentence is shown.
@@ -48,7 +48,7 @@ class Service:
     metrics: Metrics
     generations: Generations
     queue: Queue
-    bench: Bench
+    rig: LiveRig
     thumbnails: Thumbnails
     keeping: Keeping | None
     trials: Trials | None

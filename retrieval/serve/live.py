@@ -1,4 +1,4 @@
-"""The paths of what stands beside the service: live pictures of sensors, and jaws that close on something."""
+"""The paths of a live rig: pictures of its sensors as they come, and jaws that close on something."""
 
 import asyncio
 import base64
@@ -14,7 +14,7 @@ from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
 from retrieval.serve.service import Parts, Service
 
-router = APIRouter(tags=["bench"])
+router = APIRouter(tags=["live"])
 MOST_NAMES = 1000
 """Objects among which one is drawn to be grasped."""
 BOUNDARY = "picture"
@@ -25,7 +25,7 @@ Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at mos
 @router.post("/v1/grasp", responses=problems("unknown", "bad-input", "failed", "not-ready"))
 async def grasp(parts: Parts, name: Named = None) -> GraspDocument:
     """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random."""
-    close = parts.bench.grasp
+    close = parts.rig.grasp
     if close is None:
         raise Problem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
     names = await run_in_threadpool(_object_ids, parts.generations.current, name)
@@ -96,9 +96,9 @@ async def _pictures(parts: Service, name: str, first: bytes, pause_s: float) -> 
 
 
 async def _read(parts: Service, name: str) -> bytes:
-    read = parts.bench.sensors.get(name)
+    read = parts.rig.sensors.get(name)
     if read is None:
-        known = ", ".join(sorted(parts.bench.sensors)) or "none; name a rig with --rig"
+        known = ", ".join(sorted(parts.rig.sensors)) or "none; name a rig with --rig"
         raise Problem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
     try:
         return await run_in_threadpool(read)
