@@ -3,14 +3,16 @@
     python -m tests.shipped make FOLDER --init WEIGHTS   collect grasps, photos and presses of other objects each on the
                                                          simulated rig, teach both towers relief, train the matcher,
                                                          and store it as float16 in
-                                                         FOLDER/simulated-mobilenet.safetensors
+                                                         FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one
+                                                         for touches of one gel image, of the same grasps
     python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
                                                          recording and the features that `make` left in FOLDER
     python -m tests.shipped verdicts FOLDER              fit the posterior and the gel check of the shipped checkpoint
                                                          again, on its validation objects and as many training ones,
                                                          collected into FOLDER/verdicts
     python -m tests.shipped score FOLDER                 collect other objects into FOLDER/recording, and evaluate the
-                                                         shipped checkpoint on them: FOLDER/report
+                                                         shipped checkpoint on them: FOLDER/report; with --fingers 1
+                                                         that for one finger, in FOLDER/report-one-finger
 
 Simulated touches are no measure of what the method does on real sensors.
 """
@@ -80,6 +82,10 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
+    for job in (make, score):
+        job.add_argument(
+            "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
+        )
     for job in (make, verdicts, score):
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
@@ -103,20 +109,37 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         photos=str(folder / "photos"),
         touches=str(folder / "touches"),
     )
-    config = dataclasses.replace(config, training=training)
+    matcher = dataclasses.replace(config.matcher, fingers=arguments.fingers)
+    config = dataclasses.replace(config, matcher=matcher, training=training)
     grasps, towers = load_grasps(recording), frozen_matcher(config)
+    if arguments.fingers == 1:
+        grasps = [part for grasp in grasps for part in each_finger(grasp)]
     features, pairs = (
         encode_recording(part, towers, config, folder / "features") for part in (grasps, labelled_pairs(config))
     )
     split = draw_split(grasps, train=None, validation=VALIDATION)
     train, validation = features.of_objects(split.train).joined(pairs), features.of_objects(split.validation)
-    made = trained_checkpoint(Setting(config, folder=folder, quiet=False), train, validation)
+    trained = folder / f"{arguments.fingers}-fingers"
+    made = trained_checkpoint(Setting(config, folder=trained, quiet=False), train, validation)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
     # The split names whom a recording may not be judged on; no recording holds the pairs.
     made = dataclasses.replace(made, provenance=made.provenance | about, split=split)
     made = taught(made, train, validation, DISTIL_STEPS)
-    store(judging(made, grasps, features), folder / defaults.SHIPPED)
+    store(judging(made, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
     return 0
+
+
+def each_finger(grasp: Grasp) -> list[Grasp]:
+    """What each finger felt, as a grasp of its own."""
+    return [
+        dataclasses.replace(
+            grasp,
+            grasp_id=f"{grasp.grasp_id}-{finger}",
+            touches=grasp.touches[row : row + 1],
+            backgrounds=grasp.backgrounds[row : row + 1],
+        )
+        for row, finger in enumerate("ab")
+    ]
 
 
 def teach_towers(arguments: argparse.Namespace) -> int:
@@ -152,7 +175,7 @@ def judge_shipped(arguments: argparse.Namespace) -> int:
     )
     grasps = load_grasps(recording)
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED)
+    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
     return 0
 
 
@@ -172,7 +195,7 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
     assert shipped.split is not None
     train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
-    store(taught(shipped, train, validation, arguments.steps), arguments.folder / defaults.SHIPPED)
+    store(taught(shipped, train, validation, arguments.steps), arguments.folder / defaults.SHIPPED[2])
     return 0
 
 
@@ -202,10 +225,25 @@ def score_shipped(arguments: argparse.Namespace) -> int:
         return code
     split = recording.with_name("split.json")
     split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
-    model = arguments.model or defaults.shipped_model()
+    model = arguments.model or defaults.shipped_model(arguments.fingers)
     methods = "late_fusion,prune_rerank,chance"
     out = arguments.folder / "report"
+    if arguments.fingers == 1:
+        recording, out = first_finger(recording), arguments.folder / "report-one-finger"
     return retrieve("evaluate", recording, "--model", model, "--methods", methods, "--split", split, "--out", out)
+
+
+def first_finger(recording: Path) -> Path:
+    """A recording of the same grasps, of which one finger felt anything, beside `recording`; images are linked."""
+    out = recording.with_name(recording.name + "-one-finger")
+    out.mkdir(exist_ok=True)
+    if not (out / "images").exists():
+        (out / "images").symlink_to((recording / "images").resolve(), target_is_directory=True)
+    (out / "recording.json").write_bytes((recording / "recording.json").read_bytes())
+    lines = [json.loads(line) for line in (recording / "metadata.jsonl").read_text().splitlines()]
+    felt = [{name: value for name, value in line.items() if not name.startswith("touch_b_")} for line in lines]
+    (out / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in felt))
+    return out
 
 
 def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:

@@ -10,6 +10,7 @@ import pytest
 from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.model.stored import read_stored
 from retrieval.search import defaults
 
 
@@ -36,6 +37,15 @@ def an_index(folder):
 def test_what_is_given_is_taken_even_if_it_is_not_there():
     assert defaults.find_model("none.safetensors") == (Path("none.safetensors"), "given")
     assert defaults.find_index("none") == (Path("none"), "given")
+
+
+def test_shipped_models_are_named_by_the_fingers_that_they_take():
+    assert defaults.find_model("shipped")[0] == defaults.shipped_model()
+    assert defaults.find_model("shipped-one-finger")[0] == defaults.shipped_model(1)
+    for fingers in (1, 2):
+        assert read_stored(defaults.shipped_model(fingers)).config.matcher.fingers == fingers
+    with pytest.raises(BadInput, match="1 and of 2 gel images"):
+        defaults.shipped_model(3)
 
 
 def shipped_in(folder, monkeypatch):

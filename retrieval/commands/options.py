@@ -22,7 +22,12 @@ INIT_OF = "first weights of one tower alone: a file, as `train --task relief` wr
 SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
-Model = Annotated[str | None, typer.Option(help=f"checkpoint (default: {DEFAULT_MODEL})")]
+Model = Annotated[
+    str | None,
+    typer.Option(
+        help=f"checkpoint; shipped and shipped-one-finger name those of the package (default: {DEFAULT_MODEL})"
+    ),
+]
 InitPhoto = Annotated[str | None, typer.Option(help=INIT_OF)]
 InitTouch = Annotated[str | None, typer.Option(help=INIT_OF)]
 LabelledPhotos = Annotated[

@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from indexes.store.cluster import ClusterManifest
     from indexes.store.manifest import Manifest
 
-SHIPPED = "simulated-mobilenet.safetensors"
+SHIPPED = {2: "simulated-mobilenet.safetensors", 1: "simulated-mobilenet-one-finger.safetensors"}
+"""The checkpoints that come with the package, by the gel images of a touch."""
+NAMED = {"shipped": 2, "shipped-one-finger": 1}
+"""What they are called where a command takes a checkpoint."""
 INDEX = Path("index")
 """Where `build-index` writes and `query` looks, if nothing else is said."""
 
@@ -28,20 +31,26 @@ MOST_FOLDERS = 100
 """Of how many working folders it is remembered what was made there last."""
 
 
-def shipped_model() -> Path:
+def shipped_model(fingers: int = 2) -> Path:
     """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out.
+
+    fingers: gel images of a touch. Raises BadInput for more than two.
 
     >>> retrieval.shipped_model().name
     'simulated-mobilenet.safetensors'
     """
-    return Path(str(resources.files("retrieval") / "shipped" / SHIPPED))
+    if fingers not in SHIPPED:
+        raise BadInput(f"models for touches of 1 and of 2 gel images come with the package; got {fingers}")
+    return Path(str(resources.files("retrieval") / "shipped" / SHIPPED[fingers]))
 
 
 def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
 
-    Raises CheckpointError where there is none, or where that of `index` is gone.
+    given: a path, or one of `NAMED`. Raises CheckpointError where there is none, or where that of `index` is gone.
     """
+    if given in NAMED:
+        return shipped_model(NAMED[given]), "shipped; trained on the simulated rig"
     if given is not None:
         return Path(given), "given"
     from indexes.errors import IndexesError
