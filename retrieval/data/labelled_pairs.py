@@ -20,6 +20,7 @@ WEIGHTS = (2.0, 1.0, 1.0, 0.5)
 """Of the squared differences in `LabelledPicture.learnt_sizes`, each in standard deviations; a pitch is felt and
 seen best."""
 OTHER_SHAPE = 3.0
+"""How far apart two objects of different shapes are, in the same unit."""
 
 
 def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:

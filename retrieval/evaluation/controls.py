@@ -34,10 +34,8 @@ def control_experiments(experiment: Experiment, material: Material, cache: Path,
     folder, unfitted = experiment.folder / "controls", dataclasses.replace(experiment, checkpoint=None)
     experiments = {"shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True)}
     grasps = thinned(material.grasps, MOST_GRASPS)
-    queries, pairs = (
-        draw_queries(grasps, material.split, seed),
-        material.pairs[:: len(material.pairs) // MOST_PAIRS + 1],
-    )
+    queries = draw_queries(grasps, material.split, seed)
+    pairs = material.pairs[:: len(material.pairs) // MOST_PAIRS + 1]
     for variant in ("before", "blurred"):
         if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue

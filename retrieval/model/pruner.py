@@ -16,9 +16,9 @@ from torch.nn import functional
 class Pruner(nn.Module):
     """One network with one hidden layer for each modality; the inner product of their outputs orders photos."""
 
-    def __init__(self, hidden: int, width: int, embedding_dim: int) -> None:
+    def __init__(self, half: int, width: int, embedding_dim: int) -> None:
         super().__init__()
-        self._touch, self._photo = (_student(hidden, width, embedding_dim) for _ in range(2))
+        self._touch, self._photo = (_student(half, width, embedding_dim) for _ in range(2))
 
     def touch(self, half: Tensor) -> Tensor:
         """Embeddings (B, embedding_dim) of norm 1 of touch halves (B, half)."""
@@ -47,7 +47,7 @@ class Pruner(nn.Module):
 
 
 class Spread(NamedTuple):
-    """Mean (hidden,) of halves, and one standard deviation for all their units."""
+    """Mean (half,) of halves, and one standard deviation for all their units."""
 
     mean: Tensor
     scale: Tensor
@@ -63,5 +63,5 @@ class Spread(NamedTuple):
         return (halves - self.mean) / self.scale
 
 
-def _student(hidden: int, width: int, embedding_dim: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(hidden, width), nn.ReLU(), nn.Linear(width, embedding_dim))
+def _student(half: int, width: int, embedding_dim: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(half, width), nn.ReLU(), nn.Linear(width, embedding_dim))
