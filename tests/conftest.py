@@ -123,8 +123,8 @@ def searcher(index: Path) -> Iterator[Any]:
 @pytest.fixture
 def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The number of photos in each batch that went through the photo tower in this process."""
+    from retrieval.model import photo_encoder
     from retrieval.model.encode import encode_photos
-    from retrieval.search import embed
 
     sizes: list[int] = []
 
@@ -133,7 +133,7 @@ def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(len(photos))
         return encode_photos(matcher, photos, batch)
 
-    monkeypatch.setattr(embed, "encode_photos", counted)
+    monkeypatch.setattr(photo_encoder, "encode_photos", counted)
     return sizes
 
 

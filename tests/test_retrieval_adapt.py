@@ -9,6 +9,7 @@ import torch
 
 import retrieval
 from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
+from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, told
 from retrieval.adaptation.maps import RIDGES, Affine, fit_codes
 from retrieval.adaptation.material import config_for, encode, take_over
@@ -104,7 +105,8 @@ def test_places_of_hand_made_scores():
 
 
 @pytest.mark.slow
-def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path):
+def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path, monkeypatch):
+    monkeypatch.setattr(Estimate, "keeps_the_model", False)
     out = tmp_path / "own.safetensors"
     material, _ = adapt(recording, out, load_checkpoint(model), init="none", quiet=True)
     made = load_checkpoint(out)
@@ -125,7 +127,32 @@ def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogu
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tmp_path):
+def test_a_model_that_knows_more_than_a_fit_is_kept_and_its_probabilities_are_fitted(
+    recording, model, tmp_path, monkeypatch
+):
+    start = load_checkpoint(model)
+    _, estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True)
+    assert estimate.keeps_the_model == (
+        estimate.known_below.by_object()[1].mean() >= estimate.below.by_object()[1].mean()
+    )
+    monkeypatch.setattr(Estimate, "keeps_the_model", True)
+    _, estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True)
+    made = load_checkpoint(tmp_path / "own.safetensors")
+    assert "it is kept" in estimate.lines()[-1]
+    assert made.config == start.config
+    for name, tensor in start.matcher.state_dict().items():
+        assert torch.equal(tensor, made.matcher.state_dict()[name])
+    assert made.posterior != start.posterior
+    assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
+    other = dataclasses.replace(estimate, folds=estimate.folds)
+    object.__setattr__(other.known.start.config.matcher, "fingers", 1)
+    monkeypatch.undo()
+    assert not other.keeps_the_model  # of another number of fingers
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Estimate, "keeps_the_model", False)
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
     material, _ = adapt(

@@ -6,23 +6,22 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from indexes.store.files import write_atomically
-from retrieval.adaptation.folds import Blocks, Fold, draw_folds, first_guesses, measure, told
+from retrieval.adaptation.folds import Blocks, Fold, draw_folds, first_guesses, measure
 from retrieval.adaptation.maps import RIDGES, fit_codes
 from retrieval.adaptation.material import Material, widths_of
+from retrieval.adaptation.start import AsItIs
 from retrieval.console.files import MARKED
 from retrieval.console.progress import Bar
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.fusion import Matcher, score_halves
 from retrieval.model.towers.side_by_side import SideBySide
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, percent_axis
-from retrieval.training.features import Features, encode_recording
+from retrieval.training.features import Features
 from retrieval.version import __version__
 
 OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
@@ -81,7 +80,8 @@ def learning_curve(
     if isinstance(material.matcher.touch_tower, SideBySide):
         for place, name in enumerate((TAUGHT, PUBLISHED)):
             tried.append((name, *one_tower(material, place), objects[-1], touches[-1]))
-    points = [_as_it_is(material, start, folds, cache, quiet)]
+    known = AsItIs.of(start, material.grasps, cache, quiet).told(folds)
+    points = [Point.of(AS_IT_IS, 0, 0, measure(known, "first"), measure(known, "below"))]
     with Bar("learning curve", len(tried), "fits", quiet=quiet) as bar:
         for what, shown, widths, count, each in tried:
             points.append(_point(what, shown, widths, folds, count, each, seed))
@@ -123,27 +123,6 @@ def one_tower(material: Material, place: int) -> tuple[Features, Blocks]:
     touch, photo = part(features.touch, felt, fingers), part(features.photo, seen, matcher.views)
     alone = replace(features, touch=touch, photo=photo.reshape(len(photo), -1))
     return alone, ([felt[place]] * fingers, [seen[place]] * matcher.views)
-
-
-def _as_it_is(
-    material: Material, start: Checkpoint, folds: Sequence[Sequence[str]], cache: Path | None, quiet: bool
-) -> Point:
-    """The start with nothing fitted; a touch of fewer fingers than it takes is given to each of them."""
-    fingers, wanted = material.config.matcher.fingers, start.config.matcher.fingers
-    config = replace(start.config, matcher=replace(start.config.matcher, fingers=fingers))
-    seen = Matcher(config.matcher, start.matcher.views).eval()
-    seen.touch_tower, seen.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
-    features = encode_recording(material.grasps, seen, config, cache, quiet=quiet)
-    parts = []
-    for fold in folds:
-        asked = features.of_objects(fold)
-        touch = np.resize(asked.touch.transpose(1, 0, 2), (wanted, *asked.touch.shape[::2])).transpose(1, 0, 2)
-        with torch.inference_mode():
-            felt = start.matcher.touch_code(torch.from_numpy(touch.reshape(len(asked), -1).copy())).half
-            photo = start.matcher.photo_code(torch.from_numpy(asked.photo)).half.numpy()
-        scores = np.stack([score_halves(start.matcher.head, half[None], photo) for half in felt])
-        parts.append(told(scores, asked))
-    return Point.of(AS_IT_IS, 0, 0, measure(parts, "first"), measure(parts, "below"))
 
 
 def write_curve(folder: Path, points: Sequence[Point]) -> Path:

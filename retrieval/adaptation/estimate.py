@@ -1,14 +1,17 @@
 """What a fit is worth: first guesses on own objects that were left out of it, beside the same of blurred touches."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from retrieval.adaptation.folds import Fold, best_ridge, draw_folds, first_guesses, fit_folds, measure
 from retrieval.adaptation.material import Material
+from retrieval.adaptation.start import AsItIs
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
 
 
@@ -17,14 +20,25 @@ class Estimate:
     """What the fit is worth on objects left out; the same of blurred touches is the control.
 
     ridge: the one chosen. folds: the fits behind it. first, below: first guesses among a fold's objects, and pairs.
+    known: the model that one starts from, with nothing fitted; known_first, known_below: what it is worth.
     """
 
     ridge: float
     folds: list[Fold]
+    known: AsItIs
     first: Measure
     below: Measure
     blurred_first: Measure
     blurred_below: Measure
+    known_first: Measure
+    known_below: Measure
+
+    @property
+    def keeps_the_model(self) -> bool:
+        """Whether the model as it is tells these objects apart better than the fit does. One for another number of
+        fingers cannot be kept."""
+        fingers = self.known.start.config.matcher.fingers == self.folds[0].left_out.touch.shape[1]
+        return fingers and mean(self.known_below) >= mean(self.below)
 
     def lines(self) -> list[str]:
         """For people."""
@@ -37,6 +51,10 @@ class Estimate:
                 f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
             )
         lines.append("  " + self.verdict)
+        known = [interval(summarise([each])) for each in (self.known_first, self.known_below)]
+        lines.append(f"the model as it is: first guess {known[0]}, pair accuracy {known[1]}")
+        if self.keeps_the_model:
+            lines.append("  it is kept: a fit to these objects knows less; its probabilities are fitted to them")
         return lines
 
     @property
@@ -50,12 +68,19 @@ class Estimate:
     def to_dict(self) -> dict[str, float]:
         """As the checkpoint keeps it."""
         return {
-            "left_out_first_guess": float(self.first.by_object()[1].mean()),
-            "left_out_first_guess_blurred": float(self.blurred_first.by_object()[1].mean()),
+            "left_out_first_guess": mean(self.first),
+            "left_out_first_guess_blurred": mean(self.blurred_first),
             "left_out_first_guess_chance": float(self.first.chance[0]),
-            "left_out_pair_accuracy": float(self.below.by_object()[1].mean()),
-            "left_out_pair_accuracy_blurred": float(self.blurred_below.by_object()[1].mean()),
+            "left_out_pair_accuracy": mean(self.below),
+            "left_out_pair_accuracy_blurred": mean(self.blurred_below),
+            "as_it_is_first_guess": mean(self.known_first),
+            "as_it_is_pair_accuracy": mean(self.known_below),
         }
+
+
+def mean(measure: Measure) -> float:
+    """Over objects."""
+    return float(measure.by_object()[1].mean())
 
 
 def interval(summary: dict[str, Any]) -> str:
@@ -64,7 +89,7 @@ def interval(summary: dict[str, Any]) -> str:
 
 
 @one_thread()
-def judge(material: Material, *, seed: int, quiet: bool) -> Estimate | None:
+def judge(material: Material, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool) -> Estimate | None:
     """The estimate from objects left out; None where there are too few of them."""
     try:
         drawn = draw_folds(material.grasps, seed)
@@ -78,8 +103,7 @@ def judge(material: Material, *, seed: int, quiet: bool) -> Estimate | None:
     )
     ridge, its = best_ridge(folds), best_ridge(blurred)
     told, control = [first_guesses(fold, ridge) for fold in folds], [first_guesses(fold, its) for fold in blurred]
-    return Estimate(
-        ridge,
-        folds,
-        *(measure(parts, column) for parts in (told, control) for column in ("first", "below")),
-    )
+    known = AsItIs.of(start, material.grasps, cache, quiet)
+    rows = (told, control, known.told(drawn))
+    measures = (measure(parts, column) for parts in rows for column in ("first", "below"))
+    return Estimate(ridge, folds, known, *measures)

@@ -12,14 +12,15 @@ from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import Fold
 from retrieval.adaptation.maps import Affine, Codes, fit_codes
 from retrieval.adaptation.material import Material
-from retrieval.data.dataset import Split, data_digest
+from retrieval.adaptation.start import first_rows
+from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 from retrieval.training.batches import FrozenFeatures
-from retrieval.training.features import by_image
+from retrieval.training.features import Features, by_image
 from retrieval.training.judgement import with_verdicts
 
 MOST_JUDGED = 60
@@ -94,16 +95,30 @@ def _float(values: np.ndarray[Any, Any]) -> Tensor:
 
 
 def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
-    """With the check of touches, whose thresholds come from half of the objects, and with the posterior of the folds:
-    codes know the objects that they were fitted on too well to say what a match is worth."""
-    device = default_device()
-    source = FrozenFeatures(made.config, device, by_image(material.grasps, material.features, device))
-    names = sorted({grasp.object_id for grasp in material.grasps})
-    halves = [[grasp for grasp in material.grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    made.matcher.to(device)
-    with source:
-        made = with_verdicts(made, source, *halves, quiet=quiet)
+    """With the check of touches, and with the posterior of the folds: codes know the objects that they were fitted on
+    too well to say what a match is worth."""
+    made = _checked(made, material.grasps, material.features, quiet)
     return dataclasses.replace(made, posterior=_posterior(made.matcher, estimate) if estimate else None)
+
+
+def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
+    """The model as it is, with a check of touches and a posterior of own objects."""
+    made = _checked(start, material.grasps, estimate.known.features, quiet)
+    folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
+    about = {"source": material.source, "data_digest": data_digest(material.grasps)}
+    provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
+    posterior = fit_posterior(*estimate.known.judged(folds, MOST_JUDGED))
+    return dataclasses.replace(made, provenance=provenance, posterior=posterior)
+
+
+def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
+    """With a check of touches, whose thresholds come from half of the objects."""
+    device = default_device()
+    names = sorted({grasp.object_id for grasp in grasps})
+    halves = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    made.matcher.to(device)
+    with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
+        return with_verdicts(made, source, *halves, quiet=quiet)
 
 
 def _posterior(matcher: Matcher, estimate: Estimate) -> Posterior:
@@ -111,8 +126,8 @@ def _posterior(matcher: Matcher, estimate: Estimate) -> Posterior:
     scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
     parts = []
     for fold in estimate.folds:
-        owner = fold.left_out.owner
-        rows = np.concatenate([np.flatnonzero(owner == name)[:MOST_JUDGED] for name in range(owner.max() + 1)])
+        rows = first_rows(fold.left_out, MOST_JUDGED)
         logits = scale * fold.cosines(estimate.ridge)[np.ix_(rows, rows)] + offset
-        parts.append(JudgedTouches(logits, owner[rows], owner[rows], np.eye(len(rows), dtype=np.bool_)))
+        owner = fold.left_out.owner[rows]
+        parts.append(JudgedTouches(logits, owner, owner, np.eye(len(rows), dtype=np.bool_)))
     return fit_posterior(*parts)

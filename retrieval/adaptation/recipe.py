@@ -8,7 +8,7 @@ and every number that is told of it comes from objects that were left out of the
 from pathlib import Path
 
 from retrieval.adaptation.estimate import Estimate, judge
-from retrieval.adaptation.fitting import fitted, judged
+from retrieval.adaptation.fitting import fitted, judged, kept
 from retrieval.adaptation.material import Material, encode
 from retrieval.data.dataset import Split
 from retrieval.model.checkpoint import Checkpoint, require_writable, store_checkpoint
@@ -25,7 +25,8 @@ def adapt(
     seed: int = 0,
     quiet: bool = False,
 ) -> tuple[Material, Estimate | None]:
-    """Fit the towers of `start` to a recording of another sensor and own objects, and write the checkpoint `out`.
+    """Fit the towers of `start` to a recording of another sensor and own objects, and write the checkpoint `out`; where
+    `start` as it is tells objects that were left out apart better than the fit, it is kept, its probabilities fitted.
 
     init: published weights whose tower stands beside those of the start ("imagenet", a file, or "none"). split: its
     test objects are left out of everything. cache: where features are kept, so that a run which was stopped goes on.
@@ -34,8 +35,10 @@ def adapt(
     """
     require_writable(out)
     material = encode(recording, start, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
-    estimate = judge(material, seed=seed, quiet=quiet)
-    made = fitted(material, estimate, out)
-    made = judged(made, material, estimate, quiet=quiet)
+    estimate = judge(material, start, cache=cache, seed=seed, quiet=quiet)
+    if estimate and estimate.keeps_the_model:
+        made = kept(start, material, estimate, quiet=quiet)
+    else:
+        made = judged(fitted(material, estimate, out), material, estimate, quiet=quiet)
     store_checkpoint(made, out)
     return material, estimate

@@ -14,7 +14,9 @@ def adapt(
     recording: Recording,
     *,
     out: Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")],
-    model: Annotated[Path | None, typer.Option(help="checkpoint to start from (default: the shipped one)")] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="checkpoint to start from (default: the shipped one of as many fingers)")
+    ] = None,
     init: Annotated[
         str,
         typer.Option(help="published weights whose tower stands beside those of the model: imagenet, a file, or none"),
@@ -31,12 +33,14 @@ def adapt(
     """Fit a model to a new sensor and own objects; minutes on two cores."""
     from retrieval.adaptation.curve import learning_curve, write_curve
     from retrieval.adaptation.recipe import adapt as fit
+    from retrieval.data.dataset import finger_count, load_grasps
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.search import defaults
 
     if report:
         require_ours(report / "curve.md", TEXT)
-    start = load_checkpoint(model or defaults.shipped_model())
+    fingers = finger_count(load_grasps(recording))
+    start = load_checkpoint(model or defaults.shipped_model(min(fingers, 2)))
     material, estimate = fit(recording, out, start, init=init, split=read_split(split), cache=cache, seed=seed)
     defaults.remember("model", out)
     for line in estimate.lines() if estimate else ():

@@ -18,7 +18,7 @@ from retrieval.console.files import EXPORT, require_ours
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
-from retrieval.model.fusion import Matcher
+from retrieval.model.fusion import Matcher, Standardise
 from retrieval.model.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, sealed
 
 ROUNDS = 9
@@ -75,25 +75,35 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
 
 def graph_of(checkpoint: Checkpoint) -> bytes:
     """The touch encoder as an ONNX model that carries the checkpoint's digest; any number of touches at once."""
+    side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
+    outputs = ["half", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
+    return _traced(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint.digest)
+
+
+def photo_graph_of(checkpoint: Checkpoint) -> bytes:
+    """The same of the photo encoder: images (B, H, views * W, 3) to halves and embeddings."""
+    side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
+    encoder = _PhotoEncoder(checkpoint.matcher)
+    return _traced(encoder, (side, views * side, 3), ["half", "embedding"], checkpoint.digest)
+
+
+def _traced(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], digest: str) -> bytes:
     import onnx
 
-    side = checkpoint.config.preprocessing.touch_px
-    example = torch.zeros(1, checkpoint.config.matcher.fingers, side, side, 3)
-    outputs = ["half", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter by tracing is the old one; the new one needs one more package
         torch.onnx.export(
-            _TouchEncoder(checkpoint.matcher).eval(),  # the exporter leaves modules, shared ones too, as it found this
-            (example,),
+            encoder.eval(),  # the exporter leaves modules, shared ones too, as it found this
+            (torch.zeros(1, *shape),),
             str(Path(folder, "model.onnx")),
             input_names=["images"],
             output_names=outputs,
-            dynamic_axes={name: {0: "touches"} for name in ("images", *outputs)},
+            dynamic_axes={name: {0: "items"} for name in ("images", *outputs)},
             opset_version=18,
             dynamo=False,
         )
         model = onnx.load_model(str(Path(folder, "model.onnx")))
-    onnx.helper.set_model_props(model, {CHECKPOINT: checkpoint.digest})
+    onnx.helper.set_model_props(model, {CHECKPOINT: digest})
     return bytes(model.SerializeToString())
 
 
@@ -103,9 +113,7 @@ class _TouchEncoder(nn.Module):
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.matcher = for_inference(matcher, ["touch_tower"])
-        if isinstance(matcher.touch_norm, nn.BatchNorm1d):
-            self.matcher.add_module("touch_norm", _FixedNorm(matcher.touch_norm))
+        self.matcher = _written_out(matcher, "touch")
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower = self.matcher.touch_tower
@@ -116,12 +124,37 @@ class _TouchEncoder(nn.Module):
         return (code.half, code.embedding) if readings is None else (code.half, code.embedding, readings)
 
 
-class _FixedNorm(nn.Module):
-    """Batch normalisation in evaluation mode, written out: the exporter wants to know the width of its input."""
+class _PhotoEncoder(nn.Module):
+    """Images (B, H, views * W, 3) to halves and embeddings."""
 
-    def __init__(self, norm: nn.BatchNorm1d) -> None:
+    def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.mean, self.scale = norm.get_buffer("running_mean"), torch.rsqrt(norm.get_buffer("running_var") + norm.eps)
+        self.matcher = _written_out(matcher, "photo")
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        tower, views = self.matcher.photo_tower, self.matcher.views
+        side = images.shape[1]
+        pictures = images.reshape(-1, side, views, side, 3).permute(0, 2, 4, 1, 3).flatten(0, 1)
+        features = tower._encode((pictures - tower.mean) / tower.std)
+        code = self.matcher.photo_entry(features.reshape(-1, views * tower.feature_count))
+        return code.half, code.embedding
+
+
+def _written_out(matcher: Matcher, side: str) -> Matcher:
+    """A matcher whose tower is folded, and whose normalisation of features is plain arithmetic."""
+    fast = for_inference(matcher, [f"{side}_tower"])
+    norm = matcher.get_submodule(f"{side}_norm")
+    if isinstance(norm, Standardise):
+        fast.add_module(f"{side}_norm", _FixedNorm(norm))
+    return fast
+
+
+class _FixedNorm(nn.Module):
+    """Normalisation of features in evaluation mode: the exporter wants to know the width of its input."""
+
+    def __init__(self, norm: Standardise) -> None:
+        super().__init__()
+        self.mean, self.scale = norm.mean_and_scale()
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self.mean) * self.scale

@@ -53,13 +53,19 @@ class Standardise(nn.BatchNorm1d):
     def forward(self, features: Tensor) -> Tensor:
         """(B, F) of features (B, F)."""
         scaled: Tensor = super().forward(features)
-        mean, variance = self.running_mean, self.running_var
+        mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
         if self.training:
             variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
-        assert mean is not None
-        assert variance is not None
-        least = (QUIET * mean).square()
-        return scaled * ((variance + self.eps) / torch.maximum(variance + self.eps, least)).sqrt()
+        return scaled * ((variance + self.eps) / self._raised(mean, variance)).sqrt()
+
+    def mean_and_scale(self) -> tuple[Tensor, Tensor]:
+        """mean (F,) and scale (F,): in evaluation mode this is `(features - mean) * scale`."""
+        mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
+        return mean, torch.rsqrt(self._raised(mean, variance))
+
+    def _raised(self, mean: Tensor, variance: Tensor) -> Tensor:
+        """(F,) variances, those of quiet features raised."""
+        return torch.maximum(variance + self.eps, (QUIET * mean).square())
 
 
 class FusionHead(nn.Module):

@@ -78,10 +78,15 @@ os.register_at_fork(after_in_child=_leave_alone)
 
 
 def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
+    return open_session(unsealed(path), str(path), checkpoint, threads)
+
+
+def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) -> Any:
+    """ONNX Runtime on a model in memory, called `name` where it is of no use. Raises CheckpointError where it cannot be
+    opened or is of another checkpoint."""
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent; and no fork waits for its thread at the end
     import onnxruntime
 
-    model = unsealed(path)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or 0
     # Its threads would spin after a run, on the cores that decode the next images or judge candidates.
@@ -89,10 +94,10 @@ def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # its errors have no common base
-        raise CheckpointError(f"{path} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
+        raise CheckpointError(f"{name} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
     made_from = session.get_modelmeta().custom_metadata_map.get(CHECKPOINT, "unknown")
     if made_from != checkpoint:
-        raise CheckpointError(f"{path} is the export of another checkpoint ({made_from[:12]})")
+        raise CheckpointError(f"{name} is the export of another checkpoint ({made_from[:12]})")
     _sessions.add(session)
     return session
 

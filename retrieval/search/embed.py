@@ -22,7 +22,8 @@ from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import Image, batches, encode_photos, one_thread
+from retrieval.model.encode import Image, batches, default_device, one_thread
+from retrieval.model.photo_encoder import fastest, on_torch
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -30,6 +31,8 @@ R = TypeVar("R")
 BATCH = 16
 READ = 32
 """Files that a thread reads at a time: what a task costs by itself is a tenth of reading and hashing a photo."""
+MANY = 256
+"""New photos from which on a faster encoder is looked for, which takes as long as encoding a hundred."""
 HELD = 256
 """Embeddings that were made before and stand in one part, at most: what waits between threads stays small."""
 
@@ -94,6 +97,7 @@ class Embedder:
         self.objects: Counter[str] = Counter()
         self.photos, self.embedded, self.resumed, self.renamed, self.known = 0, 0, 0, 0, 0
         self.half_error = 0.0
+        self._encode_photos = on_torch(checkpoint)
 
     @property
     def removed(self) -> int:
@@ -105,6 +109,9 @@ class Embedder:
         halves that float16 cannot hold."""
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
+        new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
+        if new >= MANY and default_device().type == "cpu":
+            self._encode_photos = fastest(self.checkpoint)
         lists = batches(catalogue.photos, READ)
         found = ahead(lambda photos: self._find(catalogue, photos), lists, threads, 2 * threads)
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
@@ -202,9 +209,8 @@ class Embedder:
         """Encode the images of these rows, and keep what comes of it against a sudden end."""
         if not images:
             return {}
-        with one_thread():
-            code = encode_photos(self.checkpoint.matcher, images, BATCH)
-        halves, embeddings, names = code.half.numpy(), code.embedding.numpy(), [row["id"] for row in rows]
+        halves, embeddings = self._encode_photos(images)
+        names = [row["id"] for row in rows]
         largest = np.abs(halves).max(axis=1)
         if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
             raise NumericalError(

@@ -1,0 +1,83 @@
+"""The photo encoder of a long build: ONNX Runtime where it is installed, gives the same and is faster here."""
+
+import logging
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import CheckpointError
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import Image, encode_photos, one_thread
+from retrieval.model.onnx_encoder import open_session
+
+log = logging.getLogger(__name__)
+Floats = NDArray[np.float32]
+ROUNDS, SAMPLE = 3, 8
+TOLERANCE = 2e-4
+"""Largest difference of a half from PyTorch's, relative to the largest half: float16, in which it is stored, rounds by
+more."""
+
+
+class PhotoCodes(NamedTuple):
+    """What an index keeps of photos: halves (B, half) and embeddings (B, embedding_dim)."""
+
+    half: Floats
+    embedding: Floats
+
+
+PhotoEncoder = Callable[[Sequence[Image]], PhotoCodes]
+"""Of images (H, views * W, 3); it computes on the thread that calls it, and several may call it at once."""
+
+
+def on_torch(checkpoint: Checkpoint) -> PhotoEncoder:
+    """By the checkpoint's own towers."""
+
+    def encode(images: Sequence[Image]) -> PhotoCodes:
+        with one_thread():
+            code = encode_photos(checkpoint.matcher, images, len(images))
+        return PhotoCodes(code.half.numpy(), code.embedding.numpy())
+
+    return encode
+
+
+def on_onnx(checkpoint: Checkpoint) -> PhotoEncoder | None:
+    """By ONNX Runtime; None where it or `onnx` is not installed, or cannot run these towers."""
+    if any(find_spec(name) is None for name in ("onnx", "onnxruntime")):
+        return None
+    from retrieval.model.export import photo_graph_of
+
+    try:
+        session = open_session(photo_graph_of(checkpoint), "the photo encoder", checkpoint.digest, threads=1)
+    except CheckpointError as error:
+        log.warning("%s; PyTorch encodes the photos", error)
+        return None
+    return lambda images: PhotoCodes(*session.run(None, {"images": np.stack(images)}))
+
+
+def fastest(checkpoint: Checkpoint) -> PhotoEncoder:
+    """The faster one of both, PyTorch unless the other gives the same halves. Not to be called while other threads
+    encode: they would be traced along."""
+    settings = checkpoint.config.preprocessing
+    shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
+    images = list(np.random.default_rng(0).random(shape, dtype=np.float32))
+    torch, onnx = on_torch(checkpoint), on_onnx(checkpoint)
+    if onnx is None:
+        return torch
+    half, other = torch(images).half, onnx(images).half
+    if not np.abs(half - other).max() <= TOLERANCE * np.abs(half).max():
+        log.warning("ONNX Runtime gives other halves than PyTorch, which encodes the photos")
+        return torch
+    times = [[_seconds(each, images) for each in (torch, onnx)] for _ in range(ROUNDS)]
+    ours, theirs = (statistics.median(arm) for arm in zip(*times, strict=True))
+    return onnx if theirs < ours else torch
+
+
+def _seconds(encode: PhotoEncoder, images: Sequence[Image]) -> float:
+    start = time.thread_time()
+    encode(images)
+    return time.thread_time() - start
