@@ -51,7 +51,7 @@ VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
 VERDICT_GRASPS = 4
 """Of each object on which the posterior and the gel check are fitted."""
-FOREIGN = 2800
+FOREIGN = 8000
 """Pictures that are no gels, from which its check of touches learns: more than a training's own."""
 DISTIL_STEPS = 1500
 """Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
