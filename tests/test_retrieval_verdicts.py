@@ -3,7 +3,6 @@
 import json
 import shutil
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,9 @@ from PIL import Image
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.model.posterior import Posterior
+from retrieval.model.stored import read_stored
 from retrieval.search.answer import EXIT_CODES, in_words
+from retrieval.search.defaults import SHIPPED, shipped_model
 from retrieval.search.searcher import Searcher
 from robot.collect import CollectSettings, collect
 from robot.rig import load_rig
@@ -156,9 +157,13 @@ def test_objects_that_were_not_judged_keep_their_share(index, grasps):
         assert total + pruned.posterior["unjudged_probability"] == pytest.approx(1)
 
 
-def test_the_shipped_checkpoint_says_how_often_its_check_errs():
-    card = (Path("retrieval") / "shipped" / "simulated-mobilenet.md").read_text("utf-8")
-    assert "Check of gel images, on validation objects: touches called foreign 0.0" in card
+@pytest.mark.parametrize("fingers", SHIPPED)
+def test_the_card_of_a_shipped_checkpoint_is_its_own_and_says_how_often_its_check_errs(fingers):
+    path = shipped_model(fingers)
+    stored, card = read_stored(path), path.with_suffix(".md").read_text("utf-8")
+    assert card.startswith(f"# {path.name}")
+    assert stored.provenance["data_digest"][:16] in card
+    assert f"touches called foreign {stored.gel_check.shares['touches_called_foreign']:.3f}" in card
 
 
 def test_a_model_without_a_posterior_ranks_and_says_that_it_is_uncalibrated(index, grasps, monkeypatch):
