@@ -61,10 +61,10 @@ def test_a_demo_that_serves_opens_a_page_that_asks_its_index(finished, capsys, m
     assert served[0].settings.index == finished / "index"
     assert served[0].trials.folder == finished / "recording"
     names = sorted(path.name for path in (finished / "catalog").iterdir())
-    felt = served[0].bench.grasp(names)
+    felt = served[0].rig.grasp(names)
     assert felt.object_id in names
     assert [image[:4] for image in (*felt.touches, *felt.background)] == [b"\x89PNG"] * 4
-    assert served[0].bench.sensors["a"]()[:2] == b"\xff\xd8"
+    assert served[0].rig.sensors["a"]()[:2] == b"\xff\xd8"
     said = capsys.readouterr().err
     assert f"$ retrieve serve --index {finished / 'index'} --trials {finished / 'recording'} --open-page" in said
 

@@ -22,13 +22,14 @@ PHOTOS, BATCH = 24, 4
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
+from retrieval.model import photo_encoder
 from retrieval.search import embed
 from retrieval.search.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 
 catalogue, model, index, fatal, batch = sys.argv[1:]
 torch.set_num_threads(1)
-embed.BATCH, encode, calls = int(batch), embed.encode_photos, []
+embed.BATCH, encode, calls = int(batch), photo_encoder.encode_photos, []
 
 def counted(*arguments):
     calls.append(1)
@@ -36,7 +37,7 @@ def counted(*arguments):
         os.kill(os.getpid(), signal.SIGKILL)
     return encode(*arguments)
 
-embed.encode_photos = counted
+photo_encoder.encode_photos = counted
 build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=True)
 """
 

@@ -158,8 +158,8 @@ def test_masses_of_parts_give_the_probabilities_of_the_whole():
 def test_objects_of_which_nothing_is_known_weigh_what_the_others_do_on_average():
     mass = STEEP.mass([0.0, math.log(3)], unjudged=1, sample=[math.log(2)]).extended(6)
     assert mass.objects == 9
-    assert math.exp(mass.judged) == pytest.approx(1 + 9)
-    assert math.exp(mass.unjudged) == pytest.approx(4 + 6 * (1 + 9 + 4) / 3)
+    assert math.exp(mass.judged + mass.top) == pytest.approx(1 + 9)
+    assert math.exp(mass.unjudged + mass.top) == pytest.approx(4 + 6 * (1 + 9 + 4) / 3)
     assert STEEP.mass([1.0]).extended(0) == STEEP.mass([1.0])
 
 

@@ -309,7 +309,7 @@ def test_other_wrong_settings_are_refused():
 
 
 def test_an_unknown_optics_lists_the_known_ones():
-    with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, led"):
+    with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, grey, led"):
         draw_sensor(0, "a", optics="lamp")
     with pytest.raises(UnknownName, match="known are gelsight, gelsight_mini"):
         load_fitted("../gelsight")

@@ -57,22 +57,26 @@ class Belief:
 
 @dataclass(frozen=True)
 class Mass:
-    """What objects of a catalogue, or of a part of one, weigh together: logs of their sums of exp(w * logit).
+    """What objects of a catalogue, or of a part of one, weigh together: logs of their sums of exp(w * logit - top).
 
     judged: of those that were judged; unjudged: of the others, as a sample of them says. objects: how many of both.
+    top: the largest w * logit, told apart: in a sum with it the others' digits would be lost.
     """
 
     judged: float
     unjudged: float
     objects: int
+    top: float
 
     @classmethod
     def joined(cls, masses: Sequence["Mass"]) -> "Mass":
         """Of several parts, one at least, that have no object in common."""
+        top = max(mass.top for mass in masses)
         return cls(
-            float(np.logaddexp.reduce([mass.judged for mass in masses])),
-            float(np.logaddexp.reduce([mass.unjudged for mass in masses])),
+            float(np.logaddexp.reduce([mass.judged + (mass.top - top) for mass in masses])),
+            float(np.logaddexp.reduce([mass.unjudged + (mass.top - top) for mass in masses])),
             sum(mass.objects for mass in masses),
+            top,
         )
 
     def extended(self, objects: int) -> "Mass":
@@ -81,7 +85,7 @@ class Mass:
             return self
         mean = float(np.logaddexp(self.judged, self.unjudged)) - math.log(self.objects)
         unjudged = float(np.logaddexp(self.unjudged, math.log(objects) + mean))
-        return Mass(self.judged, unjudged, self.objects + objects)
+        return Mass(self.judged, unjudged, self.objects + objects, self.top)
 
 
 @dataclass(frozen=True)
@@ -147,20 +151,24 @@ class Posterior:
                 "a posterior needs a judged object, and a sample where others were not judged; got "
                 f"{len(judged)} judged, {unjudged} not, and a sample of {len(drawn)}"
             )
-        weight, others = self.weight(grasps), -math.inf
+        weighed, others = self.weight(grasps) * judged, self.weight(grasps) * drawn
+        top = float(max(weighed.max(), others.max() if unjudged else -math.inf))
+        rest = -math.inf
         if unjudged:  # so many times the mean of the sample
-            others = math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(weight * drawn))
-        return Mass(float(np.logaddexp.reduce(weight * judged)), others, len(judged) + unjudged)
+            rest = math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(others - top))
+        return Mass(float(np.logaddexp.reduce(weighed - top)), rest, len(judged) + unjudged, top)
 
     def share(self, logits: ArrayLike, mass: Mass, grasps: int = 1, none_prior: float = NONE_PRIOR) -> Belief:
         """What is believed of some of the objects that `mass` stands for: `objects` (J,) are those of these logits."""
         some = _finite(logits, "every logit")
         each = math.log1p(-none_prior) - math.log(mass.objects) + self.offset
         none = math.log(none_prior) if none_prior else -math.inf
-        # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN.
-        whole = float(np.logaddexp.reduce([none, each + mass.unjudged, each + mass.judged]))
-        shares = np.exp(np.minimum(each + self.weight(grasps) * some - whole, 0.0))
-        return Belief(math.exp(none - whole), shares, math.exp(each + mass.unjudged - whole))
+        # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN. All are told
+        # from the best one's.
+        none -= each + mass.top
+        whole = float(np.logaddexp.reduce([none, mass.unjudged, mass.judged]))
+        shares = np.exp(np.minimum(self.weight(grasps) * some - mass.top - whole, 0.0))
+        return Belief(math.exp(none - whole), shares, math.exp(mass.unjudged - whole))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
