@@ -25,7 +25,7 @@ class ShardBuilder:
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Build the shards of these jobs. What is wrong with one is its answer, for another try would say it again."""
-        answers = []
+        answers: list[ShardBuilt | RetrievalError | IndexesError] = []
         for job in batch["job"]:
             try:
                 answers.append(build_shard(job, self._checkpoint))
