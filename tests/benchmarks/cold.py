@@ -39,7 +39,7 @@ for name in names:
 from pathlib import Path
 import retrieval.search.searcher as search
 generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
-stored = step("read the checkpoint", lambda: search.read_stored(Path(model)))
+stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
 encoder = step("make the encoder", lambda: search.exported_beside(stored) or search.torch_encoder(stored))
 judge = step("read the head", lambda: search.read_judge(Path(model)))
 shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
