@@ -52,8 +52,10 @@ def measures(rng, skill):
     flat = {"pair_accuracy": (0.5 + 0.22 * skill, 0.5), "pair_auc": (0.5 + 0.26 * skill, 0.5)}
     for k in (5, 10):
         flat[f"guesses_k{k}"] = (curve(skill, k), np.arange(1, k + 1) / k)
-    for count in (1, 2, 3, 5, 8):
+    for count in (1, 2, 3, 5, 8, 12, 20):
         flat[f"guesses_k5_g{count}_p3"] = (curve(skill * (1 + 0.35 * np.log(count)), 5), np.arange(1, 6) / 5)
+    for count in (2, 3, 5, 10, 20):
+        flat[f"guesses_k5_p{count}"] = (curve(skill * (1 + 0.1 * np.log(count)), 5), np.arange(1, 6) / 5)
     flat["all_objects_k5"] = (curve(skill * 0.9, 5), np.arange(1, 6) / 5)
     for prefix in ("", "photo_to_touch_"):
         flat |= {f"{prefix}{key}": (0.06 + 0.2 * skill + 0.05 * at, 0.06 + 0.05 * at) for at, key in enumerate(RANKS)}
@@ -206,6 +208,17 @@ def made_up(recording, methods=tuple(SKILL), seed=0):
                 },
             }
             for name, what in CEILINGS.items()
+        },
+        "faint": {
+            "change": 2.5,
+            "touches": 40,
+            "methods": {
+                name: {
+                    part: {"guesses_k5": summary(rng, curve(skill, 5), np.arange(1, 6) / 5)}
+                    for part, skill in (("faint", 0.2), ("others", 0.8))
+                }
+                for name in methods
+            },
         },
         "comparisons": [
             {

@@ -5,8 +5,8 @@
 RECORDING gives training and validation objects, UNSEEN is a recording of other objects; all of its touches are judged.
 Training sets are nested: 20 objects are among the 80. With `--photographed 0 1000 10000` (and --photos, --touches) each
 number of felt objects is trained on beside so many photographed ones, paired by their labels with pressed ones, and the
-plot has a line for each. Writes scaling.json and scaling.png in FOLDER; what is fitted already, and features, are used
-again.
+plot has a line for each. With `--seeds 3` every method that draws anything is trained three times, and its numbers are
+means over them. Writes scaling.json and scaling.png in FOLDER; what is fitted already, and features, are used again.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
+from retrieval.evaluation.experiment import SEEDLESS
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS, build_method
@@ -34,8 +35,11 @@ from retrieval.metrics.table import ScoreTable
 from retrieval.model.config import Config, load_config
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.train import labelled_pairs
+from robot.recording.folder import read_recording
 
 LINES = ("-", "--", "-.")
+KNOWN = {"shape": slice(0, 1), "relief": slice(1, 2), "both": slice(0, 2)}
+"""Words of a simulated object's name ("mug-ribs-0-00001") that say what it is."""
 NONE_FELT = 8
 """Added to numbers of felt objects where they are plotted, so that none has a place on a logarithmic axis."""
 SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}
@@ -63,6 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--grasps", type=int, nargs="+", default=[1, 2, 4], help="of each object, at most")
     parser.add_argument("--validation", type=int, default=100, help="objects to choose and calibrate by")
     parser.add_argument("--fingers", type=int, default=2, help="ablation: only the first so many fingers feel")
+    parser.add_argument("--opening", action="store_true", help="addition: how far the jaws stood apart")
+    parser.add_argument(
+        "--known", choices=list(KNOWN), help="oracle: which photos show the same of the object is known"
+    )
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each method")
     parser.add_argument("--touch-px", type=int, help="ablation: side of the gel images that the towers see")
     parser.add_argument("--cache", type=Path, help="folder where features are kept (default: FOLDER/features)")
     arguments = parser.parse_args(argv)
@@ -79,11 +88,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fit and judge every training set: each number of objects with all grasps, then all objects with fewer."""
     config = _config(arguments)
     cache = arguments.cache or arguments.out / "features"
-    seen, seen_digest = _features(arguments.recording, config, cache, arguments.fingers)
-    unseen, unseen_digest = _features(arguments.unseen, config, cache, arguments.fingers)
+    recordings = (arguments.recording, arguments.unseen)
+    (seen, seen_digest), (unseen, unseen_digest) = (_features(one, config, cache, arguments) for one in recordings)
     pairs = seen.of_objects(())
     if config.training.photos:
-        pairs = _encoded(labelled_pairs(config), config, cache, arguments.fingers)
+        pairs = _encoded(labelled_pairs(config), config, cache, arguments)
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
     validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
     most = max(arguments.grasps)
@@ -97,18 +106,22 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
             continue
         felt, paired = first_grasps(seen.of_objects(pool[:count]), grasps), pairs.of_objects(liked[:photographed])
         train = felt.joined(paired) if count and photographed else felt if count else paired
-        setting = Setting(config, folder=arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed")
+        folder = arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed"
         for name in arguments.methods:
-            method = build_method(name, setting)
-            method.fit(train, validation)
+            seeds = range(1 if name in SEEDLESS else arguments.seeds)
+            trained = [build_method(name, Setting(config, seed, folder)) for seed in seeds]
+            for method in trained:
+                method.fit(train, validation)
             size = {"method": name, "objects": count, "grasps": grasps, "photographed": photographed}
-            size |= {"touches": len(train), "pairs": len(paired)}
-            points.append(size | judge(method, validation, unseen))
+            size |= {"touches": len(train), "pairs": len(paired), "seeds": len(seeds)}
+            points.append(size | judge(trained, validation, unseen, arguments.known))
             print(table(points[-1:]).splitlines()[-1], flush=True)
     return {
         "preset": arguments.preset,
         "iterations": config.training.iterations,
         "fingers": arguments.fingers,
+        "opening": arguments.opening,
+        "known": arguments.known,
         "touch_px": config.preprocessing.touch_px,
         "views": config.preprocessing.views,
         "recording": seen_digest,
@@ -135,14 +148,25 @@ def _config(arguments: argparse.Namespace) -> Config:
     return dataclasses.replace(config, training=training, preprocessing=preprocessing)
 
 
-def _features(recording: Path, config: Config, cache: Path, fingers: int) -> tuple[Features, str]:
+def _features(recording: Path, config: Config, cache: Path, arguments: argparse.Namespace) -> tuple[Features, str]:
     grasps = load_grasps(recording)
-    return _encoded(grasps, config, cache, fingers), data_digest(grasps)
+    features = _encoded(grasps, config, cache, arguments)
+    if arguments.opening:
+        features = with_opening(features, recording)
+    return features, data_digest(grasps)
 
 
-def _encoded(grasps: Sequence[Grasp], config: Config, cache: Path, fingers: int) -> Features:
+def _encoded(grasps: Sequence[Grasp], config: Config, cache: Path, arguments: argparse.Namespace) -> Features:
     features = encode_recording(grasps, frozen_matcher(config), config, cache)
-    return dataclasses.replace(features, touch=features.touch[:, :fingers].copy())
+    return dataclasses.replace(features, touch=features.touch[:, : arguments.fingers].copy())
+
+
+def with_opening(features: Features, recording: Path) -> Features:
+    """How far the jaws stood apart, millimetres, as one more feature of each finger."""
+    known = {line.grasp_id: line.opening_mm for line in read_recording(recording).grasps}
+    apart = np.array([known[name] for name in features.grasp_ids], dtype=np.float32)
+    column = np.broadcast_to(apart[:, None, None], (*features.touch.shape[:2], 1))
+    return dataclasses.replace(features, touch=np.concatenate([features.touch, column], axis=2))
 
 
 def first_grasps(features: Features, most: int) -> Features:
@@ -151,15 +175,21 @@ def first_grasps(features: Features, most: int) -> Features:
     return features.select(np.flatnonzero(np.array(place) < most))
 
 
-def judge(method: Method, validation: Features, unseen: Features) -> dict[str, Any]:
-    """Summaries of the measures on unseen objects, by name."""
-    fitted, table = calibrate_pairs(scores_of(method, validation), seed=0), scores_of(method, unseen)
-    return summaries([take(Scored(table, table, {}, fitted, seed=0), SHOWN)], DRAWS, seed=0)
+def judge(trained: Sequence[Method], validation: Features, unseen: Features, known: str | None) -> dict[str, Any]:
+    """Summaries of the measures on unseen objects, by name; means over trainings."""
+    measures = []
+    for method in trained:
+        fitted, table = (scores_of(method, part, known) for part in (validation, unseen))
+        measures.append(take(Scored(table, table, {}, calibrate_pairs(fitted, seed=0), seed=0), SHOWN))
+    return summaries(measures, DRAWS, seed=0)
 
 
-def scores_of(method: Method, features: Features) -> ScoreTable:
-    """Every touch with every photo."""
+def scores_of(method: Method, features: Features, known: str | None = None) -> ScoreTable:
+    """Every touch with every photo; where the shape or the relief is known, photos that show another come last."""
     scores = method.score(method.encode_touch(features.touch), method.encode_photo(features.photo))
+    if known:
+        told = ["-".join(name.split("-")[KNOWN[known]]) for name in features.object_ids]
+        scores[np.array(told)[:, None] != np.array(told)] -= np.ptp(scores) + 1
     return ScoreTable(scores, features.owner, features.owner, np.eye(len(features), dtype=bool))
 
 

@@ -78,6 +78,9 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert set(results["ceilings"]) == {"touch_to_touch", "photo_to_photo"}
     assert {(one["a"], one["b"]) for one in results["comparisons"]} == {("late_fusion", name) for name in FEW[1:]}
     assert results["audit"]["clean"]
+    assert set(results["faint"]["methods"]) == set(FEW)
+    assert results["faint"]["touches"] == 1  # a twentieth of 24
+    assert results["faint"]["methods"]["late_fusion"]["others"]["guesses_k5"]["queries"] == 23
     summary = results["methods"]["late_fusion"]["measures"]["guesses_k5"]
     assert (summary["objects"], summary["queries"], len(summary["value"])) == (6, 24, 5)
 

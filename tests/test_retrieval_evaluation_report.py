@@ -214,13 +214,23 @@ def test_leakage_is_set_apart(made, tmp_path):
     assert "test: a photo  =  train: b photo" in page
 
 
+@pytest.mark.usefixtures("words_only")
+def test_touches_that_hardly_press_are_shown_apart(made, tmp_path):
+    text = remake(made, tmp_path)[1]
+    assert "The 40 test touches that changed the gel least, by at most 2.5 grey levels" in text
+    rows = [line.split("|")[1:3] for line in text.splitlines() if "faintest |" in line or "| others |" in line]
+    assert [" late fusion ", " faintest "] in rows
+    assert [" late fusion ", " others "] in rows
+    assert not any("random" in name for name, _ in rows)
+
+
 def test_what_was_not_measured_is_left_out(made, tmp_path):
     def change(results):
         for method in results["methods"].values():
             for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "chosen"):
                 method.pop(what)
             method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
-        results |= {"controls": {}, "ceilings": {}, "comparisons": []}
+        results |= {"controls": {}, "ceilings": {}, "faint": None, "comparisons": []}
         results.pop("audit")
 
     _, text, files = remake(made, tmp_path, change=change)

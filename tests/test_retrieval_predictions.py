@@ -29,14 +29,14 @@ def recorded(counts):
     return grasps
 
 
-GRASPS = recorded({"a": 20, "b": 3, "c": 20, "d": 6, "e": 20, "f": 2, "left out": 5})
+GRASPS = recorded({"a": 20, "b": 3, "c": 20, "d": 6, "e": 24, "f": 2, "left out": 5})
 QUERIES = draw_queries(GRASPS, SPLIT, 0)
 
 
 def test_every_grasp_of_a_test_object_is_judged_and_some_of_the_others():
     names, counts = np.unique([GRASPS[row].object_id for row in QUERIES.touches], return_counts=True)
     assert dict(zip(names.tolist(), counts.tolist(), strict=True)) == {
-        "a": MOST_GRASPS["train"], "b": 3, "c": MOST_GRASPS["validation"], "d": 6, "e": 20, "f": 2,
+        "a": MOST_GRASPS["train"], "b": 3, "c": MOST_GRASPS["validation"], "d": 6, "e": 24, "f": 2,
     }  # fmt: skip
     assert len(set(QUERIES.touches.tolist())) == len(QUERIES.touches)
 
@@ -57,7 +57,7 @@ def test_a_photo_file_stands_once_however_many_grasps_share_it():
 
 
 def test_sets_hold_different_grasps_of_one_object_and_leave_it_three_photos():
-    have = {"c": 12, "d": 6, "e": 20, "f": 2}
+    have = {"c": 12, "d": 6, "e": 24, "f": 2}
     for size in SET_SIZES:
         sets = QUERIES.sets[size]
         owners = QUERIES.touch_owner[sets]

@@ -1,10 +1,12 @@
 """The scaling experiment, in small."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from retrieval.methods.base import Method
 from retrieval.training.features import Features
 from tests import scaling, synthetic
 from tests.labelled import label_recording
@@ -36,6 +38,55 @@ def test_felt_and_photographed_objects_are_crossed(recording, tmp_path):
     asked = [(point["objects"], point["photographed"], point["touches"]) for point in points]
     assert asked == [(0, 4, 4), (0, 6, 6), (4, 0, 8), (4, 4, 12), (4, 6, 14)]
     assert (tmp_path / "out" / "scaling.png").stat().st_size > 10_000
+
+
+def test_every_method_that_draws_is_trained_as_often_as_asked_and_its_numbers_are_means(recording, tmp_path):
+    unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(11, seed=5), 2)
+    sizes = ("--objects", "9", "--grasps", "2", "--validation", "3", "--iterations", "2")
+    options = ("--preset", "tiny", "--init", "random", "--methods", "late_fusion", "cca", *sizes)
+    points = {}
+    for seeds in ("1", "2"):
+        out = tmp_path / seeds
+        assert scaling.main([str(recording), str(unseen), "--out", str(out), "--seeds", seeds, *options]) == 0
+        points[seeds] = {point["method"]: point for point in json.loads((out / "scaling.json").read_text())["points"]}
+    assert {name: point["seeds"] for name, point in points["2"].items()} == {"late_fusion": 2, "cca": 1}
+    assert points["2"]["cca"]["guesses_k5"] == points["1"]["cca"]["guesses_k5"]
+    assert points["2"]["late_fusion"]["guesses_k5"]["value"] != points["1"]["late_fusion"]["guesses_k5"]["value"]
+
+
+def test_where_the_relief_is_known_photos_of_another_come_last():
+    class Constant(Method):
+        _fit = _encode_touch = _encode_photo = None
+
+        def encode_touch(self, touch):
+            return touch
+
+        encode_photo = encode_touch
+
+        def score(self, touch_codes, photo_codes):
+            return np.tile(np.arange(len(photo_codes), dtype=np.float32), (len(touch_codes), 1))
+
+    names = ("mug-ribs-0-1", "tin-ribs-0-2", "tin-dots-0-3")
+    features = Features(names, names, np.zeros((3, 1, 1), np.float32), np.zeros((3, 1), np.float32))
+    ranked = [
+        np.argsort(-scaling.scores_of(Constant(None), features, known).scores, axis=1).tolist()
+        for known in (None, "relief", "shape", "both")
+    ]
+    assert ranked == [
+        [[2, 1, 0], [2, 1, 0], [2, 1, 0]],
+        [[1, 0, 2], [1, 0, 2], [2, 1, 0]],
+        [[0, 2, 1], [2, 1, 0], [2, 1, 0]],
+        [[0, 2, 1], [1, 2, 0], [2, 1, 0]],
+    ]
+
+
+def test_the_opening_of_the_jaws_is_one_more_feature_of_each_finger(tmp_path, monkeypatch):
+    lines = [SimpleNamespace(grasp_id="g1", opening_mm=31.5), SimpleNamespace(grasp_id="g2", opening_mm=7.0)]
+    monkeypatch.setattr(scaling, "read_recording", lambda folder: SimpleNamespace(grasps=lines))
+    given, photos = np.ones((2, 2, 1), np.float32), np.zeros((2, 4), np.float32)
+    touch = scaling.with_opening(Features(("g2", "g1"), ("a", "b"), given, photos), tmp_path).touch
+    assert touch.dtype == np.float32
+    assert touch.tolist() == [[[1, 7], [1, 7]], [[1, 31.5], [1, 31.5]]]
 
 
 @pytest.mark.parametrize(("most", "kept"), [(1, [0, 1]), (2, [0, 1, 2, 3]), (9, [0, 1, 2, 3, 4])])

@@ -21,6 +21,7 @@ from retrieval.evaluation.audit import UNIT, audit
 from retrieval.evaluation.ceilings import CEILING_METHOD, ceiling_experiments, score_ceiling
 from retrieval.evaluation.controls import CONTROL_METHOD, control_experiments, score_control
 from retrieval.evaluation.experiment import Experiment
+from retrieval.evaluation.faint import faint_touches, score_faint
 from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
@@ -84,6 +85,7 @@ def evaluate(
         **_about(material, experiment, preset, wanted),
         "audit": _audited(material, out, quiet),
         **_scored(experiment, jobs, seed, quiet),
+        "faint": _faint(material, experiment, jobs, seed, quiet),
         "controls": {
             name: score_control(name, control, seed, draws=DRAWS, seed=seed) for name, control in controls.items()
         },
@@ -165,6 +167,14 @@ def _scored(experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[
             )
             bar.advance(note=name)
     return {"methods": entries, "comparisons": _compared(measures, seed)}
+
+
+def _faint(material: Material, experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any] | None:
+    """ "faint" of results.json."""
+    asked = experiment.queries
+    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
+    predictions = {name: [experiment.predictions(name, one) for one in seeds] for name, seeds in jobs.items()}
+    return score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed)
 
 
 def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -97,8 +98,12 @@ class MethodScores:
 
     def measures(self, names: Iterable[str]) -> Measures:
         """The metrics of these names, with pairs calibrated on validation objects."""
-        fitted = calibrate_pairs(self.touches("validation", "validation"), seed=self.seed)
-        return take(self.scored(fitted), names)
+        return take(self.scored(self.calibration), names)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Of single touches, fitted on validation objects."""
+        return calibrate_pairs(self.touches("validation", "validation"), seed=self.seed)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:

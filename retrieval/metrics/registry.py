@@ -12,10 +12,12 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import Calibration
 from retrieval.metrics.table import ScoreTable
 
-SET_SIZES = (1, 2, 3, 5, 8)
+SET_SIZES = (1, 2, 3, 5, 8, 12, 20)
 """Grasps in a set."""
 SHOWN_PHOTOS = 3
 """Photos of a candidate where sets of grasps are judged."""
+PHOTO_COUNTS = (1, 2, 3, 5, 10, 20)
+"""Photos of a candidate where one grasp asks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,11 @@ def of_grasps(count: int) -> str:
     return f"guesses_k5_g{count}_p{SHOWN_PHOTOS}"
 
 
+def of_photos(count: int) -> str:
+    """The metric of a query of one grasp, so many photos of each candidate."""
+    return "guesses_k5" if count == 1 else f"guesses_k5_p{count}"
+
+
 def guesses(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
     """`protocols.k_way`; None where there are fewer objects than candidates."""
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
@@ -64,6 +71,16 @@ def _of_set(count: int) -> Metric:
     words = f"{count} grasp{'s' * (count > 1)}"
     label = f"first guess of 5, {words}, {SHOWN_PHOTOS} photos"
     return Metric(label, words, "grasps", lambda of: guesses(of.sets.get(count), 5, of.seed, SHOWN_PHOTOS))
+
+
+def _of_photos(count: int) -> Metric:
+    words = f"{count} photos"
+    return Metric(f"first guess of 5, {words}", words, "photos", lambda of: _shown_alike(of, count))
+
+
+def _shown_alike(of: Scored, count: int) -> Measure | None:
+    """None where some candidate has fewer photos: the mean of fewer scores lies further out than its rivals'."""
+    return guesses(of.test, 5, of.seed, count) if of.test.fewest_photos >= count else None
 
 
 def _paired(table: ScoreTable, k: int) -> Measure | None:
@@ -86,6 +103,7 @@ METRICS: dict[str, Metric] = {
         lambda of: guesses(of.among_all, 5, of.seed),
     ),
     **{of_grasps(count): _of_set(count) for count in SET_SIZES},
+    **{of_photos(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
     "recall_1": Metric("R@1, touch to photo", "R@1", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 1)),
     "recall_5": Metric("R@5, touch to photo", "R@5", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 5)),
     "recall_10": Metric("R@10, touch to photo", "R@10", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 10)),

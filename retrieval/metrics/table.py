@@ -85,6 +85,12 @@ class ScoreTable:
         """(O,) numbers of the objects that have photos, ascending."""
         return np.unique(self.photo_owner)
 
+    @cached_property
+    def fewest_photos(self) -> int:
+        """The least number of photos that an asked row can be shown of any object, its own left out."""
+        owners = np.unique(self.asked.photo_owner, return_counts=True)[1]
+        return int(min(owners.min(), (self.asked.relevant & ~self.asked.own).sum(1).min()))
+
     def select(
         self, rows: NDArray[np.int64] | NDArray[np.bool_], columns: NDArray[np.int64] | NDArray[np.bool_]
     ) -> "ScoreTable":

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from retrieval.metrics.registry import PHOTO_TO_TOUCH, SET_SIZES, TOUCH_TO_PHOTO, of_grasps
+from retrieval.metrics.registry import PHOTO_COUNTS, PHOTO_TO_TOUCH, SET_SIZES, TOUCH_TO_PHOTO, of_grasps, of_photos
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
@@ -72,18 +72,21 @@ def _guessed(builder: Builder, name: str, k: int) -> list[tuple[str, Sequence[An
     return [(f"{label}: found with guess {number} of {k}", shown) for number, shown in enumerate(found, start=1)]
 
 
-def grasps(builder: Builder) -> Iterator[Block | None]:
-    """What several grasps of one object add."""
-    keys = [of_grasps(count) for count in SET_SIZES]
+def grasps_and_photos(builder: Builder) -> Iterator[Block | None]:
+    """What several grasps of one object add, and several photos of each candidate."""
+    keys = [*map(of_grasps, SET_SIZES), *map(of_photos, PHOTO_COUNTS[1:])]
     if builder.any(*keys):
         yield builder.picture(
             "grasps.png",
-            f"First guess against grasps in a query. {'. '.join(builder.values(k) for k in keys if builder.any(k))}.",
-            "A query of several grasps of one object against three photos of each of five objects; dashed: chance.",
-            plots.grasps,
+            "First guess against grasps in a query, and against photos of a candidate. "
+            f"{'. '.join(builder.values(k) for k in keys if builder.any(k))}.",
+            "Left: a query of several grasps of one object against three photos of each of five objects. Right: a "
+            "query of one grasp against several. Dashed: chance.",
+            plots.grasps_and_photos,
             builder.results,
         )
         yield tables.section(builder.results, "grasps")
+        yield tables.section(builder.results, "photos")
 
 
 def time(builder: Builder) -> Iterator[Block | None]:
@@ -133,6 +136,16 @@ def ceilings(builder: Builder) -> Iterator[Block | None]:
             "both; what lies between that and the result is lost on the way from one to the other."
         )
         yield tables.ceilings(builder.results)
+
+
+def faint(builder: Builder) -> Iterator[Block | None]:
+    """Touches that hardly pressed, apart."""
+    if found := builder.results.data.get("faint"):
+        yield Text(
+            f"The {found['touches']} test touches that changed the gel least, by at most {found['change']:.1f} grey "
+            "levels on average (of the finger that felt more), and all others."
+        )
+        yield tables.faint(builder.results)
 
 
 def audit(builder: Builder) -> Iterator[Block | None]:

@@ -1,14 +1,14 @@
 """Plots of an evaluation, one function each: results in, a matplotlib figure out."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.methods import KNOW_NOTHING
-from retrieval.metrics.registry import SET_SIZES, of_grasps
+from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, of_grasps, of_photos
 from retrieval.report.canvas import FAINT, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
 from retrieval.report.results import Results, measure_label, method_label, percent, short
 
@@ -83,25 +83,30 @@ def _legend(figure: Figure, names: Sequence[str]) -> None:
     figure.legend(handles=handles, loc="outside right center", frameon=False)
 
 
-def grasps(results: Results) -> Figure:
-    """First guess of five against the number of grasps of the query, three photos of each candidate."""
-    figure = canvas(8, 4.4)
-    panel = figure.subplots()
-    names = [name for name in results.methods if any(results.summary(name, of_grasps(count)) for count in SET_SIZES)]
-    for place, name in enumerate(names):
-        shift, style = 0.055 * (place - (len(names) - 1) / 2), style_of(name)
-        found = [(at, results.summary(name, of_grasps(count))) for at, count in enumerate(SET_SIZES)]
-        points = np.array([(at + shift, *_first(summary)) for at, summary in found if summary])
+def grasps_and_photos(results: Results) -> Figure:
+    """First guess of five against grasps of a query (three photos of each candidate) and against photos (one grasp)."""
+    figure = canvas(12.5, 4.4)
+    left, right = figure.subplots(1, 2)
+    _against_counts(left, results, of_grasps, SET_SIZES)
+    _against_counts(right, results, of_photos, PHOTO_COUNTS)
+    left.set_xlabel("grasps of the same object in one query")
+    right.set_xlabel("photos of each candidate")
+    _legend(figure, results.methods)
+    return figure
+
+
+def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str], counts: Sequence[int]) -> None:
+    """Each method's values of a metric of so many, side by side, over the chance of each."""
+    for place, name in enumerate(results.methods):
+        shift, style = 0.055 * (place - (len(results.methods) - 1) / 2), style_of(name)
+        found = [(at, summary) for at, key in enumerate(map(metric, counts)) if (summary := results.summary(name, key))]
+        points = np.array([(at + shift, *_first(summary)) for at, summary in found]).reshape(-1, 4)
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
         panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
         for at, summary in found:
-            if summary:
-                panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=FAINT, ls="--", lw=1.2, zorder=1)
-    panel.set_xticks(range(len(SET_SIZES)), [str(count) for count in SET_SIZES])
-    panel.set_xlabel("grasps of the same object in one query")
+            panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=FAINT, ls="--", lw=1.2, zorder=1)
+    panel.set_xticks(range(len(counts)), list(map(str, counts)))
     percent_axis(panel, "right first guess among 5 objects, %")
-    _legend(figure, names)
-    return figure
 
 
 # Objects ---------------------------------------------------------------------------------------------

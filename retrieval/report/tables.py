@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from retrieval.methods import KNOW_NOTHING
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
@@ -174,6 +175,19 @@ def ceilings(results: Results) -> Table:
         real = (with_interval(results.summary("cca", key)) for key in keys)
         rows.insert(0, ("touch to photo", "the result of CCA", *real))
     header = ("ceiling", "what was done", *(f"{measure_label(key)}, %" for key in keys))
+    return _explained(Table(header, tuple(rows), words=frozenset({1})))
+
+
+def faint(results: Results) -> Table:
+    """The faintest touches and the others, of every method that looks at them."""
+    keys = ("pair_accuracy", "guesses_k5", "guesses_k10")
+    rows = [
+        (method_label(name), words, *(with_interval(parts[part].get(key)) for key in keys))
+        for name, parts in results.data["faint"]["methods"].items()
+        if name not in KNOW_NOTHING
+        for part, words in (("faint", "faintest"), ("others", "others"))
+    ]
+    header = ("method", "touches", *(f"{measure_label(key)}, %" for key in keys))
     return _explained(Table(header, tuple(rows), words=frozenset({1})))
 
 
