@@ -68,9 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--validation", type=int, default=100, help="objects to choose and calibrate by")
     parser.add_argument("--fingers", type=int, default=2, help="ablation: only the first so many fingers feel")
     parser.add_argument("--opening", action="store_true", help="addition: how far the jaws stood apart")
-    parser.add_argument(
-        "--known", choices=list(KNOWN), help="oracle: which photos show the same of the object is known"
-    )
+    parser.add_argument("--known", choices=list(KNOWN), help="oracle: this of the object is known")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each method")
     parser.add_argument("--touch-px", type=int, help="ablation: side of the gel images that the towers see")
     parser.add_argument("--cache", type=Path, help="folder where features are kept (default: FOLDER/features)")

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from retrieval.methods.base import Method
 from retrieval.training.features import Features
 from tests import scaling, synthetic
 from tests.labelled import label_recording
@@ -55,21 +54,15 @@ def test_every_method_that_draws_is_trained_as_often_as_asked_and_its_numbers_ar
 
 
 def test_where_the_relief_is_known_photos_of_another_come_last():
-    class Constant(Method):
-        _fit = _encode_touch = _encode_photo = None
-
-        def encode_touch(self, touch):
-            return touch
-
-        encode_photo = encode_touch
-
-        def score(self, touch_codes, photo_codes):
-            return np.tile(np.arange(len(photo_codes), dtype=np.float32), (len(touch_codes), 1))
-
+    constant = SimpleNamespace(
+        encode_touch=lambda touch: touch,
+        encode_photo=lambda photo: photo,
+        score=lambda touch, photo: np.tile(np.arange(len(photo), dtype=np.float32), (len(touch), 1)),
+    )
     names = ("mug-ribs-0-1", "tin-ribs-0-2", "tin-dots-0-3")
     features = Features(names, names, np.zeros((3, 1, 1), np.float32), np.zeros((3, 1), np.float32))
     ranked = [
-        np.argsort(-scaling.scores_of(Constant(None), features, known).scores, axis=1).tolist()
+        np.argsort(-scaling.scores_of(constant, features, known).scores, axis=1).tolist()
         for known in (None, "relief", "shape", "both")
     ]
     assert ranked == [
