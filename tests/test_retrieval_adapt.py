@@ -11,17 +11,19 @@ import retrieval
 from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, told
-from retrieval.adaptation.maps import RIDGES, Affine, fit_codes
 from retrieval.adaptation.material import config_for, encode, take_over
 from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
+from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.methods.cca_towers import RIDGES, Affine, fit_codes
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features
+from retrieval.training.train import build_matcher
 
 
 @pytest.fixture
@@ -102,6 +104,23 @@ def test_places_of_hand_made_scores():
     assert measure([found], "first").chance.tolist() == [pytest.approx(1 / 3)]
     by_object = [np.mean([1.0, 0.75]), 0.75, found.below[2]]
     assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
+
+
+def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_path):
+    torch.manual_seed(0)
+    weights = tmp_path / "published.pth"
+    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), weights)
+    preset = training_config("adapt", None, init=str(weights))
+    preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
+    start = load_checkpoint(retrieval.shipped_model(1))
+    wanted = Matcher(config_for(start, 1, beside=True, seed=0).matcher, 2)
+    made = build_matcher(preset)
+    for side in ("touch_tower", "photo_tower"):
+        take_over(getattr(wanted, side), getattr(start.matcher, side), str(weights))
+        for name, tensor in getattr(wanted, side).state_dict().items():
+            assert torch.equal(getattr(made, side).state_dict()[name], tensor), name
+    said = preset.without_paths()["training"]
+    assert (said["init"], said["init_touch"]) == ("published.pth", "shipped+init")
 
 
 @pytest.mark.slow

@@ -94,6 +94,26 @@ def test_of_a_view_the_widest_directions_are_kept_where_so_many_are_asked():
     assert decompose(x, 96).rank == 12
 
 
+def test_fewer_items_than_features_give_the_same_widest_directions_as_the_whole_decomposition():
+    x = np.random.default_rng(3).standard_normal((30, 80)) * np.linspace(3, 1, 80)
+    left, singular, right = cca.leading(x, 5)
+    whole = np.linalg.svd(x, full_matrices=False)
+    np.testing.assert_allclose(singular, whole[1][:5])
+    np.testing.assert_allclose((left * singular) @ right, (whole[0][:, :5] * whole[1][:5]) @ whole[2][:5], atol=1e-10)
+
+
+def test_photos_may_have_a_ridge_of_their_own():
+    x, y = linked((0.9, 0.6))
+    views, owner = (decompose(x), decompose(y)), np.arange(len(x))
+    both, one = canonical(*views, owner, 0.5), canonical(*views, owner, 0.1, 0.5)
+    assert np.allclose(canonical(*views, owner, 0.5, 0.5).correlations, both.correlations)
+    turned = canonical(*views[::-1], owner, 0.5, 0.1)
+    assert np.allclose(one.correlations, turned.correlations)
+    assert not np.allclose(one.correlations, both.correlations)
+    with pytest.raises(BadInput, match="got ridge -1"):
+        canonical(*views, owner, 0.1, -1)
+
+
 def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
     monkeypatch.setattr(cca, "MOST_ROWS", 100)
     monkeypatch.setattr(cca, "LEADING", 3)

@@ -8,6 +8,7 @@ import pytest
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
+from retrieval.methods.cca_towers import blocks_of, fit_codes
 from retrieval.methods.selection import Validator, judged_rows, ranking_auc
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
@@ -259,3 +260,20 @@ def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left
     assert standardise.kept.tolist() == [0]  # the last one varies by its float32 rounding only
     np.testing.assert_allclose(standardise(np.array([[3.0, 9.0, 0.0]])), [[0.0]])
     np.testing.assert_allclose(standardise(x).std(0), 1.0)
+
+
+def test_once_its_ridge_is_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
+    both = TRAIN.joined(VALIDATION)
+    method = fitted("cca_towers")
+    blocks = blocks_of(CONFIG, TRAIN)
+    assert blocks == ([FEATURES, FEATURES], [FEATURES])
+    ridge = method.chosen["ridge"]
+    codes_of = dict(fit_codes(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, ridges=(ridge,)))
+    wanted = codes_of[ridge].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
+    np.testing.assert_array_equal(method.score(*codes(method)), wanted)
+
+
+def test_towers_side_by_side_take_features_of_their_own_alone():
+    other = Features(TRAIN.grasp_ids, TRAIN.object_ids, TRAIN.touch, TRAIN.photo[:, 1:])
+    with pytest.raises(BadInput, match=r"towers small \(pooled\), 512 of a touch and 256 of a photo; got 512 and 255"):
+        blocks_of(CONFIG, other)

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.files import write_atomically
-from retrieval.adaptation.folds import Blocks, Fold, draw_folds, first_guesses, measure
-from retrieval.adaptation.maps import RIDGES, fit_codes
-from retrieval.adaptation.material import Material, widths_of
+from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, measure
+from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import AsItIs
 from retrieval.console.files import MARKED
 from retrieval.console.progress import Bar
+from retrieval.methods.cca_towers import RIDGES, Blocks, fit_codes
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.towers.side_by_side import SideBySide
+from retrieval.model.towers.side_by_side import SideBySide, widths_of
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, percent_axis
 from retrieval.training.features import Features
 from retrieval.version import __version__
@@ -95,19 +95,16 @@ def _point(
     """Of every fold, a fit on objects and touches drawn from those outside it."""
     rng = np.random.default_rng([seed, objects, touches])
     everyone = {name for fold in folds for name in fold}
+    number_of = {name: number for number, name in enumerate(sorted(set(features.object_ids)))}
     parts = []
     for fold in folds:
         chosen = rng.permutation(sorted(everyone.difference(fold)))[:objects]
-        rows = [rng.permutation(np.flatnonzero(_owned(features, name)))[:touches] for name in chosen]
+        rows = [rng.permutation(np.flatnonzero(features.owner == number_of[name]))[:touches] for name in chosen]
         learned = features.select(np.sort(np.concatenate(rows)))
         touch = learned.touch.reshape(len(learned), -1)
         codes = dict(fit_codes(touch, learned.photo, learned.owner, blocks, ridges=(RIDGE,)))
         parts.append(first_guesses(Fold(features.of_objects(fold), codes), RIDGE))
     return Point.of(what, objects, touches, measure(parts, "first"), measure(parts, "below"))
-
-
-def _owned(features: Features, name: str) -> NDArray[np.bool_]:
-    return np.array([each == name for each in features.object_ids])
 
 
 def one_tower(material: Material, place: int) -> tuple[Features, Blocks]:

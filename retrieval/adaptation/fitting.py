@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import Fold
-from retrieval.adaptation.maps import Affine, Codes, fit_codes
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import first_rows
 from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.methods.cca_towers import Affine, Codes, fit_codes
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread

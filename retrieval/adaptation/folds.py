@@ -1,23 +1,23 @@
 """What a fit is worth on objects that it never saw: own objects are few, so each is left out once."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.adaptation.maps import RIDGES, Codes, fit_codes
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, linked_objects
 from retrieval.errors import BadInput
-from retrieval.metrics.measure import Measure
+from retrieval.methods.cca_towers import RIDGES, Blocks, Codes, fit_codes
+from retrieval.metrics.guesses import guess_curves
+from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features
 
 GALLERY = 9
 """Objects among which a held-out touch is told, at most: about as many as a fold holds."""
 FEWEST = 6
 """Own objects that can be judged: two folds of three."""
-Blocks = tuple[Sequence[int], Sequence[int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +77,12 @@ class Told:
     below: NDArray[np.float64]
     objects: int
 
+    def measure(self, column: str) -> Measure:
+        """The measure "first" or "below", of objects by their place in the alphabet."""
+        owner = np.unique(self.object_ids, return_inverse=True)[1].astype(np.int64)
+        chance = 1 / self.objects if column == "first" else 0.5
+        return Measure(getattr(self, column)[:, None], owner, np.array([chance]), f"{self.objects} objects left out")
+
 
 def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> Told:
     """A touch against a photo, drawn, of each of the fold's objects; its own is of another grasp where there is one."""
@@ -87,14 +93,14 @@ def told(scores: NDArray[np.float32], features: Features, seed: int = 0) -> Told
     """The same of scores (n, n) of touches with photos of grasps."""
     rng, owner = np.random.default_rng([seed, 8]), features.owner
     rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
-    first, below = np.empty(len(features)), np.empty(len(features))
+    higher, equal = np.empty((2, len(features)), np.int64)
     for touch, name in enumerate(owner):
         shown = np.array([rng.choice(mine[mine != touch] if len(mine) > 1 else mine) for mine in rows])
         own, others = scores[touch, shown[name]], np.delete(scores[touch, shown], name)
-        higher, equal = int((others > own).sum()), int((others == own).sum())
-        first[touch] = 0.0 if higher else 1 / (1 + equal)
-        below[touch] = 1 - (higher + equal / 2) / len(others)
-    return Told(features.object_ids, first, below, len(rows))
+        higher[touch], equal[touch] = (others > own).sum(), (others == own).sum()
+    rivals = len(rows) - 1
+    first = guess_curves(higher, equal, rivals, len(rows))[:, 0]
+    return Told(features.object_ids, first, 1 - (higher + equal / 2) / rivals, len(rows))
 
 
 def pair_accuracy(parts: Sequence[Told]) -> float:
@@ -104,13 +110,9 @@ def pair_accuracy(parts: Sequence[Told]) -> float:
 
 def measure(parts: Sequence[Told], column: str) -> Measure:
     """The measure "first" or "below" of all folds."""
-    names = sorted({name for part in parts for name in part.object_ids})
-    owner = np.array([names.index(name) for part in parts for name in part.object_ids])
-    order = np.argsort(owner, kind="stable")
-    values = np.concatenate([getattr(part, column) for part in parts])[order, None]
-    chance = 0.5
-    if column == "first":
-        chance = float(np.mean([1 / part.objects for part in parts for _ in set(part.object_ids)]))
+    names = [sorted(set(part.object_ids)) for part in parts]
+    number_of = {name: number for number, name in enumerate(sorted(set().union(*names)))}
+    units = [{place: number_of[name] for place, name in enumerate(own)} for own in names]
+    found = pooled([part.measure(column) for part in parts], units)
     sizes = sorted({part.objects for part in parts})
-    gallery = " or ".join(map(str, sizes)) + " objects left out, one photo of each"
-    return Measure(values, owner[order].astype(np.int64), np.array([chance]), gallery)
+    return replace(found, gallery=" or ".join(map(str, sizes)) + " objects left out, one photo of each")

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from retrieval.adaptation.folds import Blocks
 from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps, recording_source
 from retrieval.errors import BadInput
+from retrieval.methods.cca_towers import Blocks
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import TOGETHER
 from retrieval.model.towers.base import Tower
-from retrieval.model.towers.side_by_side import SideBySide
+from retrieval.model.towers.side_by_side import SideBySide, widths_of
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features, encode_recording
 
@@ -69,7 +69,7 @@ def config_for(start: Checkpoint, fingers: int, *, beside: bool, seed: int) -> C
     preset, known = load_config(PRESET), start.config.matcher
     tower = TOGETHER.join([known.tower, BESIDE] if beside else [known.tower])
     matcher = dataclasses.replace(preset.matcher, tower=tower, tower_output=known.tower_output, fingers=fingers)
-    training = dataclasses.replace(preset.training, init="random", seed=seed)
+    training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)
 
 
@@ -83,8 +83,3 @@ def take_over(tower: Tower, known: Tower, init: str) -> None:
     for part, its in zip(parts, known.parts if isinstance(known, SideBySide) else [known], strict=True):
         part.load_state_dict(its.state_dict())
     initialise_tower(beside, BESIDE, init)  # type: ignore[arg-type]
-
-
-def widths_of(tower: Tower) -> list[int]:
-    """Of the features of towers side by side, or of the one."""
-    return tower.widths if isinstance(tower, SideBySide) else [tower.feature_count]

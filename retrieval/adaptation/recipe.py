@@ -1,7 +1,7 @@
 """`retrieve adapt`: a checkpoint for a new sensor and own objects, from a few of them.
 
 Towers stand still: those of the checkpoint that one starts from, which learnt on the simulated rig what relief looks
-like, beside those of published weights, which know pictures. What is fitted is linear (`retrieval.adaptation.maps`),
+like, beside those of published weights, which know pictures. What is fitted is linear (`retrieval.methods.cca_towers`),
 and every number that is told of it comes from objects that were left out of the fit.
 """
 

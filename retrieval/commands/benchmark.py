@@ -16,7 +16,7 @@ from retrieval.evaluation.real import PROTOCOLS
 
 HELP = "Judge methods on public data sets of real touches, with controls."
 PRESET = "real"
-METHODS = "cca_pca,cca,late_fusion,chance"
+METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
 WRITTEN = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
 
 app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metavar="DATA_KIND [ARGS]...")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PRESET = "small"
 DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
-INIT = "first weights of the towers: random, imagenet, or a state dict file"
+INIT = "first weights of the towers: random, imagenet, shipped, or a state dict file"
 INIT_OF = "first weights of one tower alone: a file, as `train --task relief` writes it"
 SPLIT = "JSON file with train, validation and test objects"
 

@@ -21,7 +21,7 @@ from retrieval.model.encode import one_thread
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
-SEEDLESS = frozenset({"cca", "cca_pca", "plsca", "constant"})
+SEEDLESS = frozenset({"cca", "cca_pca", "cca_towers", "plsca", "constant"})
 """Methods that come out alike for every seed: one is enough."""
 
 

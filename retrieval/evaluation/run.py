@@ -133,7 +133,7 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
         "setting": {
             "preset": preset,
             "model": material.checkpoint.digest if material.checkpoint else None,
-            "config": _without_paths(material.config),
+            "config": material.config.without_paths(),
             "seeds": seeds,
             "draws": DRAWS,
             "features": {
@@ -145,14 +145,6 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
             },
         },
     }
-
-
-def _without_paths(config: Config) -> dict[str, Any]:
-    """Where the first weights lay on this machine concerns nobody; the features' digest says what they were."""
-    tables = config.to_dict()
-    for name in ("init", "init_photo", "init_touch", "photos", "touches"):
-        tables["training"][name] = Path(tables["training"][name]).name
-    return tables
 
 
 def _scored(experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any]:

@@ -19,6 +19,7 @@ METHODS = {
     "contrastive_sigmoid": "retrieval.methods.contrastive:ContrastiveSigmoid",
     "cca": "retrieval.methods.cca:Cca",
     "cca_pca": "retrieval.methods.cca_pca:CcaPca",
+    "cca_towers": "retrieval.methods.cca_towers:CcaTowers",
     "plsca": "retrieval.methods.plsca:Plsca",
     "chance": "retrieval.methods.chance:Chance",
     "constant": "retrieval.methods.constant:Constant",

@@ -73,32 +73,41 @@ def decompose(x: NDArray[Any], most: int | None = None) -> View:
     unless something varies."""
     if not np.isfinite(x).all():
         raise NumericalError("features must be finite to be correlated; got a NaN or infinite one")
-    standardise = Standardiser.fit(x)
-    left, singular, right = svd(standardise(x)) if len(x) <= MOST_ROWS else leading(standardise(x), most or LEADING)
+    return factored(x, Standardiser.fit(x), most)
+
+
+def factored(x: NDArray[Any], standardise: Standardiser, most: int | None = None) -> View:
+    """The same of finite items, standardised as is said."""
+    shown = standardise(x)
+    left, singular, right = svd(shown) if len(x) <= MOST_ROWS else leading(shown, most or LEADING)
     rank = min(int((singular > RANK_CUT * singular[0]).sum()), len(singular) if most is None else most)
     return View(standardise, left[:, :rank], singular[:rank], right[:rank])
 
 
-def canonical(touch: View, photo: View, owner: NDArray[np.int64], ridge: float = 0.0) -> Canonical:
+def canonical(
+    touch: View, photo: View, owner: NDArray[np.int64], ridge: float = 0.0, photo_ridge: float | None = None
+) -> Canonical:
     """Canonical correlations of touches with photos, each touch paired with every photo of its object.
 
     owner (n,): object of each row, from 0; `arange(n)` pairs row with row. A pair of an object with m grasps weighs
     1/m, so every grasp counts the same, and pairing is the block average B = E'E, E (objects, n) with rows
     1/sqrt(m): the cross-covariance X'BY needs object means only, and its rank is below the number of objects. Its
-    whitened form is factored by QR of both sides. Raises BadInput for a negative ridge or too few rows.
+    whitened form is factored by QR of both sides. photo_ridge: that of photos, where it is not that of touches. Raises
+    BadInput for a negative ridge or too few rows.
     """
-    if ridge < 0 or not len(touch.left) == len(photo.left) == len(owner):
+    photo_ridge = ridge if photo_ridge is None else photo_ridge
+    if min(ridge, photo_ridge) < 0 or not len(touch.left) == len(photo.left) == len(owner):
         raise BadInput(
-            f"a canonical analysis needs a ridge from 0 and one owner a row; got ridge {ridge}, "
+            f"a canonical analysis needs a ridge from 0 and one owner a row; got ridge {min(ridge, photo_ridge)}, "
             f"{len(touch.left)} touches, {len(photo.left)} photos and {len(owner)} owners"
         )
     touch_q, touch_r = np.linalg.qr(_whitened_means(touch, owner, ridge))
-    photo_q, photo_r = np.linalg.qr(_whitened_means(photo, owner, ridge))
+    photo_q, photo_r = np.linalg.qr(_whitened_means(photo, owner, photo_ridge))
     left, rho, right = svd(touch_r @ photo_r.T)
     count = min(len(rho), len(np.unique(owner)) - 1)  # the means of centred data have one dimension less
     weights = (
         touch.right.T @ ((touch_q @ left)[:, :count] / touch.damped(ridge)[:, None]),
-        photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.damped(ridge)[:, None]),
+        photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.damped(photo_ridge)[:, None]),
     )
     signs = _signs(np.concatenate(weights))
     return Canonical(np.clip(rho[:count], 0.0, 1.0), weights[0] * signs, weights[1] * signs)
@@ -117,11 +126,15 @@ def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
-    """The same for the `most` widest directions of many items, from the eigenvectors of X'X.
+    """The same for the `most` widest directions of many items, from the eigenvectors of X'X or, where that is smaller,
+    of XX'.
 
     Its squared condition number costs the thinnest directions, which are not asked for.
     """
     width = x.shape[1]
+    if len(x) < width:
+        right, singular, left = leading(x.T, most)
+        return left.T, singular, right.T
     values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - most, 0), width - 1))
     singular = np.sqrt(np.maximum(values[::-1], (RANK_CUT * RANK_CUT) * values[-1]))
     right = vectors.T[::-1]

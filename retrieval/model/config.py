@@ -14,6 +14,7 @@ from indexes.store.regular import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.losses import LOSSES
+from retrieval.model.towers import TOGETHER
 
 # How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
 
@@ -57,8 +58,9 @@ class MatcherConfig:
 class TrainingConfig:
     """How a matcher is trained.
 
-    init: "random", "imagenet" or the path of a state dict. init_touch, init_photo: the same for one tower alone, where
-    they are not empty (`retrieval.training.relief` makes such weights). photos, touches: folders of labelled pictures
+    init: "random", "imagenet", "shipped" or the path of a state dict. init_touch, init_photo: the same for one tower
+    alone, where they are not empty (`retrieval.training.relief` makes such weights); of towers side by side the part
+    "init" is what init says. photos, touches: folders of labelled pictures
     whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pairs`);
     both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
     pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
@@ -124,6 +126,10 @@ class TrainingConfig:
             f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
         )
 
+    def first_weights(self, of_one: str) -> str:
+        """First weights of one tower, from `init_touch` or `init_photo`."""
+        return TOGETHER.join(self.init if part == "init" else part for part in (of_one or "init").split(TOGETHER))
+
     @property
     def trains_embeddings(self) -> bool:
         """Whether the contrastive projections learn anything."""
@@ -175,6 +181,14 @@ class Config:
     def without_pruner(self) -> "Config":
         """The same with no pruner to be taught."""
         return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0))
+
+    def without_paths(self) -> dict[str, Any]:
+        """As `to_dict`, of files and folders the names alone: where they lay on this machine concerns nobody."""
+        tables = self.to_dict()
+        for name in ("init", "init_photo", "init_touch", "photos", "touches"):
+            parts = tables["training"][name].split(TOGETHER)
+            tables["training"][name] = TOGETHER.join(Path(part).name for part in parts)
+        return tables
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, as in a TOML file."""

@@ -53,6 +53,7 @@ _STYLES = {
     "contrastive_sigmoid": Style("#e69f00", "v"),
     "cca": Style("#aa3377", "P"),
     "cca_pca": Style("#882255", "p"),
+    "cca_towers": Style("#44aa99", "h"),
     "plsca": Style("#6f4e37", "X"),
     "chance": Style("#6b7580", ".", ":"),
     "constant": Style("#aab2ba", "|", ":"),

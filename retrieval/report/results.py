@@ -22,6 +22,7 @@ METHODS = {
     "prune_rerank": "prune + rerank",
     "contrastive": "contrastive, InfoNCE",
     "contrastive_sigmoid": "contrastive, sigmoid",
+    "cca_towers": "CCA, tower by tower",
     "cca_pca": "CCA, principal components",
     "cca": "CCA",
     "plsca": "PLS-CA",

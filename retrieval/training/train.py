@@ -8,6 +8,7 @@ import dataclasses
 import math
 import threading
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ from retrieval.model.config import Config, TrainingConfig
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.weights import initialise_tower
+from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.training.distil import add_pruner
@@ -330,11 +332,21 @@ def labelled_pairs(config: Config) -> list[Grasp]:
 def build_matcher(config: Config) -> Matcher:
     """A matcher with the configured first weights in both towers."""
     settings, matcher = config.training, Matcher(config.matcher, len(config.preprocessing.views))
-    for tower, init in ((matcher.touch_tower, settings.init_touch), (matcher.photo_tower, settings.init_photo)):
-        initialise_tower(tower, config.matcher.tower, init or settings.init)
+    for tower, init, side in (
+        (matcher.touch_tower, settings.init_touch, "touch_tower"),
+        (matcher.photo_tower, settings.init_photo, "photo_tower"),
+    ):
+        shipped = partial(_shipped_tower, config.matcher.fingers, side)
+        initialise_tower(tower, config.matcher.tower, settings.first_weights(init), shipped)
         tower.requires_grad_(not settings.freeze_towers)
         distributed.share_batch_statistics(tower)
     return matcher
+
+
+def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
+    checkpoint = load_checkpoint(shipped_model(min(fingers, 2)))
+    tower: nn.Module = getattr(checkpoint.matcher, side)
+    return tower.state_dict()
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:

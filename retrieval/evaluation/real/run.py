@@ -103,7 +103,7 @@ def benchmark(
         "software": __version__,
         "setting": {
             "preset": preset,
-            "config": _without_paths(config),
+            "config": config.without_paths(),
             "seeds": list(range(seeds)),
             "draws": DRAWS,
             "judged_grasps": MOST,
@@ -115,13 +115,6 @@ def benchmark(
     text = f"{json.dumps(results, sort_keys=True, indent=1, allow_nan=False)}\n"
     write_atomically(out / "results.json", text.encode())
     return results
-
-
-def _without_paths(config: Config) -> dict[str, Any]:
-    tables = config.to_dict()
-    for name in ("init", "init_photo", "init_touch"):
-        tables["training"][name] = Path(tables["training"][name]).name
-    return tables
 
 
 def _rows(
@@ -239,7 +232,7 @@ class _Asked:
                 "features": features.digest,
                 "split": split.to_dict(),
                 "seed": seed,
-                "config": _without_paths(towers.config),
+                "config": towers.config.without_paths(),
                 "model": towers.checkpoint.digest if towers.checkpoint else None,
                 "judged": MOST,
                 "software": __version__,

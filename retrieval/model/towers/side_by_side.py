@@ -23,3 +23,8 @@ class SideBySide(Tower):
 
     def _encode(self, images: Tensor) -> Tensor:
         return torch.cat([part._encode(images) for part in self.parts], dim=1)  # type: ignore[operator]
+
+
+def widths_of(tower: Tower) -> list[int]:
+    """How many features each of the towers that stand side by side gives, or the one."""
+    return tower.widths if isinstance(tower, SideBySide) else [tower.feature_count]

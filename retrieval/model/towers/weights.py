@@ -1,6 +1,7 @@
 """Where a tower's first weights come from: random, a file, or the published ImageNet checkpoints."""
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from urllib.error import URLError
 
@@ -12,6 +13,9 @@ from retrieval.model.towers import TOGETHER
 from retrieval.model.towers.base import Tower
 from retrieval.model.towers.side_by_side import SideBySide
 
+State = dict[str, Tensor]
+SHIPPED = "shipped"
+"""In place of first weights: those of the checkpoint that comes with the package."""
 log = logging.getLogger(__name__)
 
 # The eight digits in a file name begin its SHA-256; the download is checked against them.
@@ -23,12 +27,12 @@ IMAGENET_URLS = {
 }
 
 
-def initialise_tower(tower: Tower, name: str, init: str) -> None:
+def initialise_tower(tower: Tower, name: str, init: str, shipped: Callable[[], State] | None = None) -> None:
     """Give `tower`, built as `name`, its first weights.
 
-    init: "random" leaves it as built, "imagenet" fetches the published checkpoint once into PyTorch's cache,
-    anything else is the path of a .pth, .pt or .safetensors state dict with torchvision's key names. Towers side by
-    side take one for all of them, or as many, joined alike.
+    init: "random" leaves it as built, "imagenet" fetches the published checkpoint once into PyTorch's cache, "shipped"
+    is what the caller knows as that, anything else is the path of a .pth, .pt or .safetensors state dict with
+    torchvision's key names. Towers side by side take one for all of them, or as many, joined alike.
     Raises CheckpointError where a file is missing, damaged or of another architecture.
     """
     if init == "random":
@@ -40,7 +44,10 @@ def initialise_tower(tower: Tower, name: str, init: str) -> None:
                 f"{len(names)} towers side by side take first weights for each, joined by {TOGETHER!r}; got {init!r}"
             )
         for part, its_name, its_init in zip(tower.parts, names, inits * (len(names) // len(inits)), strict=True):
-            initialise_tower(part, its_name, its_init)  # type: ignore[arg-type]
+            initialise_tower(part, its_name, its_init, shipped)  # type: ignore[arg-type]
+        return
+    if init == SHIPPED and shipped is not None:
+        load_tower_state(tower, shipped(), "the shipped checkpoint")
         return
     path = _imagenet_file(name) if init == "imagenet" else Path(init)
     load_tower_state(tower, read_state(path), str(path))

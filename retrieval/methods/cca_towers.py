@@ -1,4 +1,4 @@
-"""Linear maps from features to codes whose cosine matches touches with photos, fitted on few objects.
+"""CCA of towers side by side, for few objects: what `retrieve adapt` fits.
 
 Features of each tower are first reduced to their widest directions, every tower weighing the same; then come canonical
 correlations with a ridge (`retrieval.methods.cca`). On a few dozen objects nothing with more freedom did better
@@ -7,20 +7,33 @@ correlations with a ridge (`retrieval.methods.cca`). On a few dozen objects noth
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.methods.cca import View, canonical, decompose, leading, unit_rows
+from retrieval.errors import BadInput
+from retrieval.methods.base import Array, Method
+from retrieval.methods.cca import LEADING, View, canonical, cosine, decompose, factored, unit_rows
+from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
+from retrieval.model.config import Config
+from retrieval.model.towers import build_tower
+from retrieval.model.towers.side_by_side import widths_of
+
+if TYPE_CHECKING:
+    from retrieval.training.features import Features
 
 Matrix = NDArray[np.float64]
 Rows = NDArray[np.float32]
+Blocks = tuple[Sequence[int], Sequence[int]]
+"""How wide the features are of towers that stand side by side, of a touch and of a photo."""
 DIRECTIONS = 256
 """Of each tower's features that are kept."""
 COMPONENTS = 64
 RIDGES = (0.1, 0.3, 1.0)
+PHOTO_RIDGE = 1.0
+"""Photos of an object are fewer than its touches, and more alike."""
 
 
 class Affine(NamedTuple):
@@ -71,20 +84,17 @@ class Reduced:
 
 def _widest(x: Rows) -> Affine:
     """To the widest directions of x (n, F), whose variances add up to 1."""
-    view = decompose(x)
-    kept = slice(min(DIRECTIONS, view.rank))
-    size = np.sqrt((view.singular[kept] ** 2).sum() / len(x))
-    weight = np.zeros((x.shape[1], view.rank))[:, kept]
-    weight[view.standardise.kept] = view.right[kept].T / view.standardise.scale[:, None] / size
+    view = decompose(x, DIRECTIONS)
+    size = np.sqrt((view.singular**2).sum() / len(x))
+    weight = np.zeros((x.shape[1], view.rank))
+    weight[view.standardise.kept] = view.right.T / view.standardise.scale[:, None] / size
     return Affine(weight, -(view.standardise.mean @ weight[view.standardise.kept]))
 
 
 def _centred(x: Matrix) -> View:
     """Of items that are centred already, and whose spread is meant."""
-    left, singular, right = leading(x)
-    rank = int((singular > 1e-7 * singular[0]).sum())
     as_it_is = Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1]))
-    return View(as_it_is, left[:, :rank], singular[:rank], right[:rank])
+    return factored(x, as_it_is, LEADING)
 
 
 def fit_codes(
@@ -97,11 +107,11 @@ def fit_codes(
     """The codes of each ridge, from features of grasps: touch (n, F), photo (n, F'), owner (n,) objects from 0.
 
     blocks: how wide the towers' features are that stand side by side, of touches and of photos. Variates are weighted
-    by their correlation; a ridge is a share of the mean variance.
+    by their correlation; a ridge is a share of the mean variance, that of photos is `PHOTO_RIDGE`.
     """
     felt, seen = Reduced.of(touch, blocks[0]), Reduced.of(photo, blocks[1])
     for ridge in ridges:
-        found = canonical(felt.view, seen.view, owner, ridge)
+        found = canonical(felt.view, seen.view, owner, ridge, PHOTO_RIDGE)
         weights = found.correlations[:COMPONENTS]
         yield (
             ridge,
@@ -112,3 +122,52 @@ def fit_codes(
                 )
             ),
         )
+
+
+class CcaTowers(Method):
+    """Cosine of such codes; the ridge by ranking on validation objects, and then all objects teach.
+
+    So scores of validation objects are of objects that it knows: what is calibrated on them is too sure.
+    """
+
+    def _fit(self, train: "Features", validation: "Features") -> None:
+        blocks = blocks_of(self.setting.config, train)
+        judged = Validator.of(validation)
+        shown = judged.features
+        aucs = {
+            ridge: judged.touches(codes.cosines(_rows(shown), shown.photo))
+            for ridge, codes in fit_codes(_rows(train), train.photo, train.owner, blocks)
+        }
+        best = max(aucs, key=lambda ridge: (aucs[ridge], ridge))
+        known = train.joined(validation)
+        ((_, self._codes),) = fit_codes(_rows(known), known.photo, known.owner, blocks, ridges=(best,))
+        self.chosen = {"ridge": best, "validation_auc": aucs[best]}
+
+    def _encode_touch(self, touch: Array) -> Array:
+        return unit_rows(self._codes.touch(touch.reshape(len(touch), -1)))
+
+    def _encode_photo(self, photo: Array) -> Array:
+        return unit_rows(self._codes.photo(photo))
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        return cosine(touch_codes, photo_codes)
+
+
+def _rows(features: "Features") -> Rows:
+    return features.touch.reshape(len(features), -1)
+
+
+def blocks_of(config: Config, features: "Features") -> Blocks:
+    """Of features of the towers of `config`. Raises BadInput for features of others."""
+    import torch
+
+    with torch.device("meta"):
+        widths = widths_of(build_tower(config.matcher.tower, config.matcher.tower_output))
+    blocks = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
+    wanted, got = (sum(blocks[0]), sum(blocks[1])), (_rows(features).shape[1], features.photo.shape[1])
+    if wanted != got:
+        raise BadInput(
+            f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
+            f"{wanted[0]} of a touch and {wanted[1]} of a photo; got {got[0]} and {got[1]}; encode with these"
+        )
+    return blocks
