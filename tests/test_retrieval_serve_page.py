@@ -2,9 +2,14 @@
 
 import base64
 import itertools
+import json
+import shutil
 
 import pytest
 
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.searcher import Searcher
 from retrieval.serve.service import Grasped, LiveRig
 from tests import synthetic
 from tests.browser import address, ask, choose, chromium, gel_files, page, serious
@@ -107,6 +112,31 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
     assert opened.get_by_text("5 other objects").is_visible()
 
 
+@pytest.mark.parametrize(
+    ("verdict", "claim", "told"),
+    [
+        ("none of these", "None of these", "That the catalogue lacks the object has probability"),
+        ("no contact", "No contact", "The gels look untouched"),
+        ("not a gel image", "Not a gel image", "does not look like a gel"),
+        ("uncalibrated", None, "This model was never calibrated"),
+    ],
+)
+def test_every_verdict_is_said_in_words(opened, files, index, verdict, claim, told):
+    with Searcher.open(index) as searcher:
+        document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
+    if verdict != "none of these":
+        document |= {"none_probability": None, "posterior": None}
+    if verdict in ("no contact", "not a gel image"):
+        document |= {"results": [], "query": {"touches": [["a.png", "b.png"]], "grasps": [verdict]}}
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
+    shown = opened.locator(".verdict")
+    shown.get_by_text(told).wait_for()
+    assert shown.get_by_role("heading").inner_text() == (claim or opened.locator(".photo .name").first.inner_text())
+    marks = {"no contact": "no contact, not judged", "not a gel image": "not a gel image, not judged"}
+    assert opened.locator(".mark").all_inner_texts() == ([marks[verdict]] if verdict in marks else [])
+
+
 def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()
@@ -130,6 +160,22 @@ def test_nearest_photos_of_a_photo_lead_on_to_their_objects(opened, files):
     name = near.inner_text()
     near.click()
     opened.get_by_role("dialog", name=name).wait_for()
+
+
+def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model, tmp_path):
+    own, name = tmp_path / "catalog", "a mug"
+    shutil.copytree(next(path for path in catalogue.iterdir() if path.is_dir()), own / name)
+    shutil.copytree(next(path for path in catalogue.iterdir() if path.is_dir()), own / "a tin")
+    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "maker": "Wedgwood", "price": 3}) + "\n")
+    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
+    with address(tmp_path / "index") as url, page(browser, url) as opened:
+        opened.get_by_role("navigation").get_by_role("link", name="Catalogue").click()
+        opened.get_by_role("searchbox", name="Search").fill("wedgwood 1.jpg")
+        opened.get_by_text("1 photo found").wait_for()
+        opened.locator(".grid button").click()
+        facts = opened.get_by_role("dialog", name=name).locator(".facts")
+        facts.get_by_text("Wedgwood").wait_for()
+        assert facts.locator("dt, dd").all_inner_texts() == ["maker", "Wedgwood", "price", "3"]
 
 
 def test_grasp_something_closes_the_jaws_and_asks(opened):

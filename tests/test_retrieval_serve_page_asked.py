@@ -21,6 +21,8 @@ def test_the_answer_is_photos_with_bars_that_add_up_to_1_none_of_these_among_the
     assert opened.locator(".photo .name", has_text="None of these").is_visible()
     verdicts = ("Most likely", "Nearest", "Nothing was felt", "Nothing is named")
     assert opened.locator(".above").inner_text() in verdicts
+    claim = opened.locator(".claim").inner_text()
+    assert claim in opened.get_by_role("status").first.inner_text()  # which screen readers say
     assert opened.locator(".photo img").count() == 8
     assert opened.locator(".photo img").evaluate_all("all => all.every((one) => one.loading === 'lazy')")
 

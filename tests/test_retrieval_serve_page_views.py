@@ -12,6 +12,7 @@ from retrieval.search.searcher import Searcher
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.browser import address, ask, chromium, gel_files, page, serious
+from tests.next_grasp import another_grasp
 
 pytestmark = pytest.mark.slow
 MANY = 100_000
@@ -82,6 +83,18 @@ def divergence_bits(answer):
     return float(np.sum(now * np.log2(now / before)))
 
 
+@pytest.mark.parametrize("grasps", [1, 2])
+def test_what_another_grasp_may_be_expected_to_tell_is_said_in_bits(opened, files, index, grasps):
+    with Searcher.open(index) as searcher:
+        expected, left, weight = another_grasp(searcher.query([files[at : at + 2] for at in (0, 2)][:grasps], top=100))
+    ask(opened, files[: 2 * grasps])
+    said = opened.get_by_role("region", name="Another grasp").inner_text()
+    about = f"about {expected:.2f} of the {left:.1f} bits" if expected >= 0.005 else "hardly anything"
+    assert f"would tell {about}" in said
+    assert f"{grasps + 1} grasps of one object weigh as much as {weight:.2f} independent ones" in said
+    assert "the matcher cannot say" in said
+
+
 def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):
     ask(opened, files)
     opened.get_by_role("button", name="It was another object").click()
@@ -96,6 +109,23 @@ def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):
     row.get_by_role("link").click()
     opened.locator(".answer").get_by_text(f"Said to be {name}.").wait_for()
     assert opened.get_by_alt_text("Gel image").count() == 4
+
+
+@pytest.mark.parametrize(
+    ("button", "told"), [("Right", "Said to be right."), ("None of the catalogue", "Said to be none of these.")]
+)
+def test_right_and_none_are_a_click_each_and_the_history_shows_them(opened, files, button, told):
+    opened.get_by_text("Options").click()
+    prior = opened.get_by_label("Chance, before anything is felt, that the catalogue lacks it")
+    prior.fill("0.001")  # so that an object is the answer, of which both can be said
+    prior.blur()
+    ask(opened, files)
+    asked = opened.get_by_role("region", name="Was this right?")
+    asked.get_by_role("button", name=button, exact=True).click()
+    opened.get_by_text(told).wait_for()
+    assert asked.get_by_role("button").count() == 0
+    to(opened, "History")
+    opened.locator(".query").first.get_by_text(told.removesuffix(".")).wait_for()
 
 
 def test_the_history_is_searched_and_exported(opened, files):

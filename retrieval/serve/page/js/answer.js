@@ -5,6 +5,7 @@ import { h, picture } from "./dom.js";
 import { openDetail } from "./detail.js";
 import { feedbackPanel } from "./feedback.js";
 import { growingPanel } from "./growing.js";
+import { anotherGrasp } from "./information.js";
 import { count, percent, verdict } from "./words.js";
 
 const LEAST_SHOWN = 0.0005;
@@ -26,6 +27,7 @@ export function answerPanel({ index, answer, id, asked, kept = null }) {
         parts.map((part) => card(part, answer, open)),
       ),
     parts.length > 0 && asked.touches.length > 1 && answer.none_probability !== null && growingPanel(asked),
+    parts.length > 0 && answer.posterior && anotherGrasp(answer),
     found(answer),
   );
 }

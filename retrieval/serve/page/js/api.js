@@ -110,6 +110,11 @@ export const nearest = (id, count = 12) => json(withParameters(`/v1/nearest/${en
 
 export const history = (given) => json(withParameters("/v1/history", given));
 export const entry = (id) => json(`/v1/history/${encodeURIComponent(id)}`);
+/** The no-contact frames that a query was sent with; null where it had none. */
+export const untouched = (id, letters) =>
+  Promise.all(letters.map((letter) => blob(`/v1/history/${encodeURIComponent(id)}/touches/0/${letter}`))).catch(
+    () => null,
+  );
 export const nearestTouches = (id, count = 8) =>
   json(withParameters(`/v1/history/${encodeURIComponent(id)}/nearest`, { count }));
 export const feedback = (query, said, objectId = null) =>

@@ -15,6 +15,7 @@ export function askView(index) {
   const options = { ...DEFAULTS };
   let held = null; // what the simulated jaws closed on
   let asking = null;
+  const subtracts = index.background !== "none"; // the model takes the untouched gels away from the touch
 
   const title = h("h1", { tabindex: "-1" }, "Which object is in the hand?");
   const lead = h("p", { class: "lead" }, leadText(index));
@@ -90,6 +91,7 @@ export function askView(index) {
       if (!objectId) tray.clear();
       held = felt.objectId;
       tray.addGrasp(felt.touches);
+      if (subtracts) felt.background?.forEach((blob, place) => tray.putBackground(place, blob));
       await ask();
     } catch (error) {
       refused.replaceChildren(problemCard(error, () => graspSomething(objectId)));
@@ -138,17 +140,20 @@ export function askView(index) {
     try {
       const kept = await api.entry(id);
       const touches = await Promise.all(kept.touches.map((grasp) => Promise.all(grasp.map(api.blob))));
+      const background = subtracts ? await api.untouched(id, touches[0].map((_, place) => finger(place))) : null;
       tray.clear();
       held = null;
       touches.forEach((grasp) => tray.addGrasp(grasp));
+      background?.forEach((blob, place) => tray.putBackground(place, blob));
       tray.marks = kept.answer.query.grasps;
       cards.replaceChildren(...trayCards(tray));
+      const none_prior = kept.answer.posterior?.none_prior ?? options.none_prior;
       result.replaceChildren(
         answerPanel({
           index,
           answer: kept.answer,
           id,
-          asked: { touches, background: null, options, held: null },
+          asked: { touches, background, options: { ...options, none_prior }, held: null },
           kept,
         }),
       );

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { h, problemCard, svg } from "./dom.js";
+import { certainBits, toldBits } from "./information.js";
 import { percent } from "./words.js";
 
 const MOST_LINES = 5;
@@ -29,17 +30,16 @@ export function growingPanel(asked) {
 }
 
 function content(answers, alone) {
-  const told = answers.filter((answer) => answer.none_probability !== null).length;
-  if (told < 2)
+  if (answers.filter((answer) => answer.none_probability !== null).length < 2)
     return [h("p", { class: "faint" }, "Fewer than two grasps felt something; there is nothing to compare.")];
   const lines = linesOf(answers);
-  const toldBits = alone.map(bits);
+  const told = alone.map(toldBits);
   return [
     h("p", { class: "turn" }, turningPoint(answers, lines)),
-    h("p", { class: "turn" }, mostByItself(alone, toldBits)),
+    h("p", { class: "turn" }, mostByItself(alone, told)),
     plot(answers, lines),
     legend(lines),
-    numbers(answers, lines, toldBits),
+    numbers(answers, lines, told),
   ];
 }
 
@@ -62,26 +62,10 @@ function linesOf(answers) {
   ];
 }
 
-/** What an answer tells beyond what was believed before it: the Kullback-Leibler divergence of the two, in bits. Objects
- * that are not listed count as one. */
-function bits({ results, none_probability: none, posterior }) {
-  if (none === null || !posterior) return 0; // nothing was felt
-  const { objects, none_prior: before } = posterior;
-  const each = (1 - before) / objects;
-  const listed = results.reduce((sum, match) => sum + match.probability, 0);
-  const pairs = [
-    ...results.map((match) => [match.probability, each]),
-    [none, before],
-    [Math.max(0, 1 - none - listed), (objects - results.length) * each],
-  ];
-  return pairs.reduce((sum, [now, was]) => sum + (now > 0 && was > 0 ? now * Math.log2(now / was) : 0), 0);
-}
-
 /** Which grasp would tell most, were it the only one. */
 function mostByItself(alone, told) {
   const most = told.indexOf(Math.max(...told));
-  const { objects, none_prior: before } = alone[most].posterior;
-  const all = Math.log2(objects / (1 - before));
+  const all = certainBits(alone[most].posterior);
   return `By itself, grasp ${most + 1} would tell most: ${told[most].toFixed(1)} of the ${all.toFixed(1)} bits that name an object for certain.`;
 }
 
@@ -138,7 +122,7 @@ function legend(lines) {
 }
 
 /** The same as numbers, for those who want them or cannot see the plot. */
-function numbers(answers, lines, toldBits) {
+function numbers(answers, lines, told) {
   const head = h(
     "tr",
     {},
@@ -153,8 +137,8 @@ function numbers(answers, lines, toldBits) {
       values.map((p) => h("td", {}, p === null ? "-" : percent(p))),
     ),
   );
-  const told = toldBits.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
-  rows.push(h("tr", {}, h("th", { scope: "row" }, "The grasp by itself tells"), told));
+  const bits = told.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
+  rows.push(h("tr", {}, h("th", { scope: "row" }, "The grasp by itself tells"), bits));
   return h(
     "details",
     {},

@@ -1,0 +1,84 @@
+"""The page in a real browser beside rigs: simulated jaws that close, and gels of a rig's file, live. Each a click."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.serve.rig import of_index, of_rig
+from retrieval.training.train import train
+from robot.recording.folder import RecordingWriter
+from robot.sim.rig import SimRig
+from tests.browser import address, chromium, page
+from tests.conftest import TINY
+from tests.replay_rig import replay_file
+
+pytestmark = pytest.mark.slow
+SEED = 20_000
+SHOWN = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def index(recording, tmp_path_factory):
+    """Of three simulated objects, with a model that subtracts the untouched gel."""
+    folder, rig = tmp_path_factory.mktemp("simulated"), SimRig(SEED)
+    for name in rig.object_ids(3):
+        (folder / "catalog" / name).mkdir(parents=True)
+        rig.prepare(name, 0)
+        pixels = np.ascontiguousarray(rig.world.now().image("photo")[..., ::-1])
+        assert cv2.imwrite(str(folder / "catalog" / name / "1.jpg"), pixels)
+    config = dataclasses.replace(TINY, preprocessing=Preprocessing(touch_px=32, photo_px=48, background="difference"))
+    train(recording, folder / "tiny.safetensors", config, quiet=True)
+    build_index(folder / "catalog", load_checkpoint(folder / "tiny.safetensors"), folder / "index", quiet=True)
+    return folder / "index"
+
+
+def live(opened):
+    """The live picture of a sensor, which has come."""
+    opened.get_by_role("button", name="Live sensors").click()
+    picture = opened.get_by_alt_text("Live picture of sensor b")
+    picture.wait_for()
+    picture.evaluate(SHOWN)
+    return picture
+
+
+def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(browser, index, tmp_path):
+    with (
+        RecordingWriter(tmp_path / "recording", {"source": "said", "sensor": "simulated"}) as writer,
+        address(index, of_index(index), writer, history=tmp_path) as url,
+        page(browser, url) as opened,
+    ):
+        assert live(opened).evaluate("one => one.naturalWidth") > 100
+        opened.get_by_role("button", name="Grasp something").click()
+        opened.locator(".answer").wait_for()
+        names = [path.name for path in (index.parent / "catalog").iterdir()]
+        assert opened.locator(".held strong").inner_text() in names
+        assert opened.get_by_alt_text("Gel image").count() == 2
+        opened.get_by_role("button", name="Grasp it again").click()
+        opened.get_by_role("region", name="Grasp by grasp").get_by_text("would tell most").wait_for()
+        opened.get_by_role("navigation").get_by_role("link", name="History").click()
+        opened.locator(".query").first.get_by_role("link").click()
+        opened.get_by_role("region", name="Grasp by grasp").get_by_text("would tell most").wait_for()
+
+
+def test_gels_of_a_rigs_file_are_live_and_taken_untouched_and_touched(browser, index):
+    with replay_file() as file, address(index, of_rig(str(file), index)) as url, page(browser, url) as opened:
+        live(opened)
+        assert opened.get_by_role("button", name="Grasp something").count() == 0  # nobody moves a rig from here
+        opened.get_by_role("button", name="Take as no-contact frames").click()
+        opened.get_by_text("Options").click()
+        opened.get_by_role("button", name="Finger b: taken").wait_for()
+        opened.get_by_role("button", name="Take this touch").click()
+        opened.get_by_alt_text("Gel image, grasp 1, finger b").wait_for()
+        opened.get_by_role("button", name="Ask", exact=True).click()
+        opened.locator(".answer").wait_for()
