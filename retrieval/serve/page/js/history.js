@@ -62,7 +62,7 @@ export function historyView() {
       if (offset) list.append(...items);
       else list.replaceChildren(...items);
       more.hidden = page.next === null;
-      total.textContent = page.total ? count(page.total, "touch") : empty(asked);
+      total.textContent = page.total ? count(page.total, "question") : empty(asked);
     } catch (error) {
       list.replaceChildren(
         h(
