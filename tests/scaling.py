@@ -30,6 +30,7 @@ from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import frozen_matcher
+from retrieval.metrics.measure import Measure
 from retrieval.metrics.registry import Scored, take
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.config import Config, load_config
@@ -174,12 +175,21 @@ def first_grasps(features: Features, most: int) -> Features:
 
 
 def judge(trained: Sequence[Method], validation: Features, unseen: Features, known: str | None) -> dict[str, Any]:
-    """Summaries of the measures on unseen objects, by name; means over trainings."""
-    measures = []
-    for method in trained:
-        fitted, table = (scores_of(method, part, known) for part in (validation, unseen))
-        measures.append(take(Scored(table, table, {}, calibrate_pairs(fitted, seed=0), seed=0), SHOWN))
-    return summaries(measures, DRAWS, seed=0)
+    """Summaries of the measures on unseen objects, by name: means over trainings, and under "together" the same of
+    the trainings' mean scores."""
+    judged = [tuple(scores_of(method, part, known) for part in (validation, unseen)) for method in trained]
+    alone = summaries([_measures(*tables) for tables in judged], DRAWS, seed=0)
+    together = (mean_scores(tables) for tables in zip(*judged, strict=True))
+    return alone | {"together": summaries([_measures(*together)], DRAWS, seed=0)}
+
+
+def _measures(validation: ScoreTable, unseen: ScoreTable) -> dict[str, Measure]:
+    return take(Scored(unseen, unseen, {}, calibrate_pairs(validation, seed=0), seed=0), SHOWN)
+
+
+def mean_scores(tables: Sequence[ScoreTable]) -> ScoreTable:
+    """What several trainings say together."""
+    return dataclasses.replace(tables[0], scores=np.mean([table.scores for table in tables], axis=0))
 
 
 def scores_of(method: Method, features: Features, known: str | None = None) -> ScoreTable:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from retrieval.metrics.table import ScoreTable
 from retrieval.training.features import Features
 from tests import scaling, synthetic
 from tests.labelled import label_recording
@@ -50,7 +51,16 @@ def test_every_method_that_draws_is_trained_as_often_as_asked_and_its_numbers_ar
         points[seeds] = {point["method"]: point for point in json.loads((out / "scaling.json").read_text())["points"]}
     assert {name: point["seeds"] for name, point in points["2"].items()} == {"late_fusion": 2, "cca": 1}
     assert points["2"]["cca"]["guesses_k5"] == points["1"]["cca"]["guesses_k5"]
+    assert points["1"]["late_fusion"]["together"]["guesses_k5"] == points["1"]["late_fusion"]["guesses_k5"]
     assert points["2"]["late_fusion"]["guesses_k5"]["value"] != points["1"]["late_fusion"]["guesses_k5"]["value"]
+
+
+def test_what_several_trainings_say_together_is_the_mean_of_their_scores():
+    owner, own = np.array([0, 1]), np.eye(2, dtype=bool)
+    tables = [
+        ScoreTable(np.array(scores, np.float32), owner, owner, own) for scores in ([[1, 2], [3, 4]], [[3, 0], [5, 2]])
+    ]
+    assert scaling.mean_scores(tables).scores.tolist() == [[2, 1], [4, 3]]
 
 
 def test_where_the_relief_is_known_photos_of_another_come_last():
