@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { h, problemCard, svg } from "./dom.js";
 import { certainBits, toldBits } from "./information.js";
-import { percent } from "./words.js";
+import { count, percent } from "./words.js";
 
 const MOST_LINES = 5;
 const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [250, 46, 16, 14, 30];
@@ -113,12 +113,12 @@ function plot(answers, lines) {
   );
 }
 
+/** The lines by their looks; those of the other objects are told apart as numbers. */
 function legend(lines) {
-  return h(
-    "ul",
-    { class: "keys", "aria-hidden": "true" },
-    lines.map(({ name, kind }) => h("li", { class: kind }, name)),
-  );
+  const following = lines.filter(({ kind }) => kind === "other").length;
+  const keys = lines.filter(({ kind }) => kind !== "other").map(({ name, kind }) => h("li", { class: kind }, name));
+  if (following) keys.splice(1, 0, h("li", { class: "other" }, count(following, "other object")));
+  return h("ul", { class: "keys", "aria-hidden": "true" }, keys);
 }
 
 /** The same as numbers, for those who want them or cannot see the plot. */

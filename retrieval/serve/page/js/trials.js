@@ -4,7 +4,7 @@ import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
 import { count } from "./words.js";
 
-const whole = (share) => `${Math.round(100 * share)} %`;
+const whole = (share) => `${Math.round(100 * share)}\u00a0%`;
 
 export function trialsView() {
   const element = h("div", { class: "trials" });
@@ -192,7 +192,7 @@ function sentence({ human, model, count: trials }) {
       : human.right > model.right
         ? "You were right more often than the model"
         : "The model was right more often than you";
-  return `${better}: ${human.right} and ${model.right} of ${count(trials, "trial")}.${apart ? "" : " The intervals overlap: this may be chance."}`;
+  return `${better}: you ${human.right}, the model ${model.right} of ${count(trials, "trial")}.${apart ? "" : " The intervals overlap: this may be chance."}`;
 }
 
 function seriesCard(run) {
