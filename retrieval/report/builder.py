@@ -47,7 +47,8 @@ class Builder:
         taken = found.object_id if found else shown["found"]
         touches = own.touches if own else ()
         gels = [(f"finger {ascii_lowercase[place]}", path) for place, path in enumerate(touches)]
-        right = "found first" if taken == shown["object_id"] else "found first, wrong"
+        # Of a confusion they are those that speak most for it: of this seed the object itself may have come first.
+        right = "found" if taken == shown["object_id"] else "found, wrong"
         photos = [
             (f"the object: {shown['object_id']}", own.photo if own else None),
             (f"{right}: {taken}", found.photo if found else None),
