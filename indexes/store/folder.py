@@ -10,6 +10,7 @@
       vectors.faiss       the structure of the index, for kinds that have one
       NAME.json           documents
     LOCK                  held by the writer
+    seen.records          how the files behind the rows looked, of no generation (`indexes.store.seen`)
     unfinished/           what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
 
 A generation is written whole and stands alone: its folder and a CURRENT are an index, wherever they are copied to. One
@@ -128,7 +129,7 @@ class IndexStore:
 
     def write_blocks(
         self,
-        blocks: Iterable[Block],
+        blocks: Iterable[Block | range],
         documents: Mapping[str, Any] | None = None,
         *,
         fingerprint: Mapping[str, str],
@@ -144,7 +145,8 @@ class IndexStore:
         self_check: int = 256,
         keep: int = 2,
     ) -> Generation:
-        """As `write`, from blocks of rows that are put on the disk as they come: memory holds one of them.
+        """As `write`, from blocks of rows that are put on the disk as they come: memory holds one of them. A range is
+        of the parent's rows, which are taken over as they are, unparsed.
 
         fingerprint  what made the vectors; `open(expect=...)` compares it
         about        anything else for the manifest
@@ -152,7 +154,8 @@ class IndexStore:
         software     version that writes
         settle       chooses kind, parameters and more of `about` instead, once all rows are on the disk
         queries      (Q, d) unit vectors to measure recall with; None draws them near the index's own
-        self_check   rows that must find themselves before the switch (see `Generation.self_check`)
+        self_check   rows that must find themselves before the switch: of new ones so many, of those that the parent
+                     had in the same structure a sixteenth of it (see `Generation.self_check`)
         keep         generations before the new one that stay on disk for readers that are just opening them
 
         Raises `RowError`, `VectorError`, `ParameterError`, `MismatchedIndex` for bad input, `LockedIndex`
@@ -194,13 +197,13 @@ class IndexStore:
         except OSError as error:
             raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
 
-    def _publish(self, name: str, blocks: Iterable[Block], job: Job, self_check: int, keep: int) -> Generation:
+    def _publish(self, name: str, blocks: Iterable[Block | range], job: Job, self_check: int, keep: int) -> Generation:
         folder = self.path / f"{name}.tmp-{getpid()}"
         try:
             folder.mkdir()
-            write_generation(folder, name, blocks, job)
+            kept = write_generation(folder, name, blocks, job)
             generation = read_generation(folder, verify=False, threads=job.threads)  # the digests were just taken
-            generation.self_check(self_check)
+            generation.self_check(self_check, since=kept)
             folder.rename(self.path / name)
         except BaseException:
             _discard(folder)

@@ -30,6 +30,8 @@ from indexes.store.rows import RECORD, Rows, keys_of
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
 SHOWN_IDS = 5
 CHECKED = 1000
+FEWER_OLD = 16
+"""How many times fewer rows are checked where a parent's rows were."""
 
 
 class Generation:
@@ -120,8 +122,12 @@ class Generation:
 
     def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
         """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
-        numbers, keys = self.rows.find(ids), keys_of(digests)
-        same = (keys != b"") & (keys == self._digests[numbers])
+        return self.matching_keys(keys_of(ids), keys_of(digests))
+
+    def matching_keys(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
+        """As `matching`, for the keys (n,) of ids and digests."""
+        numbers = self.rows.find_keys(ids)
+        same = (digests != b"") & (digests == self._digests[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
     def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
@@ -129,21 +135,26 @@ class Generation:
         numbers = self.matching(list(wanted), wanted.values()).tolist()
         return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
 
-    def self_check(self, sample: int = 256, seed: int = 0) -> None:
+    def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
         """Search for the vectors of `sample` rows; `SelfRetrievalFailed` names those that do not come first.
 
+        since: the first of the slots that an earlier generation has not had in the same structure, and checked so; of
+        rows in others only a few are searched for.
         A row passes when its slot, or one that scores as high (a near-copy), is at rank 1. Where a search for one
         misses it, one for a hundredth of all rows may find it: candidates are asked for by the hundred, and codes
         cannot tell near-copies apart.
         """
-        drawn = np.random.default_rng(seed).permutation(self.count)[:sample]
+        mixed = np.random.default_rng(seed).permutation(self.count)
+        new = self.slots[mixed] >= since
+        drawn = np.concatenate([mixed[new][:sample], mixed[~new][: sample // FEWER_OLD]])
+        searched = len(drawn)
         for k in sorted({1, max(1, min(CHECKED, self.count // 100))}):
             drawn = self._lost(drawn, k)
         lost = sorted(self.rows.ids(drawn))
         if lost:
             shown = ", ".join(lost[:SHOWN_IDS]) + (", ..." if len(lost) > SHOWN_IDS else "")
             raise SelfRetrievalFailed(
-                f"{len(lost)} of {min(sample, self.count)} rows do not find themselves in the {self.manifest.kind} "
+                f"{len(lost)} of {searched} rows do not find themselves in the {self.manifest.kind} "
                 f"index ({shown}); choose the kind flat, or a broader search",
                 lost,
             )

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,14 @@ class Rows(Sequence[dict[str, Any]]):
         record = self.table[number]
         return self.text[int(record["start"]) : int(record["stop"]) - 1].tobytes()
 
+    def ending(self, text: bytes) -> NDArray[np.bool_]:
+        """Whether each row's line (N,), without the end of the line, ends with this text; nothing is parsed."""
+        stops = self.table["stop"] - 1
+        same: NDArray[np.bool_] = stops - self.table["start"] >= len(text)
+        for back, byte in enumerate(reversed(text), start=1):
+            same &= self.text[np.maximum(stops - back, 0)] == byte
+        return same
+
     def keys(self, name: str) -> NDArray[np.bytes_]:
         """`key_of` the field `name`, one of `KEYS`, of every row (N,); nothing is parsed."""
         return np.ascontiguousarray(self.table[name])
@@ -79,18 +87,22 @@ class Rows(Sequence[dict[str, Any]]):
 
     def find(self, ids: Iterable[str]) -> Slots:
         """For each id its row's number (n,), -1 where there is none."""
-        return _found(ids, self._by_id)
+        return self.find_keys(keys_of(ids))
+
+    def find_keys(self, keys: NDArray[np.bytes_]) -> Slots:
+        """As `find`, for the keys (n,) of ids."""
+        return _found(keys, self._by_id)
 
     def holding(self, digests: Iterable[str]) -> Slots:
         """For each digest the number of a row of that content (n,), -1 where there is none."""
-        return _found(digests, self._by_digest)
+        return _found(keys_of(digests), self._by_digest)
 
     @cached_property
-    def _by_id(self) -> tuple[Slots, NDArray[np.bytes_]]:
+    def _by_id(self) -> "_Sorted":
         return _sorted(self.keys("id"))
 
     @cached_property
-    def _by_digest(self) -> tuple[Slots, NDArray[np.bytes_]]:
+    def _by_digest(self) -> "_Sorted":
         return _sorted(self.keys("digest"))
 
     def _parsed(self, number: int) -> dict[str, Any]:
@@ -103,12 +115,37 @@ class Rows(Sequence[dict[str, Any]]):
         return row
 
 
-def _sorted(keys: NDArray[np.bytes_]) -> tuple[Slots, NDArray[np.bytes_]]:
-    order = np.argsort(keys, kind="stable")
-    return order, keys[order]
+class _Sorted(NamedTuple):
+    """Keys (N,), and the order (N,) in which their first eight bytes `ranked` (N,), taken for numbers, grow: numbers
+    are sorted and searched in a tenth of the time of bytes."""
+
+    keys: NDArray[np.bytes_]
+    order: Slots
+    ranked: NDArray[np.uint64]
 
 
-def _found(values: Iterable[str], sorted_keys: tuple[Slots, NDArray[np.bytes_]]) -> Slots:
-    wanted, (order, ranked) = keys_of(values), sorted_keys
-    place = np.minimum(np.searchsorted(ranked, wanted), len(ranked) - 1)
-    return np.where(ranked[place] == wanted, order[place], -1)
+def _sorted(keys: NDArray[np.bytes_]) -> _Sorted:
+    beginnings = _beginnings(keys)
+    order = np.argsort(beginnings, kind="stable")
+    return _Sorted(keys, order, beginnings[order])
+
+
+def _beginnings(keys: NDArray[np.bytes_]) -> NDArray[np.uint64]:
+    beginnings: NDArray[np.uint64] = np.ascontiguousarray(keys).view(np.uint64)[::2]
+    return beginnings
+
+
+def first_equal(keys: NDArray[np.bytes_], wanted: NDArray[np.bytes_]) -> Slots:
+    """For each wanted key (n,) the place of the first of `keys` (N,), N >= 1, that equals it; -1 where none does."""
+    return _found(wanted, _sorted(keys))
+
+
+def _found(wanted: NDArray[np.bytes_], known: _Sorted) -> Slots:
+    beginnings = _beginnings(wanted)
+    place = np.minimum(np.searchsorted(known.ranked, beginnings), len(known.ranked) - 1)
+    numbers = np.where(known.keys[known.order[place]] == wanted, known.order[place], -1)
+    alike = (numbers < 0) & (known.ranked[place] == beginnings)  # others begin so too, or this one alone
+    for number in np.flatnonzero(alike).tolist():
+        same = np.flatnonzero(known.keys == wanted[number])
+        numbers[number] = same[0] if len(same) else -1
+    return numbers

@@ -54,7 +54,8 @@ class Tables:
 
 
 class TableWriter:
-    """Takes blocks with `add`, writes them to files in `folder`, and maps what was written with `close`.
+    """Takes blocks with `add` and the parent's rows with `keep`, writes them to files in `folder`, and maps what was
+    written with `close`.
 
     What comes is written once and in order. Embeddings are the parent's, then the new ones; where some of these are
     equal, or many of those have no row any more, they are written again at the end.
@@ -104,6 +105,31 @@ class TableWriter:
         self._add_arrays(block.arrays, numbers, fresh_ids)
         self._add_lines(block.rows, ids, numbers, records)
 
+    def keep(self, numbers: range) -> None:
+        """Take the parent's rows of these numbers (a step of 1) next, as they are. Raises `RowError` without a parent,
+        or `MismatchedIndex`."""
+        parent = self.parent
+        if parent is None or not numbers:
+            raise RowError("rows can be kept of a parent alone, and one at least")
+        self._require_fit(parent)
+        span = slice(numbers.start, numbers.stop)
+        self._open_arrays(parent.arrays)
+        for name, file in (self._arrays or {}).items():
+            for start in range(span.start, span.stop, BLOCK_ROWS):
+                file.append(parent.arrays[name][start : min(start + BLOCK_ROWS, span.stop)])
+        records = parent.rows.table[span].copy()
+        first, last = int(records["start"][0]), int(records["stop"][-1])
+        if (records["start"][1:] == records["stop"][:-1]).all():
+            shift = self._text.tell() - first
+            self._text.write(parent.rows.text[first:last].data)
+            records["start"] += shift
+            records["stop"] += shift
+        else:  # of a grown generation of format 2
+            lines = [parent.rows.line(number) + b"\n" for number in numbers]
+            self._place(records, lines)
+            self._text.writelines(lines)
+        self._records.append(records)
+
     def close(self) -> Tables:
         """Finish the files, check that everything fits together, and map what was written."""
         if self._vectors is None or not self._records:
@@ -128,13 +154,17 @@ class TableWriter:
             return np.full(len(rows), -1)
         numbers = self.parent.matching(ids, [row.get("digest") for row in rows])
         if (numbers >= 0).any():
-            if not self._fits:
-                raise MismatchedIndex(
-                    f"vectors can be taken over only from an index with the same fingerprint {self._fingerprint}; "
-                    f"{self.parent.name} has {self.parent.fingerprint}. Build the index without a parent"
-                )
-            self._used = True
+            self._require_fit(self.parent)
         return numbers
+
+    def _require_fit(self, parent: Generation) -> None:
+        """Rows are to be taken over from the parent: they must have been made alike."""
+        if not self._fits:
+            raise MismatchedIndex(
+                f"vectors can be taken over only from an index with the same fingerprint {self._fingerprint}; "
+                f"{parent.name} has {parent.fingerprint}. Build the index without a parent"
+            )
+        self._used = True
 
     def _add_vectors(self, vectors: Floats) -> None:
         if self._vectors is None:
@@ -180,16 +210,21 @@ class TableWriter:
         lines, same = [], np.zeros(len(rows), bool)
         for place, (row, name, number) in enumerate(zip(rows, ids, numbers.tolist(), strict=True)):
             before = b"" if self.parent is None or number < 0 else self.parent.rows.line(number)
-            lines.append(json_of(dict(row), f"row {name!r}", name, checked=before))
-            same[place] = lines[place] == before
+            line = json_of(dict(row), f"row {name!r}", name, checked=before)
+            lines.append(line + b"\n")
+            same[place] = line == before
         for name in KEYS:
             if self.parent is not None and same.any():
                 records[name][same] = self.parent.rows.table[name][numbers[same]]
             records[name][~same] = keys_of(rows[place].get(name) for place in np.flatnonzero(~same).tolist())
-        records["stop"] = self._text.tell() + np.cumsum([len(line) + 1 for line in lines])
-        records["start"] = np.concatenate([[self._text.tell()], records["stop"][:-1]])
-        self._text.writelines(line + b"\n" for line in lines)
+        self._place(records, lines)
+        self._text.writelines(lines)
         self._records.append(records)
+
+    def _place(self, records: NDArray[Any], lines: Sequence[bytes]) -> None:
+        """Say where lines will stand that are written next."""
+        records["stop"] = self._text.tell() + np.cumsum([len(line) for line in lines])
+        records["start"] = np.concatenate([[self._text.tell()], records["stop"][:-1]])
 
     def _check_distinct(self, table: NDArray[Any]) -> None:
         keys = np.ascontiguousarray(table["id"])

@@ -52,11 +52,15 @@ class Job:
     queries: Floats | None = None
 
 
-def write_generation(folder: Path, name: str, blocks: Iterable[Block], job: Job) -> None:
-    """Fill the empty `folder` with the generation of that name."""
+def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], job: Job) -> int:
+    """Fill the empty `folder` with the generation of that name. Returns how many slots, the first ones, are the
+    parent's in the parent's structure."""
     with TableWriter(folder, job.parent, job.fingerprint) as writer:
         for block in blocks:
-            writer.add(block)
+            if isinstance(block, range):
+                writer.keep(block)
+            else:
+                writer.add(block)
         tables = writer.close()
     clash = sorted(set(job.documents) & set(tables.arrays))
     if clash:
@@ -66,7 +70,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block], job: Job)
             handle.write(files.encoded(content, indent=2) + b"\n")
     if job.settle is not None:
         job = _settled(job, job.settle(tables))
-    index, built_slots = _index(tables, job)
+    index, built_slots, kept = _index(tables, job)
     if index.save(folder / STRUCTURE):
         files.sync(folder / STRUCTURE)
     slots = len(tables.vectors)
@@ -92,17 +96,19 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block], job: Job)
     )
     write_manifest(folder, manifest)
     files.sync(folder)
+    return kept
 
 
-def _index(tables: Tables, job: Job) -> tuple[VectorIndex, int]:
-    """The index over the vectors, and how many there were when its structure was trained."""
+def _index(tables: Tables, job: Job) -> tuple[VectorIndex, int, int]:
+    """The index over the vectors, how many there were when its structure was trained, and how many the parent had in
+    it."""
     vectors, parent = tables.vectors, tables.parent
     if parent is None or tables.renumbered or not _serves(parent, len(vectors), job):
-        return job.kind.over(vectors, job.asked, seed=job.seed, threads=job.threads), len(vectors)
+        return job.kind.over(vectors, job.asked, seed=job.seed, threads=job.threads), len(vectors), 0
     index = parent.index.copy()
     index.threads = job.threads
     index.grow(vectors)
-    return index, parent.manifest.counts.built_slots
+    return index, parent.manifest.counts.built_slots, len(parent.embeddings)
 
 
 def _serves(parent: Generation, slots: int, job: Job) -> bool:

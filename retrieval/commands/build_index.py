@@ -58,6 +58,10 @@ def build_index(
         bool,
         typer.Option("--cluster", help="shards are built by Ray, side by side: that of RAY_ADDRESS, else one here"),
     ] = False,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="read every photo's file, also those whose size, times and inode did not change"),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
@@ -79,6 +83,7 @@ def build_index(
         "kind": kind,
         "min_recall": min_recall,
         "max_ms": max_ms,
+        "verify": verify,
     }
     if shards is None and is_cluster(out):
         shards = read_cluster(out).of

@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -33,7 +34,7 @@ UNREAD = frozenset(
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class CataloguePhoto:
     """One photo: its `path` is relative to the catalogue; `metadata` is the user's own."""
 
@@ -97,7 +98,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    found = list(_walk(root, "", Path(os.path.realpath(root)), set()))
+    found = list(_walk(str(root), "", Path(os.path.realpath(root)), set()))
     skipped = [item for item in found if isinstance(item, SkippedPhoto)]
     path = root / METADATA_FILE
     try:
@@ -117,7 +118,8 @@ def catalogue_of(
     photos: list[tuple[str, str]] = []
     skipped, ignored, unfit, unread = list(passed_over), [], [], set()
     for path in sorted(names):
-        ending = os.path.splitext(path)[1].lower()
+        dot = path.rfind(".")
+        ending = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
         if ending not in EXTENSIONS and ending not in UNREAD:
             ignored += [path] if path != METADATA_FILE else []
             continue
@@ -173,22 +175,20 @@ def decode_photo(file: PhotoBytes) -> RgbImage | SkippedPhoto:
         return SkippedPhoto(file.photo.path, error.reason)
 
 
-def _walk(folder: Path, prefix: str, root: Path, followed: set[Path]) -> Iterator[str | SkippedPhoto]:
+def _walk(folder: str, prefix: str, root: Path, followed: set[Path]) -> Iterator[str | SkippedPhoto]:
     """All files below a folder as relative posix paths, and what is passed over.
 
     A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
     """
     try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
+        entries = sorted(os.scandir(folder), key=attrgetter("name"))
     except OSError as error:
         raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
     for entry in entries:
         path = prefix + entry.name
         if entry.name.startswith("."):
             continue
-        try:
-            path.encode()
-        except UnicodeEncodeError:
+        if not path.isascii() and not _is_utf8(path):
             named = os.fsencode(path).decode(errors="backslashreplace")
             yield SkippedPhoto(named, "the name is not valid UTF-8; rename it")
             continue
@@ -199,16 +199,25 @@ def _walk(folder: Path, prefix: str, root: Path, followed: set[Path]) -> Iterato
         if not is_folder:
             yield path
             continue
-        target = Path(os.path.realpath(entry.path))
         if not entry.is_symlink():
-            yield from _walk(Path(entry.path), path + "/", root, followed)
-        elif target.is_relative_to(root) or root.is_relative_to(target):
+            yield from _walk(entry.path, path + "/", root, followed)
+            continue
+        target = Path(os.path.realpath(entry.path))
+        if target.is_relative_to(root) or root.is_relative_to(target):
             yield SkippedPhoto(path, "a link into or around the catalogue itself is not followed")
         elif target in followed:
             yield SkippedPhoto(path, f"a link to {target}, which another link has listed already")
         else:
             followed.add(target)
-            yield from _walk(Path(entry.path), path + "/", root, followed)
+            yield from _walk(entry.path, path + "/", root, followed)
+
+
+def _is_utf8(path: str) -> bool:
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 # The user's own metadata -----------------------------------------------------------------------------------

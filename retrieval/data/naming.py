@@ -59,6 +59,10 @@ class Naming:
 
     def object_of(self, path: str) -> str | None:
         """The object of the photo at `path`, forward slashes; None where the path does not fit the rule."""
+        if self.text == FOLDER:
+            first, _, rest = path.partition("/")
+            if first not in ("", ".") and rest.strip("./"):  # most paths, without taking them apart
+                return first
         name = PurePosixPath(path)
         if self.text == FOLDER:
             return name.parts[0] if len(name.parts) > 1 else name.stem
@@ -97,8 +101,9 @@ def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
         )
     elif len(names) == 1 and photos[names[0]] > 1:
         found.append(f"all {photos[names[0]]} photos are taken for photos of one object, {names[0]}")
-    stems = Counter(map(without_number, names))
-    alike = [name for name in names if (stem := without_number(name)) and stems[stem] > 1]
+    stem_of = {name: without_number(name) for name in names}
+    stems = Counter(stem_of.values())
+    alike = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
     if naming.text != STEM and alike:
         single = all(photos[name] == 1 for name in names)
         what = "every object has one photo, and " if single else ""

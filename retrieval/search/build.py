@@ -24,6 +24,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.stored import fingerprint
 from retrieval.search.build_report import BuildReport
 from retrieval.search.embed import Embedder, Part, layouts
+from retrieval.search.looks import Looked
 from retrieval.search.measuring import WinnerBench, can_measure, query_codes
 from retrieval.search.operating import (
     Asked,
@@ -47,6 +48,7 @@ def build_index(
     kind: str | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
+    verify: bool = False,
     quiet: bool = False,
 ) -> BuildReport:
     """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
@@ -55,11 +57,12 @@ def build_index(
 
     objects_from: which object a photo shows (`retrieval.data.naming`); where None, as the index has it, else by folder.
     kind, min_recall, max_ms: what is asked of the search (`retrieval.search.operating`); where all are None, exact
-    search. Where neither the photos' content nor their objects nor what is asked for changed, nothing is written.
-    Photos that cannot be read are skipped and reported. Raises BadInput for a rule that is none, DatasetError where no
-    photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the index as it was. What
-    was embedded until an error, or until the process was killed, is not embedded again by the next build
-    (`indexes.store.unfinished`).
+    search. verify: read every file, also those whose size, times and inode are as an earlier build found them
+    (`retrieval.search.looks`). Where neither the photos' content nor their objects nor what is asked for changed,
+    nothing is written. Photos that cannot be read are skipped and reported. Raises BadInput for a rule that is none,
+    DatasetError where no photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the
+    index as it was. What was embedded until an error, or until the process was killed, is not embedded again by the
+    next build (`indexes.store.unfinished`).
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -71,17 +74,25 @@ def build_index(
     named_before = _named_before(IndexStore(out))
     naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
     renamed = "" if named_before in (None, naming.text) else renamed_note(naming, str(named_before))
-    return build_listed(list_photos(folder, naming), checkpoint, out, Wanted(naming, asked, quiet, note=renamed))
+    wanted = Wanted(naming, asked, quiet, verify, note=renamed)
+    return build_listed(list_photos(folder, naming), checkpoint, out, wanted)
+
+
+UNNOTED = (
+    "How the photos' files looked when they were read was not noted, as older versions do not, so each was read and "
+    "compared."
+)
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is wanted of a build. note: to be said of it first. about: more for the manifest. donors: generations whose
-    codes may be taken. keep: generations before the new one that stay."""
+    """What is wanted of a build. verify: as `build_index` takes it. note: to be said of it first. about: more for the
+    manifest. donors: generations whose codes may be taken. keep: generations before the new one that stay."""
 
     naming: Naming
     asked: Asked
     quiet: bool = False
+    verify: bool = False
     note: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
     donors: Sequence[Generation] = ()
@@ -104,14 +115,18 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
             **wanted.about,
         }
         start = time.perf_counter()
+        looked = Looked(catalogue, out, wanted.verify)
         with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
-            made = Embedder(checkpoint, parent, unfinished, wanted.donors)
+            made = Embedder(checkpoint, parent, unfinished, looked, wanted.donors)
             with closing(made.parts(catalogue, wanted.quiet)) as parts:
                 changed = _unless_same(parent, parts, about)
                 job = _Job(store, made, about, asked, wanted.quiet, wanted.keep)
                 generation = parent if parent is not None and changed is None else job.write(changed or ())
             unfinished.clear()
+        looked.note(generation)
         seconds = time.perf_counter() - start - job.settling_s
+        if parent is not None and looked.unnoted:
+            why = UNNOTED
     names = sorted(made.objects)
     return BuildReport(
         index=str(out),
@@ -129,6 +144,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         renamed=made.renamed,
         resumed=made.resumed,
         removed=made.removed,
+        unread=made.unread,
         skipped=made.skipped,
         ignored=_outside(catalogue, out),
         without_photo=sorted(set(catalogue.object_ids) - set(names)),
@@ -182,6 +198,11 @@ def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mappin
     place = 0
     for part in parts:
         same.append(part)
+        if part.kept:
+            if part.kept.start != place:
+                return chain(same, parts)
+            place = part.kept.stop
+            continue
         if part.halves is not None or parent.rows[place : place + len(part.rows)] != part.rows:
             return chain(same, parts)
         place += len(part.rows)
@@ -205,7 +226,7 @@ class _Job:
         checkpoint = self.made.checkpoint
         return self.store.write_blocks(
             (
-                Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
+                part.kept or Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
                 for part in parts
             ),
             {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},

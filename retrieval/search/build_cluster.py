@@ -61,6 +61,7 @@ class ShardJob:
     naming: Naming
     asked: Asked
     donors: Sequence[tuple[str, str]]
+    verify: bool
     quiet: bool
 
 
@@ -91,6 +92,7 @@ def build_cluster(
     min_recall: float | None = None,
     max_ms: float | None = None,
     bad_share: float = BAD_SHARE,
+    verify: bool = False,
     quiet: bool = False,
     run: Run | None = None,
 ) -> BuildReport:
@@ -119,7 +121,7 @@ def build_cluster(
             [] if before is None or before.of == shards else [(one.folder, one.generation) for one in before.shards]
         )
         jobs = [
-            ShardJob(out, shard_folder(number, shards), own, checkpoint.path, naming, asked, donors, quiet)
+            ShardJob(out, shard_folder(number, shards), own, checkpoint.path, naming, asked, donors, verify, quiet)
             for number, own in _divided(catalogue, shards)
         ]
         built = sorted((run or one_after_another)(jobs, checkpoint), key=lambda one: one.folder)
@@ -151,7 +153,8 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
     store = IndexStore(job.cluster / job.folder)
     donors = [_donor(job.cluster, *donor, fingerprint(model)) for donor in job.donors]
     about = {"shard": job.folder}
-    wanted = Wanted(job.naming, job.asked, job.quiet, "", about, [one for one in donors if one is not None], _KEEP_ALL)
+    usable = [one for one in donors if one is not None]
+    wanted = Wanted(job.naming, job.asked, job.quiet, job.verify, "", about, usable, _KEEP_ALL)
     try:
         report = build_listed(job.catalogue, model, store.path, wanted)
     except NoPhoto as error:
@@ -230,6 +233,7 @@ def _report(
         renamed=sum(report.renamed for report in reports),
         resumed=sum(report.resumed for report in reports),
         removed=sum(report.removed for report in reports),
+        unread=sum(report.unread for report in reports),
         skipped=skipped,
         ignored=list(catalogue.ignored),
         without_photo=sorted(lost),

@@ -16,16 +16,17 @@ SHOWN, FEW = 20, 5
 class BuildReport:
     """What a build did.
 
-    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that
-    names objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects, each
-    with a photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew,
-    `renamed` of which had another name in the index before, and `resumed` of which stood in no index yet, but had been
-    embedded by a build that was cut off. removed: names that are gone. skipped: pictures that could not be read;
+    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that names
+    objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects, each with a
+    photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew, `renamed` of
+    which had another name in the index before, and `resumed` of which stood in no index yet, but had been embedded by a
+    build that was cut off. removed: names that are gone. unread: of how many the files were not read, as they look as
+    they did when an earlier build read them (`retrieval.search.looks`). skipped: pictures that could not be read;
     ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all
     of whose pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
     (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
-    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a
-    cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
+    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a cluster,
+    as its manifest names them (`indexes.store.cluster`); None for an index folder.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -49,6 +50,7 @@ class BuildReport:
     renamed: int
     resumed: int
     removed: int
+    unread: int
     skipped: list[SkippedPhoto]
     ignored: list[str]
     without_photo: list[str]
@@ -84,7 +86,12 @@ class BuildReport:
             f"{self.embedded} embedded{resumed}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
         )
         if not self.written:
-            yield "nothing changed, by the content of every file: the index stays as it is"
+            yield "nothing changed: the index stays as it is"
+        if self.unread:
+            yield (
+                f"{self.unread} photos are taken to be what they were, by size, times and inode of their files; the "
+                f"other {self.photos - self.unread} were read (--verify reads all)"
+            )
         each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
         yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
         yield from (f"  {name} <- {photo}" for name, photo in self.examples)

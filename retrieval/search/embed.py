@@ -5,16 +5,17 @@ the towers, as PyTorch's default is, waits for those of its members whose core i
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
 from indexes.store.tables import Layouts
 from indexes.store.unfinished import Unfinished
@@ -24,6 +25,7 @@ from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, default_device, one_thread
 from retrieval.model.photo_encoder import fastest, on_torch
+from retrieval.search.looks import Looked, row_of, runs
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -58,10 +60,23 @@ class _Found:
 
 
 @dataclass(frozen=True)
+class _Kept:
+    """Photos whose rows the parent has as they would be written, one after another."""
+
+    photos: Sequence[CataloguePhoto]
+    rows: range
+
+
+_Item: TypeAlias = _Found | SkippedPhoto | _Kept
+_Listed: TypeAlias = tuple[CataloguePhoto, int]
+
+
+@dataclass(frozen=True)
 class Part:
     """Photos that follow each other, as many to encode among them as make a batch; what became of them.
 
-    rows: of all that could be read; embeddings (F, d) and halves (F, half): of those that the parent does not have
+    kept: the parent's rows of these numbers, as they are, and nothing else. rows: of all that could be read;
+    embeddings (F, d) and halves (F, half): of those that the parent does not have
     under their names, of which `embedded` were encoded now, and `resumed` by a build that was cut off.
     """
 
@@ -72,16 +87,20 @@ class Part:
     half_error: float = 0.0
     embedded: int = 0
     resumed: int = 0
+    kept: range = range(0)
+    objects: Mapping[str, int] = field(default_factory=dict)
+    """How many photos each object has; of `kept` alone, where no row tells."""
 
 
 class Embedder:
     """Makes parts of a catalogue's photos, and counts what became of them. What it encodes is kept in `unfinished`.
 
-    donors: other generations of the same model, whose codes are taken for photos of the same content.
+    looked: how the files look, and so which need not be read. donors: other generations of the same model, whose codes
+    are taken for photos of the same content.
 
     photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `renamed` had
     another name in the parent, and `known` are the parent's own by id, with the same content or another. objects: how
-    many rows each has. half_error: largest rounding of a stored half.
+    many rows each has. unread: how many files need not be read. half_error: largest rounding of a stored half.
     """
 
     def __init__(
@@ -89,13 +108,14 @@ class Embedder:
         checkpoint: Checkpoint,
         parent: Generation | None,
         unfinished: Unfinished,
+        looked: Looked,
         donors: Sequence[Generation] = (),
     ) -> None:
-        self.checkpoint, self.parent, self.unfinished = checkpoint, parent, unfinished
+        self.checkpoint, self.parent, self.unfinished, self.looked = checkpoint, parent, unfinished, looked
         self._holders = [*([] if parent is None else [parent]), *donors]
         self.skipped: list[SkippedPhoto] = []
         self.objects: Counter[str] = Counter()
-        self.photos, self.embedded, self.resumed, self.renamed, self.known = 0, 0, 0, 0, 0
+        self.photos, self.embedded, self.resumed, self.renamed, self.known, self.unread = 0, 0, 0, 0, 0, 0
         self.half_error = 0.0
         self._encode_photos = on_torch(checkpoint)
 
@@ -112,13 +132,14 @@ class Embedder:
         new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
         if new >= MANY and default_device().type == "cpu":
             self._encode_photos = fastest(self.checkpoint)
-        lists = batches(catalogue.photos, READ)
-        found = ahead(lambda photos: self._find(catalogue, photos), lists, threads, 2 * threads)
+        known = self.looked.known(self.parent)
+        self.unread = int((known >= 0).sum())
+        found = ahead(lambda some: self._find(catalogue, some), self._lists(catalogue, known), threads, 2 * threads)
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
             for part in ahead(self._encode, _full(chain.from_iterable(found)), threads, 2 * threads):
                 self._count(part)
-                bar.advance(len(part.rows) + len(part.skipped))
-                if part.rows:
+                bar.advance(len(part.kept) + len(part.rows) + len(part.skipped))
+                if part.kept or part.rows:
                     yield part
         if not self.photos:
             first = self.skipped[0]
@@ -130,30 +151,43 @@ class Embedder:
             errors = [holder.manifest.about.get("half_error", 0.0) for holder in self._holders]
             self.half_error = max(self.half_error, *errors)
 
-    def _find(self, catalogue: Catalogue, photos: Sequence[CataloguePhoto]) -> list[_Found | SkippedPhoto]:
+    def _lists(self, catalogue: Catalogue, known: Slots) -> Iterator[_Kept | list[_Listed]]:
+        """The photos in their order: long runs that stay as they are, and lists of others, each with its row in the
+        parent where its file need not be read."""
+        done = 0
+        for run in chain(runs(catalogue.photos, known, self.parent), [slice(len(known), len(known))]):
+            others = zip(catalogue.photos[done : run.start], known[done : run.start].tolist(), strict=True)
+            yield from batches(others, READ)
+            if run.start < run.stop:
+                first = int(known[run.start])
+                yield _Kept(catalogue.photos[run], range(first, first + run.stop - run.start))
+            done = run.stop
+
+    def _find(self, catalogue: Catalogue, some: "_Kept | list[_Listed]") -> list[_Item]:
         """Read photos' files, and keep the bytes of those with which there is more to do. Called on threads."""
-        items = [read_photo(catalogue, photo) for photo in photos]
+        if isinstance(some, _Kept):
+            return [some]
+        items = [read_photo(catalogue, photo) if number < 0 else self._same(photo, number) for photo, number in some]
         read = [item for item in items if isinstance(item, PhotoBytes)]
         known: set[str] = set()
         if self.parent is not None:
             known.update(self.parent.reusable({item.photo.path: item.digest for item in read}))
         codes = self._made_before([item.digest for item in read if item.photo.path not in known])
-        found: list[_Found | SkippedPhoto] = []
+        found: list[_Item] = []
         for item in items:
-            if isinstance(item, SkippedPhoto):
+            if not isinstance(item, PhotoBytes):
                 found.append(item)
                 continue
             photo = item.photo
-            row = {
-                "id": photo.path,
-                "object_id": photo.object_id,
-                "path": photo.path,
-                "digest": item.digest,
-                "metadata": photo.metadata,
-            }
             code = None if photo.path in known else codes.get(item.digest)
-            found.append(_Found(row, item if code is None and photo.path not in known else None, code))
+            file = item if code is None and photo.path not in known else None
+            found.append(_Found(row_of(photo, item.digest), file, code))
         return found
+
+    def _same(self, photo: CataloguePhoto, number: int) -> _Found:
+        """A photo whose file has the content of that row of the parent."""
+        assert self.parent is not None
+        return _Found(row_of(photo, self.parent.rows[number]["digest"]))
 
     def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
         """Codes of these contents, of the parent under other names, or of a build that was cut off."""
@@ -173,13 +207,15 @@ class Embedder:
             found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), resumed=True)
         return found
 
-    def _encode(self, found: Sequence[_Found | SkippedPhoto]) -> Part:
+    def _encode(self, found: Sequence[_Item]) -> Part:
         """Decode and encode those that must be. Called on threads."""
+        if isinstance(found[0], _Kept):
+            return Part([], kept=found[0].rows, objects=Counter(photo.object_id for photo in found[0].photos))
         part, new, images = Part([]), list[dict[str, Any]](), list[Image]()
         codes = dict[str, _Code]()
         for item in found:
-            if isinstance(item, SkippedPhoto):
-                part.skipped.append(item)
+            if not isinstance(item, _Found):
+                part.skipped.extend([item] if isinstance(item, SkippedPhoto) else [])
                 continue
             image = None if item.file is None else decode_photo(item.file)
             if isinstance(image, SkippedPhoto):
@@ -227,13 +263,15 @@ class Embedder:
 
     def _count(self, part: Part) -> None:
         self.skipped += part.skipped
+        self.objects.update(part.objects)
         self.objects.update(row["object_id"] for row in part.rows)
-        self.photos += len(part.rows)
+        self.photos += len(part.kept) + len(part.rows)
         self.embedded += part.embedded
         self.resumed += part.resumed
         self.renamed += 0 if part.halves is None else len(part.halves) - part.embedded - part.resumed
         self.half_error = max(self.half_error, part.half_error)
-        if self.parent is not None:
+        self.known += len(part.kept)
+        if self.parent is not None and part.rows:
             self.known += int((self.parent.rows.find([row["id"] for row in part.rows]) >= 0).sum())
 
 
@@ -265,11 +303,17 @@ def layouts(checkpoint: Checkpoint) -> Layouts:
     }
 
 
-def _full(found: Iterable[_Found | SkippedPhoto]) -> Iterator[list[_Found | SkippedPhoto]]:
-    """Parts with a whole batch of photos to encode in each but the last."""
-    part: list[_Found | SkippedPhoto] = []
+def _full(found: Iterable[_Item]) -> Iterator[list[_Item]]:
+    """Parts with a whole batch of photos to encode in each but the last, and but those before a run that is kept."""
+    part: list[_Item] = []
     new, held = 0, 0
     for item in found:
+        if isinstance(item, _Kept):
+            if part:
+                yield part
+            yield [item]
+            part, new, held = [], 0, 0
+            continue
         part.append(item)
         new += isinstance(item, _Found) and item.file is not None
         held += isinstance(item, _Found) and item.code is not None

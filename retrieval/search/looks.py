@@ -1,0 +1,131 @@
+"""Which photos need not be read: files that look as they did when an earlier build read them.
+
+Size, both times and inode are compared. A write within one tick of the disk's clock would leave all four as they were,
+so a file that had changed just before a build looked at it is not noted, and the next build reads it again: what git
+does with its "racily clean" files.
+"""
+
+import json
+import os
+import time
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.kinds.scores import Slots
+from indexes.store.generation import Generation
+from indexes.store.rows import keys_of
+from indexes.store.seen import LOOKS, Looks, Seen
+from retrieval.data.catalogue import Catalogue, CataloguePhoto
+from retrieval.data.sources import Fetched
+
+SETTLED_NS = 2 * 10**9
+"""A file must have been left alone for so long: the coarsest clock of a common disk, FAT's, ticks every two seconds."""
+LEAST_RUN = 256
+"""Photos in a row that are worth being taken over as they lie; each such run ends a batch of photos to encode."""
+
+_MASK = 2**64 - 1
+_BARE = b'"metadata": {}}'
+"""How the line of a row without metadata ends, as `row_of` has it last."""
+
+
+class Looked:
+    """How the files of a catalogue's photos look, N of them, in its order; taken before any is read.
+
+    ids: keys of the photos' ids. verify: all are to be read, whatever they look like. unnoted: whether all are read for
+    want of notes.
+    """
+
+    def __init__(self, catalogue: Catalogue, index: Path, verify: bool = False) -> None:
+        self.photos = catalogue.photos
+        self.ids = keys_of(photo.path for photo in self.photos)
+        self._seen = Seen(index)
+        self._local, self._verify = not isinstance(catalogue, Fetched), verify
+        self._looks, self._settled = _looks(catalogue) if self._local else _unknown(len(self.photos))
+        self.unnoted = self._local and not verify and not len(self._seen.records)
+
+    def known(self, parent: Generation | None) -> Slots:
+        """For each photo the parent's row (N,) of its id and content, where its file need not be read; else -1."""
+        if parent is None or self._verify or not self._local:
+            return np.full(len(self.photos), -1)
+        digests = self._seen.digests(self.ids, self._looks)
+        return parent.matching_keys(self.ids, digests)
+
+    def note(self, made: Generation) -> None:
+        """Write down how files look whose content is that of the generation's rows, for the next build."""
+        if not self._local:
+            return
+        numbers = made.rows.find_keys(self.ids)
+        good = (numbers >= 0) & self._settled
+        self._seen.write(self.ids[good], made.rows.table["digest"][numbers[good]], self._looks[good])
+
+
+def runs(photos: tuple[CataloguePhoto, ...], known: Slots, parent: Generation | None) -> Iterator[slice]:
+    """Long runs of photos whose rows in the parent follow each other and would be written as they are."""
+    if parent is None:
+        return
+    same = np.where(_as_they_are(photos, known, parent), known, -1)
+    ends = np.flatnonzero((same[1:] != same[:-1] + 1) | (same[1:] < 0)) + 1
+    for start, stop in pairwise([0, *ends.tolist(), len(same)]):
+        if stop - start >= LEAST_RUN and same[start] >= 0:
+            yield slice(start, stop)
+
+
+def _as_they_are(photos: Sequence[CataloguePhoto], known: Slots, parent: Generation) -> NDArray[np.bool_]:
+    """Whether the parent's rows of these numbers say of the photos (N,) what is to be said now. Ids and contents fit.
+
+    Rows without metadata are compared by the keys of their objects, and not parsed.
+    """
+    names = {photo.object_id for photo in photos}
+    keys = dict(zip(names, keys_of(names).tolist(), strict=True))
+    objects = np.array([keys[photo.object_id] for photo in photos], "S16")
+    same: NDArray[np.bool_] = (known >= 0) & (parent.rows.table["object_id"][known] == objects)
+    telling = ~parent.rows.ending(_BARE)[known] | np.array([bool(photo.metadata) for photo in photos])
+    for place in np.flatnonzero(same & telling).tolist():
+        same[place] = _is_row(photos[place], parent, int(known[place]))
+    return same
+
+
+def _is_row(photo: CataloguePhoto, parent: Generation, number: int) -> bool:
+    try:
+        row = json.loads(parent.rows.line(number))
+        said = {**row, "metadata": repr(row["metadata"])}  # 1, 1.0 and true are equal, and not the same
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return False
+    return bool(said == row_of(photo, row.get("digest")) | {"metadata": repr(photo.metadata)})
+
+
+def row_of(photo: CataloguePhoto, digest: str) -> dict[str, Any]:
+    """What an index says of a photo with this content."""
+    return {
+        "id": photo.path,
+        "object_id": photo.object_id,
+        "path": photo.path,
+        "digest": digest,
+        "metadata": photo.metadata,
+    }
+
+
+def _looks(catalogue: Catalogue) -> tuple[Looks, NDArray[np.bool_]]:
+    """Of each file (N, 4), and whether it had been left alone for `SETTLED_NS`."""
+    now, folder = time.time_ns(), f"{catalogue.folder}/"
+    looks, settled = list[int](), list[bool]()
+    for photo in catalogue.photos:
+        try:
+            found = os.stat(folder + photo.path)
+        except (OSError, ValueError):  # reading it will say why
+            looks += [0] * len(LOOKS)
+            settled.append(False)
+            continue
+        modified, changed = found.st_mtime_ns, found.st_ctime_ns
+        looks += [found.st_size & _MASK, modified & _MASK, changed & _MASK, found.st_ino & _MASK]
+        settled.append(max(modified, changed) + SETTLED_NS < now)
+    return np.array(looks, np.uint64).reshape(-1, len(LOOKS)), np.array(settled)
+
+
+def _unknown(count: int) -> tuple[Looks, NDArray[np.bool_]]:
+    return np.zeros((count, len(LOOKS)), np.uint64), np.zeros(count, bool)
