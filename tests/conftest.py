@@ -53,14 +53,18 @@ def _state_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No test reads or writes what the user's commands remember, or what another test's do.
+    """No test reads or writes what the user's commands remember or keep, or what another test's do.
 
     One folder, emptied after whoever wrote into it: making one for each of thousands of tests takes half a minute.
     """
+    cache = _state_folder.with_name(f"{_state_folder.name}-cache")
     monkeypatch.setenv("XDG_STATE_HOME", str(_state_folder))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     yield
     for left in _state_folder.iterdir():
         shutil.rmtree(left)
+    if cache.is_dir():
+        shutil.rmtree(cache)
 
 
 @pytest.fixture

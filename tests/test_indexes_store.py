@@ -342,7 +342,7 @@ def test_new_vectors_of_another_size_than_the_parents_are_refused(tmp_path):
 def test_a_build_whose_rows_do_not_find_themselves_never_becomes_current(tmp_path, monkeypatch):
     filled(tmp_path)
 
-    def failing(self, sample=256, seed=0):
+    def failing(self, sample=256, seed=0, since=0):
         raise SelfRetrievalFailed("2 of 20 rows do not find themselves (p1, p2)", ["p1", "p2"])
 
     monkeypatch.setattr(Generation, "self_check", failing)

@@ -178,7 +178,7 @@ def test_an_export_with_a_flipped_bit_is_not_used_where_onnx_runtime_takes_it(pl
     data = bytearray(path.read_bytes())
     data[int(place * len(data)) if isinstance(place, float) else place] ^= 1
     path.write_bytes(data)
-    assert onnx_encoder.exported_beside(checkpoint) is None
+    assert onnx_encoder.exported(checkpoint) is None
     assert "is damaged or no export" in caplog.text
 
 
@@ -210,7 +210,7 @@ def test_without_onnx_runtime_pytorch_serves(own, onnx_wins, monkeypatch):
     checkpoint = load_checkpoint(own)
     export(checkpoint)
     monkeypatch.setattr(onnx_encoder, "find_spec", lambda name: None)
-    assert onnx_encoder.exported_beside(checkpoint) is None
+    assert onnx_encoder.exported(checkpoint) is None
 
 
 @pytest.mark.parametrize("part", ["half", "embedding"])
@@ -221,6 +221,50 @@ def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, own, 
     monkeypatch.setattr(searcher.encoder, "encode", lambda touches: codes)
     with pytest.raises(NumericalError, match=f"the {part} of touch 2 holds a NaN"):
         searcher.query([touch, touch])
+
+
+# The user's cache ------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_without_an_export_beside_it_has_one_in_the_cache_once(own, index, touch, onnx_wins):
+    checkpoint = load_checkpoint(own)
+    made = exporting.export_to_cache(checkpoint)
+    assert Path(made.path) == onnx_encoder.cached(checkpoint.digest)
+    assert Searcher.open(index).query([touch]).index["encoder"] == "onnx"
+    assert exporting.export_to_cache(checkpoint) is None
+    assert not own.with_suffix(".onnx").exists()
+
+
+def test_the_export_beside_a_checkpoint_comes_first(own, monkeypatch):
+    timed(monkeypatch, 2.0, 1.0)
+    checkpoint = load_checkpoint(own)
+    export(checkpoint)
+    assert exporting.export_to_cache(checkpoint) is None
+    assert not onnx_encoder.cached(checkpoint.digest).exists()
+
+
+def test_a_damaged_export_in_the_cache_is_made_again(own, monkeypatch):
+    checkpoint = load_checkpoint(own)
+    path = onnx_encoder.cached(checkpoint.digest)
+    path.parent.mkdir(parents=True)
+    path.write_bytes(sealed(b"model" * 100)[:-1])
+    timed(monkeypatch, 2.0, 1.0)
+    assert Path(exporting.export_to_cache(checkpoint).path) == path
+    assert OnnxEncoder(path, checkpoint.digest).name == "onnx"
+
+
+@pytest.mark.parametrize("trouble", ["slower", "a file in the way", "no home"])
+def test_without_a_cache_a_build_goes_on(trouble, own, monkeypatch, tmp_path):
+    timed(monkeypatch, 1.0, 2.0)
+    (tmp_path / "file").touch()
+    if trouble == "a file in the way":
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    if trouble == "no home":
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    checkpoint = load_checkpoint(own)
+    assert exporting.export_to_cache(checkpoint) is None
+    assert onnx_encoder.exported(checkpoint) is None
 
 
 # The command -----------------------------------------------------------------------------------------------------

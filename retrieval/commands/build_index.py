@@ -68,6 +68,7 @@ def build_index(
     from indexes.store.cluster import is_cluster, read_cluster
     from retrieval.data.sources import is_elsewhere
     from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.model.export import export_to_cache
     from retrieval.search import build, build_cluster, defaults
 
     sheet = out.resolve().with_name(f"{out.resolve().name}-views.png")
@@ -106,6 +107,8 @@ def build_index(
         say(f"what was embedded is kept in {out}; the same command goes on with it")
         raise
     defaults.remember("index", out)
+    if defaults.is_shipped(path) and (made := export_to_cache(checkpoint)):
+        say(f"for queries without PyTorch, once: {made}")
     for line in report.lines():
         say(line)
     if preview:

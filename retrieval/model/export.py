@@ -1,9 +1,11 @@
 """`retrieve export`: the touch encoder as ONNX, if it is faster so on this machine."""
 
+import logging
 import statistics
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,12 +17,13 @@ from torch import Tensor, nn
 
 from indexes.store.files import write_atomically
 from retrieval.console.files import EXPORT, require_ours
-from retrieval.errors import BadInput, RetrievalError
+from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
 from retrieval.model.fusion import Matcher, Standardise
-from retrieval.model.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, sealed
+from retrieval.model.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, cached, sealed, unsealed
 
+log = logging.getLogger(__name__)
 ROUNDS = 9
 TOLERANCE = 1e-3
 """Largest difference of a half from PyTorch's, relative to the largest half, and of an embedding's component."""
@@ -71,6 +74,26 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     finally:
         unsettled.unlink(missing_ok=True)
     return result
+
+
+def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
+    """Write the export of a checkpoint to the user's cache, where queries look for it too: once, and only where none
+    lies beside the checkpoint. For a checkpoint in the folder of an installed package, which is not ours to write to.
+
+    None where there is nothing to do, or nothing can be done: a query works without it.
+    """
+    path = cached(checkpoint.digest)
+    if path is None or checkpoint.path.with_suffix(ENDING).is_file():
+        return None
+    with suppress(CheckpointError):  # none yet, or a damaged one
+        unsealed(path)
+        return None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return export(checkpoint, path)
+    except (OSError, RetrievalError) as error:
+        log.info("no export for queries: %s", error)
+        return None
 
 
 def graph_of(checkpoint: Checkpoint) -> bytes:

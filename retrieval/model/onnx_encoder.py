@@ -102,13 +102,25 @@ def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) 
     return session
 
 
-def exported_beside(checkpoint: Stored, threads: int | None = None) -> OnnxEncoder | None:
-    """The export that lies beside a checkpoint, where it is of this checkpoint and ONNX Runtime is installed.
+def cached(digest: str) -> Path | None:
+    """Where the export is kept of a checkpoint with that digest beside which none can be written: in
+    `$XDG_CACHE_HOME/touch-retrieval` (`~/.cache` where it is not set). None where the user has no home."""
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return Path(home) / "touch-retrieval" / f"{digest}{ENDING}"
+
+
+def exported(checkpoint: Stored, threads: int | None = None) -> OnnxEncoder | None:
+    """The export that lies beside a checkpoint, else the one in the user's cache, where it is of this checkpoint and
+    ONNX Runtime is installed.
 
     One that is stale or damaged is not used, and a warning says so.
     """
-    path = checkpoint.path.with_suffix(ENDING)
-    if not path.is_file() or find_spec("onnxruntime") is None:
+    beside = checkpoint.path.with_suffix(ENDING)
+    path = beside if beside.is_file() else cached(checkpoint.digest)
+    if path is None or not path.is_file() or find_spec("onnxruntime") is None:
         return None
     try:
         return OnnxEncoder(path, checkpoint.digest, threads)

@@ -44,6 +44,11 @@ def shipped_model(fingers: int = 2) -> Path:
     return Path(str(resources.files("retrieval") / "shipped" / SHIPPED[fingers]))
 
 
+def is_shipped(path: Path) -> bool:
+    """Whether this is a checkpoint in the folder of the package, wherever links lead."""
+    return path.resolve() in [shipped_model(fingers).resolve() for fingers in SHIPPED]
+
+
 def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
 

@@ -15,7 +15,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from retrieval.errors import BadInput
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
-from retrieval.model.onnx_encoder import exported_beside
+from retrieval.model.onnx_encoder import exported
 from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
 from retrieval.model.stored import Stored, read_judge
 from retrieval.model.touches import (
@@ -84,9 +84,9 @@ class Searcher:
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
         threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
         the choice to the library. shards: opens those of a cluster; None: in this process, `open_cluster`.
-        Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) where there is one, and
-        PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`, CheckpointError, and
-        MismatchedIndex for another model.
+        Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) or in the user's cache where
+        there is one, and PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`,
+        CheckpointError, and MismatchedIndex for another model.
 
         >>> import numpy as np
         >>> from PIL import Image
@@ -105,7 +105,7 @@ class Searcher:
             generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
             stored = stored_for(generation.manifest, model)
             shard = folder_shard(generation, stored)
-        encoder = exported_beside(stored, threads) or torch_encoder(stored, threads)
+        encoder = exported(stored, threads) or torch_encoder(stored, threads)
         return cls(folder, shard, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:

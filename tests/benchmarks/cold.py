@@ -40,7 +40,7 @@ from pathlib import Path
 import retrieval.search.searcher as search
 generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
-encoder = step("make the encoder", lambda: search.exported_beside(stored) or search.torch_encoder(stored))
+encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))
 judge = step("read the head", lambda: search.read_judge(Path(model)))
 shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
 searcher = search.Searcher(Path(index), shard, stored, encoder, judge)
