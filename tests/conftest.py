@@ -115,6 +115,24 @@ def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory
     return out
 
 
+@pytest.fixture(scope="session")
+def grasps(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Path, ...]]]:
+    """Files of three grasps of each of the catalogue's first two objects."""
+    objects = synthetic.make_objects(2, seed=9)
+    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
+
+
+@pytest.fixture(scope="session")
+def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The catalogue in four shards. Not to be changed."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.search.build_cluster import build_cluster
+
+    out = tmp_path_factory.mktemp("cluster") / "cluster"
+    build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
+    return out
+
+
 @pytest.fixture(scope="module")
 def searcher(index: Path) -> Iterator[Any]:
     """The index, opened."""

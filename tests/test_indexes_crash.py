@@ -205,7 +205,7 @@ def test_a_disk_that_refuses_any_step_is_one_error_and_a_whole_index(tmp_path, m
 def test_an_interrupted_writer_cleans_up_and_gives_the_lock_back(tmp_path, monkeypatch):
     filled(tmp_path)
 
-    def interrupted(self, sample=256, seed=0):
+    def interrupted(self, sample=256, seed=0, since=0):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:

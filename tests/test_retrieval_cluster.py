@@ -45,21 +45,6 @@ def ray():
         yield module
 
 
-@pytest.fixture(scope="module")
-def grasps(tmp_path_factory):
-    """Files of three grasps of each of two objects."""
-    objects = synthetic.make_objects(2, seed=9)
-    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
-
-
-@pytest.fixture(scope="module")
-def cluster(catalogue, model, tmp_path_factory):
-    """The catalogue in four shards. Not to be changed."""
-    out = tmp_path_factory.mktemp("cluster") / "cluster"
-    build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
-    return out
-
-
 def deployments(ray, **held):
     from retrieval.cluster.serving import Deployments, Held
 

@@ -20,24 +20,8 @@ from retrieval.search.build_cluster import build_cluster
 from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import Judged, Ranked, merged
-from tests import synthetic
 
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
-
-
-@pytest.fixture(scope="module")
-def grasps(tmp_path_factory):
-    """Files of three grasps of each of two objects."""
-    objects = synthetic.make_objects(2, seed=9)
-    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
-
-
-@pytest.fixture(scope="module")
-def cluster(catalogue, model, tmp_path_factory):
-    """The catalogue in four shards. Not to be changed."""
-    out = tmp_path_factory.mktemp("cluster") / "cluster"
-    build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +387,7 @@ def test_another_format_is_told(own):
     content.pop("sha256")
     content["sha256"] = own_digest(content)
     path.write_text(json.dumps(content))
-    with pytest.raises(UnsupportedFormat, match="has format 99, this software reads 1"):
+    with pytest.raises(UnsupportedFormat, match="has the newer format 99, this software reads 1; update"):
         Searcher.open(cluster)
 
 

@@ -180,15 +180,27 @@ class VectorIndex(ABC):
 
         `live` (M,) leaves out the slots where it is false; k' = min(k, number of live slots).
         """
-        k = check_k(k)
-        table = check_unit(queries, dim=self.dim, what="query")
-        if live is not None and (live.shape != (self.count,) or live.dtype != np.bool_):
-            raise ParameterError(f"live must be bool of shape ({self.count},); got {live.dtype} {live.shape}")
-        wanted = min(k, self.count if live is None else int(np.count_nonzero(live)))
+        table, wanted = self._checked(queries, k, live)
         if wanted == 0 or not len(table):
             shape = (len(table), wanted)
             return np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int64)
         return self._search(table, wanted, live)
+
+    def candidates(self, queries: Floats, k: int, live: Mask | None = None) -> list[Slots]:
+        """The slots that `search` finds, of each query and in no order, for whoever scores them otherwise: an exact
+        kind names just these, an approximate one at least k' of its best. Takes less time, as few are scored."""
+        table, wanted = self._checked(queries, k, live)
+        if wanted == 0:
+            return [np.empty(0, dtype=np.int64) for _ in table]
+        return [self._candidate_slots(query[None], wanted, live) for query in table]
+
+    def _checked(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, int]:
+        """The queries, and how many slots each can have."""
+        k = check_k(k)
+        table = check_unit(queries, dim=self.dim, what="query")
+        if live is not None and (live.shape != (self.count,) or live.dtype != np.bool_):
+            raise ParameterError(f"live must be bool of shape ({self.count},); got {live.dtype} {live.shape}")
+        return table, min(k, self.count if live is None else int(np.count_nonzero(live)))
 
     def add(self, vectors: Floats, *, names: Sequence[str] | None = None) -> None:
         """Append `vectors` (F, d) as slots M..M+F-1; F = 0 changes nothing."""
@@ -241,6 +253,11 @@ class VectorIndex(ABC):
     @abstractmethod
     def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
         """The result of `search`: queries are checked, and 1 <= k <= live slots."""
+
+    def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
+        """The result of `candidates` for one query (1, d), checked as those of `_search` are."""
+        slots: Slots = self._search(query, k, live)[1][0]
+        return slots
 
     def _build(self) -> None:  # noqa: B027 - nothing to do without a structure
         """Make the structure over `self._vectors`."""

@@ -101,6 +101,29 @@ class FaissIndex(VectorIndex):
             scores[pending], slots[pending] = scan(self._vectors, queries[pending], k, live)
         return scores, slots
 
+    def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
+        """What the first round names, where that is enough: scored again are, of an exact kind, those alone that
+        rounding may have put on the wrong side of the last place."""
+        dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
+        fetch = math.ceil(self._first_fetch(k) * dilution)
+        if fetch < self.count:
+            with guarded("searching", 1):
+                rough, found = (row[0] for row in self._named(query, fetch, 1))
+            kept = found >= 0 if live is None else (found >= 0) & live[found]
+            scores: Doubles = rough[kept].astype(np.float64)  # what is added to them must not be rounded
+            slots: Slots = found[kept]
+            if len(slots) >= k and not self.exact:
+                return slots
+            if len(slots) > k:
+                last, off = scores[k - 1], 2 * slack(self.dim)
+                above = scores > last + off
+                sure, near = slots[above], slots[~above & (scores >= last - off)]
+                if rough[-1] < last - off:
+                    gridded = on_grid(query[0])
+                    more = best(grid_scores(gridded, on_grid(self._vectors[near])), near, k - len(sure))[1]
+                    return np.concatenate([sure, more])
+        return super()._candidate_slots(query, k, live)
+
     def _named(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
         parts, first = [], self.covered

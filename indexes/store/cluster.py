@@ -15,13 +15,12 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex
 from indexes.store.files import encoded, file_digest, naming, write_atomically
 from indexes.store.folder import GENERATION, IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import NAME as GENERATION_MANIFEST
-from indexes.store.manifest import own_digest
-from indexes.store.regular import read_json
+from indexes.store.manifest import own_digest, read_document
 from indexes.store.rows import key_of
 
 NAME, FORMAT = "CLUSTER.json", 1
@@ -110,25 +109,9 @@ def write_cluster(folder: Path, manifest: ClusterManifest) -> None:
 def read_cluster(folder: Path) -> ClusterManifest:
     """The manifest of a cluster. Raises NoIndex, CorruptIndex or UnsupportedFormat."""
     path = folder / NAME
-    try:
-        content = read_json(path)
-    except FileNotFoundError as error:
-        raise NoIndex(f"{folder}: there is no cluster here; run `retrieve build-index --shards` first") from error
-    except OSError as error:
-        raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
-    except ValueError as error:
-        raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
-    return parsed_cluster(path, content)
-
-
-def parsed_cluster(path: Path, content: Any) -> ClusterManifest:
-    """The manifest that a document holds, which messages call `path`. Raises CorruptIndex or UnsupportedFormat."""
-    if not isinstance(content, dict) or type(content.get("format")) is not int:
-        raise CorruptIndex(f"{path}: must be a JSON object that says its format; {AGAIN}")
-    if content["format"] != FORMAT:
-        raise UnsupportedFormat(f"{path}: has format {content['format']}, this software reads {FORMAT}; {AGAIN}")
-    if content.pop("sha256", None) != own_digest(content):
-        raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
+    if not path.exists():
+        raise NoIndex(f"{folder}: there is no cluster here; run `retrieve build-index --shards` first")
+    content = read_document(path, FORMAT, FORMAT)
     del content["format"]
     if set(content) != {field.name for field in fields(ClusterManifest)}:
         raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; {AGAIN}")

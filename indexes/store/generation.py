@@ -120,6 +120,11 @@ class Generation:
         scores, slots = self.index.search(queries, k + 1, self._live)
         return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
 
+    def candidates(self, queries: Floats, k: int) -> list[Slots]:
+        """For each unit query (Q, d) the rows (n,) of the best k slots, in no order: those of `search`, but for slots
+        that tie for the last place, and of an approximate kind perhaps more."""
+        return [self._rows_of(slots)[1] for slots in self.index.candidates(queries, k, self._live)]
+
     def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
         """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
         return self.matching_keys(keys_of(ids), keys_of(digests))
@@ -186,12 +191,16 @@ class Generation:
         stay = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
         return rows[stay], spread[stay]
 
+    def _rows_of(self, slots: Slots) -> tuple[Slots, Slots]:
+        """How many rows each slot has, and all of them, slot by slot."""
+        counts = self._per_slot[slots]
+        inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return counts, self._by_slot[np.repeat(self._starts[slots], counts) + inside]
+
     def _expanded(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
         """All rows of slots in the order of their scores, and their scores; equal scores in the order of ids."""
-        counts = self._per_slot[slots]
+        counts, rows = self._rows_of(slots)
         spread = np.repeat(scores, counts)
-        inside = np.arange(len(spread)) - np.repeat(np.cumsum(counts) - counts, counts)
-        rows = self._by_slot[np.repeat(self._starts[slots], counts) + inside]
         edges = np.flatnonzero(np.diff(spread)) + 1
         starts, ends = np.concatenate([[0], edges]), np.append(edges, len(spread))
         tied = ends - starts > 1

@@ -72,7 +72,12 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 def read_manifest(folder: Path) -> Manifest:
     """The manifest of a generation's folder; `CorruptIndex` or `UnsupportedFormat` where it is bad."""
-    path = folder / NAME
+    return _parsed(folder / NAME, read_document(folder / NAME, OLDER, FORMAT))
+
+
+def read_document(path: Path, oldest: int, newest: int) -> dict[str, Any]:
+    """A JSON object of one of these formats that ends with the digest of its own content, without that digest. Raises
+    CorruptIndex or UnsupportedFormat."""
     try:
         content = read_json(path)
     except OSError as error:
@@ -81,10 +86,10 @@ def read_manifest(folder: Path) -> Manifest:
         raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
     if not isinstance(content, dict):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
-    _check_format(path, content.get("format"))
+    _check_format(path, content.get("format"), oldest, newest)
     if content.pop("sha256", None) != own_digest(content):
         raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
-    return _parsed(path, content)
+    return content
 
 
 def sealed(folder: Path) -> dict[str, dict[str, Any]]:
@@ -107,14 +112,13 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
 
 
-def _check_format(path: Path, version: object) -> None:
+def _check_format(path: Path, version: object, oldest: int, newest: int) -> None:
     if not isinstance(version, int) or isinstance(version, bool):
         raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
-    if not OLDER <= version <= FORMAT:
-        age, remedy = ("newer", f"update the software, or {AGAIN}") if version > FORMAT else ("older", AGAIN)
-        raise UnsupportedFormat(
-            f"{path}: has the {age} format {version}, this software reads {OLDER} to {FORMAT}; {remedy}"
-        )
+    if not oldest <= version <= newest:
+        age, remedy = ("newer", f"update the software, or {AGAIN}") if version > newest else ("older", AGAIN)
+        known = f"{newest}" if oldest == newest else f"{oldest} to {newest}"
+        raise UnsupportedFormat(f"{path}: has the {age} format {version}, this software reads {known}; {remedy}")
 
 
 def own_digest(content: Mapping[str, Any]) -> str:

@@ -71,10 +71,8 @@ def build_index(
     (4, 0)
     """
     asked = Asked(kind, min_recall, max_ms)
-    named_before = _named_before(IndexStore(out))
-    naming = Naming(next(rule for rule in (objects_from, named_before, FOLDER) if rule is not None))
-    renamed = "" if named_before in (None, naming.text) else renamed_note(naming, str(named_before))
-    wanted = Wanted(naming, asked, quiet, verify, note=renamed)
+    naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
+    wanted = Wanted(naming, asked, quiet, verify, note)
     return build_listed(list_photos(folder, naming), checkpoint, out, wanted)
 
 
@@ -158,9 +156,19 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
     )
 
 
-def renamed_note(naming: Naming, before: str) -> str:
-    """That objects are named by another rule now."""
-    return f"Objects are named by {naming.text} now, no longer by {before}."
+def naming_by(asked: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
+    """The rule that names objects, which is the one asked for, else the one of the index there, by what its manifest
+    says of it, else by folder; and what is to be said where it is another one now. Raises BadInput for one asked for
+    that is none."""
+    before = about.get("objects_from")
+    try:
+        known = None if before is None else Naming(before)
+    except (BadInput, TypeError):  # of another version, or forged
+        known = None
+    naming = Naming(asked) if asked is not None else known or Naming(FOLDER)
+    if known is None or known == naming:
+        return naming, ""
+    return naming, f"Objects are named by {naming.text} now, no longer by {known.text}."
 
 
 def _outside(catalogue: Catalogue, out: Path) -> list[str]:
@@ -171,13 +179,12 @@ def _outside(catalogue: Catalogue, out: Path) -> list[str]:
     return [name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)]
 
 
-def _named_before(store: IndexStore) -> str | None:
-    """The rule that named the objects of the index there, None where there is none that says so."""
+def _about_before(store: IndexStore) -> Mapping[str, Any]:
+    """What the index there says of itself besides; nothing where there is none."""
     try:
-        text = read_manifest(store.path / store.current()).about.get("objects_from")
-        return None if text is None else Naming(text).text
-    except (IndexesError, BadInput, TypeError):
-        return None
+        return read_manifest(store.path / store.current()).about
+    except IndexesError:
+        return {}
 
 
 def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str]]:

@@ -33,13 +33,12 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
-from retrieval.data.naming import FOLDER as BY_FOLDER
 from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint
-from retrieval.search.build import Wanted, build_listed, renamed_note
+from retrieval.search.build import Wanted, build_listed, naming_by
 from retrieval.search.build_report import BuildReport
 from retrieval.search.operating import Asked
 from retrieval.version import __version__
@@ -111,10 +110,7 @@ def build_cluster(
     asked = Asked(kind, min_recall, max_ms)
     with WriterLock(out / "LOCK"):
         before, note = _before(out)
-        named_before = None if before is None else before.about.get("objects_from")
-        naming = Naming(next(rule for rule in (objects_from, named_before, BY_FOLDER) if rule is not None))
-        if named_before not in (None, naming.text):
-            note = f"{renamed_note(naming, str(named_before))} {note}".rstrip()
+        naming, renamed = naming_by(objects_from, {} if before is None else before.about)
         catalogue = list_photos(folder, naming)
         _sweep(out, before, shards)
         donors = (
@@ -138,7 +134,7 @@ def build_cluster(
             write_cluster(out, manifest)
         for entry in manifest.shards:
             IndexStore(out / entry.folder).discard_before(entry.generation)
-    reason = " ".join(filter(None, (note, report.reason)))
+    reason = " ".join(filter(None, (renamed, note, report.reason)))
     return replace(report, generation=manifest.generation, written=written, reason=reason)
 
 

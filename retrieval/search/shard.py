@@ -111,9 +111,11 @@ class Shard(Protocol):
 
 
 class FolderShard:
-    """The photos of one generation of an index folder.
+    """The photos of one generation of an index folder, opened in this process: candidates by its index, judged by the
+    model's head. Threads may ask it at once; they wait for each other only where words are looked for in all rows.
 
-    has_embeddings: whether the model's embeddings were trained; without, every photo is judged.
+    judge: the layers of the head that take halves. has_embeddings: whether the model's embeddings were trained;
+    without, every photo is judged.
     """
 
     def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
@@ -188,8 +190,7 @@ class FolderShard:
         """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
-        found = [rows for rows, _ in self.generation.search(embeddings, k)]
-        return np.unique(np.concatenate(found))
+        return np.unique(np.concatenate(self.generation.candidates(embeddings, k)))
 
     def _judged(self, halves: Floats, rows: Rows, top: int, meaning: Posterior) -> tuple[JudgedObjects, int]:
         """Objects by their judged photos, and how many photos these are."""
@@ -222,7 +223,9 @@ class FolderShard:
 
 
 class Shards:
-    """Several shards of one process as one. described: of all of them together."""
+    """Several shards of this process as one: asked one after another, their answers merged as those of shards on other
+    machines are. described: what is known of all of them together.
+    """
 
     def __init__(self, shards: Sequence[Shard], described: Described) -> None:
         self.shards, self.described = list(shards), described
