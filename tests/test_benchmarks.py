@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import arm, build, cameras, cold, common, cylinder, gripper, query, rerank, step
+from tests.benchmarks import again, arm, build, cameras, cold, common, cylinder, gpu, gripper, query, rerank, step
 from tests.conftest import TINY
 
 SMALLEST = {
@@ -33,6 +33,21 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
         assert str(line).startswith(f"{name}, small: ")
         assert all(value > 0 for value in line.figures.values())
         json.dumps(line.figures, allow_nan=False)
+
+
+def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    lines = list(gpu.measure(TINY, "cpu:0", photos=3, repetitions=1))
+    assert [line.text.split(",")[0] for line in lines] == ["build", "ask", "train"]
+    for line in lines:
+        assert set(line.figures) == {"cpu_s", "cpu:0_s", "ratio"}
+        json.dumps(line.figures, allow_nan=False)
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_a_second_build_tells_each_arm():
+    (line,) = again.measure(photos=6, rounds=1)
+    assert set(line.figures) == {"photos", "encoding", "unnoted", "verify", "nothing", "one"}
 
 
 OF_DEVICES = {

@@ -119,7 +119,7 @@ def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_plac
     now = [0.0]
     bench = WinnerBench(checkpoint, *gallery, clock=lambda: now[0])
     index, judged = bench.built("flat"), []
-    search, searching, judging = index.search, iter((9, 1, 2)), iter((4, 6, 100))
+    search, searching, judging = index.candidates, iter((9, 1, 2)), iter((4, 6, 100))
 
     def slow_search(queries, k):
         now[0] += next(searching) / 1e3
@@ -130,7 +130,7 @@ def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_plac
         judged.append(rows.tolist())
 
     monkeypatch.setattr(measuring, "TIMED", 3)
-    monkeypatch.setattr(index, "search", slow_search)
+    monkeypatch.setattr(index, "candidates", slow_search)
     monkeypatch.setattr(measuring, "score_halves", slow_judge)
     assert bench.times(index, 8) == pytest.approx((2.0, 6.0))
     for rows in judged:  # eight different photos, in the order in which they lie on the disk

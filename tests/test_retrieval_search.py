@@ -51,8 +51,8 @@ def searches(monkeypatch):
         asked.append(k)
         return search(generation, queries, k)
 
-    search = Generation.search
-    monkeypatch.setattr(Generation, "search", counted)
+    search = Generation.candidates
+    monkeypatch.setattr(Generation, "candidates", counted)
     return asked
 
 

@@ -23,7 +23,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import Image, batches, default_device, one_thread
+from retrieval.model.encode import Image, batches, one_thread
 from retrieval.model.photo_encoder import fastest, on_torch
 from retrieval.search.looks import Looked, row_of, runs
 
@@ -130,7 +130,7 @@ class Embedder:
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
         new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
-        if new >= MANY and default_device().type == "cpu":
+        if new >= MANY and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
             self._encode_photos = fastest(self.checkpoint)
         known = self.looked.known(self.parent)
         self.unread = int((known >= 0).sum())
