@@ -264,7 +264,9 @@ def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left
 
 def test_once_its_ridge_is_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
     both = TRAIN.joined(VALIDATION)
-    method = fitted("cca_towers")
+    method = build_method("cca_towers", Setting(CONFIG, all_teach=True))
+    method.fit(TRAIN, VALIDATION)
+    assert method.chosen == fitted("cca_towers").chosen
     blocks = blocks_of(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES])
     ridge = method.chosen["ridge"]

@@ -31,7 +31,7 @@ class Experiment:
 
     pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
     and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
-    each part before fitting, so that nothing can be learned.
+    each part before fitting, so that nothing can be learned. all_teach: as in `Setting`.
     """
 
     folder: Path
@@ -43,6 +43,7 @@ class Experiment:
     checkpoint: Checkpoint | None
     shuffled: bool
     quiet: bool
+    all_teach: bool = False
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
         """The seeds that make a difference to a method."""
@@ -87,7 +88,7 @@ class Experiment:
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
         config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn
-        method = build_method(name, Setting(config, seed, self.folder / "fits", self.quiet))
+        method = build_method(name, Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach))
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))

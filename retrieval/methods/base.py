@@ -22,12 +22,15 @@ class Setting:
     """What a method is made with.
 
     folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
+    all_teach: a method that can (`cca_towers`) learns from validation objects, too, once they have chosen its settings;
+    what is calibrated on their scores is then too sure.
     """
 
     config: Config
     seed: int = 0
     folder: Path | None = None
     quiet: bool = True
+    all_teach: bool = False
 
 
 class Method(ABC):

@@ -101,7 +101,7 @@ def fit_codes(
     touch: Rows,
     photo: Rows,
     owner: NDArray[np.int64],
-    blocks: tuple[Sequence[int], Sequence[int]],
+    blocks: Blocks,
     ridges: Sequence[float] = RIDGES,
 ) -> Iterator[tuple[float, Codes]]:
     """The codes of each ridge, from features of grasps: touch (n, F), photo (n, F'), owner (n,) objects from 0.
@@ -125,22 +125,19 @@ def fit_codes(
 
 
 class CcaTowers(Method):
-    """Cosine of such codes; the ridge by ranking on validation objects, and then all objects teach.
-
-    So scores of validation objects are of objects that it knows: what is calibrated on them is too sure.
-    """
+    """Cosine of such codes; the ridge by ranking on validation objects."""
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = blocks_of(self.setting.config, train)
         judged = Validator.of(validation)
         shown = judged.features
-        aucs = {
-            ridge: judged.touches(codes.cosines(_rows(shown), shown.photo))
-            for ridge, codes in fit_codes(_rows(train), train.photo, train.owner, blocks)
-        }
+        fits = dict(fit_codes(_rows(train), train.photo, train.owner, blocks))
+        aucs = {ridge: judged.touches(codes.cosines(_rows(shown), shown.photo)) for ridge, codes in fits.items()}
         best = max(aucs, key=lambda ridge: (aucs[ridge], ridge))
-        known = train.joined(validation)
-        ((_, self._codes),) = fit_codes(_rows(known), known.photo, known.owner, blocks, ridges=(best,))
+        if self.setting.all_teach:
+            known = train.joined(validation)
+            fits = dict(fit_codes(_rows(known), known.photo, known.owner, blocks, ridges=(best,)))
+        self._codes = fits[best]
         self.chosen = {"ridge": best, "validation_auc": aucs[best]}
 
     def _encode_touch(self, touch: Array) -> Array:

@@ -252,6 +252,7 @@ class _Asked:
             checkpoint=towers.checkpoint if line.kind in ("touch", "blurred") else None,
             shuffled=line.kind == "dealt",
             quiet=True,
+            all_teach=True,
         )
         experiment.predict(line.method, seed)
         judged = MethodScores(experiment.queries, experiment.predictions(line.method, seed), seed)
