@@ -96,7 +96,8 @@ def grasps_and_photos(results: Results) -> Figure:
 
 
 def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str], counts: Sequence[int]) -> None:
-    """Each method's values of a metric of so many, side by side, over the chance of each."""
+    """Each method's values of a metric of so many, side by side, over the chance of each; of counts that were asked."""
+    counts = [count for count in counts if any(results.summary(name, metric(count)) for name in results.methods)]
     for place, name in enumerate(results.methods):
         shift, style = 0.055 * (place - (len(results.methods) - 1) / 2), style_of(name)
         found = [(at, summary) for at, key in enumerate(map(metric, counts)) if (summary := results.summary(name, key))]
