@@ -5,10 +5,25 @@ import sys
 import time
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 
 from tests.benchmarks import __main__ as program
-from tests.benchmarks import again, arm, build, cameras, cold, common, cylinder, gpu, gripper, query, rerank, step
+from tests.benchmarks import (
+    again,
+    arm,
+    build,
+    cameras,
+    cold,
+    common,
+    cylinder,
+    gpu,
+    gripper,
+    peers,
+    query,
+    rerank,
+    step,
+)
 from tests.conftest import TINY
 
 SMALLEST = {
@@ -48,6 +63,17 @@ def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
 def test_the_benchmark_of_a_second_build_tells_each_arm():
     (line,) = again.measure(photos=6, rounds=1)
     assert set(line.figures) == {"photos", "encoding", "unnoted", "verify", "nothing", "one"}
+
+
+def test_every_engine_is_asked_at_the_least_width_that_finds_enough():
+    lines = list(peers.measure(photos=700, queries=10))
+    assert [line.tower for line in lines] == 2 * list(peers.ENGINES)
+    for line in lines:
+        assert line.figures["recall"] > 0.8
+        assert line.figures["query_us"] > 0
+    width_of = peers.Built(lambda query, width: np.arange(width), (1, 10, 20))
+    vectors = np.eye(30, peers.DIM, dtype=np.float32)
+    assert peers.least_width(width_of, vectors, vectors[:1]) == 10
 
 
 OF_DEVICES = {
