@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,6 +40,15 @@ def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
     assert "700 photos: written in " in text
     assert "  flat {}: " in text
     json.dumps(vars(size), allow_nan=False)
+
+
+def test_contrastive_embeddings_are_the_last_part_of_the_halves_at_unit_length(crowd):
+    hidden = TINY.matcher.hidden
+    checkpoint = SimpleNamespace(config=TINY)
+    halves = np.zeros((2, hidden + 2), np.float32)
+    halves[:, :hidden], halves[:, hidden:] = 9, [[3, 4], [0, -2]]
+    found = dataclasses.replace(crowd, checkpoint=checkpoint, by="contrastive").embeddings(halves, "photo")
+    assert found.tolist() == pytest.approx(np.array([[0.6, 0.8], [0, -1]]))
 
 
 def test_a_kind_that_needs_more_photos_says_so(crowd, tmp_path):

@@ -1,11 +1,11 @@
 """`python -m tests.benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
 
 Catalogues of N photos are drawn from the trained model's own distribution: halves of recorded photos, each blended of
-two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's pruner gives them. The touches are
-those of validation objects that the checkpoint keeps. The winner is the photo that the classifier ranks first of all.
-Settings, and how many candidates hold 99 % of the winners, are chosen with every other touch; `MARGIN` times as many
-are taken, for a hundred touches hardly tell the last percent, and the share of winners that is told is that of the
-touches between them.
+two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's pruner gives them (`--by
+contrastive`: with those whose cosine is in the halves). The touches are those of validation objects that the checkpoint
+keeps. The winner is the photo that the classifier ranks first of all. Settings, and how many candidates hold 99 % of
+the winners, are chosen with every other touch; `MARGIN` times as many are taken, for a hundred touches hardly tell the
+last percent, and the share of winners that is told is that of the touches between them.
 
 The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists of which p are visited:
 
@@ -93,16 +93,23 @@ class Size:
 
 @dataclass(frozen=True)
 class Crowd:
-    """A model, halves (n, h) of recorded photos to blend catalogues from, and halves (Q, h) of touches to ask with."""
+    """A model, halves (n, h) of recorded photos to blend catalogues from, and halves (Q, h) of touches to ask with.
+
+    by: which embeddings name the candidates, "pruner" or, where their cosine is in the halves, "contrastive".
+    """
 
     checkpoint: Checkpoint
     judge: Judge
     photos: np.ndarray
     touches: np.ndarray
+    by: str = "pruner"
 
     @torch.inference_mode()
     def embeddings(self, halves: np.ndarray, what: str) -> np.ndarray:
-        """The pruner's embeddings (n, d) of "touch" or "photo" halves."""
+        """Unit embeddings (n, d) of "touch" or "photo" halves."""
+        if self.by == "contrastive":
+            scaled = halves[:, self.checkpoint.config.matcher.hidden :]
+            return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
         return getattr(self.checkpoint.matcher.pruner, what)(torch.from_numpy(halves)).numpy()
 
     def blocks(self, start: int, stop: int, seed: int) -> Iterator[Block]:
@@ -117,16 +124,18 @@ class Crowd:
             yield Block(rows, self.embeddings(halves, "photo"), {"halves": halves.astype(np.float16)})
 
 
-def crowd_of(model: Path, recording: Path, features: Path | None) -> Crowd:
+def crowd_of(model: Path, recording: Path, features: Path | None, by: str = "pruner") -> Crowd:
     """The crowd that a recording's photos make; `features` keeps what was encoded."""
     checkpoint = load_checkpoint(model)
     if checkpoint.queries is None or checkpoint.matcher.pruner is None:
         raise SystemExit(f"{model} keeps no touches to ask with, or has no pruner; train it again")
+    if by == "contrastive" and not checkpoint.config.matcher.cosine:
+        raise SystemExit(f"the halves of {model} hold no contrastive embedding; its configuration has cosine = false")
     found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
     with torch.inference_mode():
         photos = checkpoint.matcher.photo_code(torch.from_numpy(found.photo)).half.numpy()
     judge = judge_of(checkpoint.matcher.head)
-    return Crowd(checkpoint, judge, np.unique(photos, axis=0), checkpoint.queries.astype(np.float32))
+    return Crowd(checkpoint, judge, np.unique(photos, axis=0), checkpoint.queries.astype(np.float32), by)
 
 
 def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
@@ -336,11 +345,12 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
     parser.add_argument("--features", type=Path, help="where encoded features are kept")
     parser.add_argument("--queries", type=int, default=QUERIES)
+    parser.add_argument("--by", choices=("pruner", "contrastive"), default="pruner", help="embedding of the candidates")
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        crowd = crowd_of(arguments.model, arguments.recording or collected(folder), arguments.features)
+        crowd = crowd_of(arguments.model, arguments.recording or collected(folder), arguments.features, arguments.by)
         sizes = []
         for number in arguments.sizes:
             sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index", arguments.queries))
