@@ -115,6 +115,20 @@ def test_many_threads_ask_at_once(held, grasps):
     assert found == [expected] * 8
 
 
+def test_one_that_ends_leaves_the_shards_of_another(ray, cluster, held, grasps):
+    other = deployments(ray, wait_s=120.0)
+    searcher = Searcher.open(cluster, shards=other.open)
+    assert names(searcher.query(grasps[0])) == names(held.query(grasps[0]))
+    before = set(ray.serve.status().applications)
+    other.close()
+    until = time.monotonic() + 60
+    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < until:
+        time.sleep(0.1)
+    assert len(before) == 8
+    assert len(ray.serve.status().applications) == 4
+    assert held.query(grasps[0]).index["searched"] == 1.0
+
+
 # Faults ---------------------------------------------------------------------------------------------------------------
 
 
@@ -130,11 +144,11 @@ def test_a_shard_that_is_killed_is_started_again_and_every_answer_is_whole(held,
 
 @pytest.fixture
 def stopped():
-    """Stops a shard's process, as a machine hangs; all go on at the end."""
+    """Stops every process of one shard, whoever holds it, as a machine hangs; all go on at the end."""
     done = []
 
-    def stop(count=1):
-        for process in on_ray.called(SHARD)[:count]:
+    def stop():
+        for process in on_ray.called(f"{SHARD}00-of-04"):
             os.kill(process, signal.SIGSTOP)
             done.append(process)
 

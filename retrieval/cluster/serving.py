@@ -7,6 +7,7 @@ A shard that does not answer in time is left out. The answer then says which sha
 its objects keep the probability that they had, on average; where more of the catalogue was asked for, there is none.
 """
 
+import secrets
 import threading
 import time
 import weakref
@@ -167,10 +168,14 @@ class RayShards:
 
 
 class Deployments:
-    """The shards that Ray Serve holds for this process, by the digest of what they hold."""
+    """The shards that Ray Serve holds for this process, by the digest of what they hold.
+
+    Their names are this object's own: whoever else holds the same shards on the same Ray keeps its own when this ends.
+    """
 
     def __init__(self, ray: Any, held: Held, verify: bool = True) -> None:
         self._ray, self._held, self._verify = ray, held, verify
+        self._own = secrets.token_hex(4)
         self._users: Counter[str] = Counter()
         self._lock = threading.Lock()
         ray.serve.start(proxy_location="Disabled")
@@ -178,7 +183,7 @@ class Deployments:
     def open(self, cluster: Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
         """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
         require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
-        names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}" for entry in manifest.shards}
+        names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._own}" for entry in manifest.shards}
         with self._lock:
             self._deploy(names, cluster.resolve(), manifest, stored)
             self._users.update(names.values())
@@ -188,7 +193,7 @@ class Deployments:
         return opened
 
     def close(self) -> None:
-        """End all that this process asked for, where nobody else's Ray holds it."""
+        """End all that was opened."""
         self._let_go(list(self._users.elements()))
 
     def _deploy(
