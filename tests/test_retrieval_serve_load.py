@@ -1,4 +1,4 @@
-"""Many at once, askers who leave, deadlines, windows, new generations of the index, and the end."""
+"""Many at once, askers who leave, deadlines, queries answered together, new generations of the index, and the end."""
 
 import base64
 import shutil
@@ -94,6 +94,20 @@ def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
         encoder.go.set()
         assert (first.result().status_code, last.result().status_code) == (200, 200)
         assert encoder.calls == [1, 1]
+
+
+def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_would_get_alone(index, body):
+    with held(index, queue=6, batch_most=3) as (url, encoder, parts, askers):
+        first = askers.submit(asked, url, body)
+        until(lambda: encoder.calls == [1])
+        waiting = [askers.submit(asked, url, body) for _ in range(5)]
+        until(lambda: parts.queue.held == 6)
+        encoder.go.set()
+        alone, *others = [one.result().json()["results"] for one in (first, *waiting)]
+        assert encoder.calls == [1, 3, 2]
+        for other in others:
+            assert [one["object_id"] for one in other] == [one["object_id"] for one in alone]
+            assert [one["logit"] for one in other] == pytest.approx([one["logit"] for one in alone], abs=1e-4)
 
 
 def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_none(index, body):

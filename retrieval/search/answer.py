@@ -1,6 +1,6 @@
 """What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        return {name: value for name, value in asdict(self).items() if name != "photo_path"}
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "photo_path"}
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Who waits for the model, and for how long.
 
-So many requests are held at once, the one in work among them; the next is told at once to come again. A request whose
-asker has left, or whose deadline has passed, is dropped before it is worked on. With a window, queries that come
-together and ask alike are encoded together.
+So many requests are held at once, those in work among them; the next is told at once to come again. A request whose
+asker has left, or whose deadline has passed, is dropped before it is worked on. Queries that wait and ask alike are
+answered together: an encoder takes as long for each as alone, but the interpreter's work is done once for all of them.
 """
 
 import asyncio
@@ -145,14 +145,14 @@ class Queue:
             loop.call_soon_threadsafe(_tell, jobs, _answers(opened, jobs))
 
     def _together(self) -> list[_Job]:
-        """The next job, and those that come within the window and can be answered with it; none at the end."""
+        """The next job, and those that wait or come in the window and can be answered with it; none at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if not self._jobs:
                 return []
             jobs, until = [first := self._jobs.popleft()], time.monotonic() + self._settings.batch_ms / 1e3
-            while first.asked and len(jobs) < self._settings.batch_most and (left := until - time.monotonic()) > 0:
-                if not self._changed.wait_for(lambda: self._jobs, left):
+            while first.asked and len(jobs) < self._settings.batch_most:
+                if not self._changed.wait_for(lambda: self._jobs, until - time.monotonic()):
                     break
                 if not (asked := self._jobs[0].asked) or asked.keywords != first.asked.keywords:
                     break

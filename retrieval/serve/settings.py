@@ -20,11 +20,12 @@ class ServiceSettings:
     """What `retrieve serve` was told.
 
     host: where it listens; anything but this machine needs a `token` (16 characters at least). queue: requests that
-    are held at once, the one in work among them. workers: requests in work at once. batch_ms: how long a request waits
-    for others to be answered with it; 0 for none. deadline_s: after which an answer is no longer waited for. body_s: by
-    which the body of a request must have come. poll_s: how often a new generation of the index is looked for.
-    history: folder where queries are kept, and what is said of them; None keeps nothing. keep, keep_bytes: queries of
-    which nothing was said, and their gel images, that are kept at most. streams: pictures of sensors that run at once.
+    are held at once, those in work among them. workers: threads that answer. batch_most: so many queries that wait and
+    ask alike are answered together at most. batch_ms: how long one waits for others besides. deadline_s: after which an
+    answer is no longer waited for. body_s: by which the body of a request must have come. poll_s: how often a new
+    generation of the index is looked for. history: folder where queries are kept, and what is said of them; None keeps
+    nothing. keep, keep_bytes: queries of which nothing was said, and their gel images, that are kept at most. streams:
+    pictures of sensors that run at once.
     """
 
     index: Path
@@ -36,7 +37,7 @@ class ServiceSettings:
     queue: int = 8
     workers: int = 1
     batch_ms: float = 0.0
-    batch_most: int = 8
+    batch_most: int = 4
     deadline_s: float = 30.0
     body_s: float = 10.0
     poll_s: float = 1.0
