@@ -6,6 +6,7 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a NaN or infinite value where a number must be
     +-- TooManyBad             more photos cannot be read than the user allows
+    +-- StorageError           a storage behind a URL goes on refusing, or does not hold what it was given
     +-- Unanswered             shards did not answer, and more of the catalogue was asked for
     +-- Interrupted            the user stopped the job; what was made is kept
     +-- BadInput               wrong use or bad input (exit code 2)
@@ -40,6 +41,10 @@ class NumericalError(RetrievalError):
 
 class TooManyBad(RetrievalError):
     """More of a catalogue's photos cannot be read than the user allows; the index stays as it was."""
+
+
+class StorageError(RetrievalError):
+    """A storage behind a URL goes on refusing, or does not hold what it was given; the job can go on later."""
 
 
 class Unanswered(RetrievalError):

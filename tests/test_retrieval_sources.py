@@ -8,22 +8,23 @@ import fsspec
 import numpy as np
 import pytest
 
-from retrieval.data import sources
+from retrieval.data import sources, storage
 from retrieval.data.catalogue import PhotoBytes, SkippedPhoto, list_catalogue, read_photo
 from retrieval.data.naming import Naming
 from retrieval.data.sources import list_photos
-from retrieval.errors import BadInput, DatasetError
+from retrieval.errors import BadInput, DatasetError, StorageError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
 from retrieval.search.build_cluster import build_cluster
 from retrieval.search.searcher import Searcher
+from tests import s3
 
 pyarrow = pytest.importorskip("pyarrow")
 
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch):
-    monkeypatch.setattr(sources, "WAITS_S", (0.0,) * 5)
+    monkeypatch.setattr(storage, "WAITS_S", (0.0,) * 5)
     sources._read_group.cache_clear()
 
 
@@ -196,7 +197,7 @@ def test_a_storage_that_goes_on_refusing_ends_the_build_which_goes_on_later(
     refused.update(every=40, times=21)
     listed = list_photos("memory://bucket/catalog")
     assert len(listed.photos) == 24
-    with pytest.raises(DatasetError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
+    with pytest.raises(StorageError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
         read_photo(listed, listed.photos[0])
     checkpoint = load_checkpoint(model)
     refused.update(every=10**9, times=0)
@@ -221,39 +222,22 @@ def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, 
 
 
 @pytest.fixture(scope="module")
-def s3(tmp_path_factory):
-    """The address of a server that speaks S3, on this machine alone."""
-    server = pytest.importorskip("moto.server", reason="needs moto[server]")
-    pytest.importorskip("s3fs", reason="needs s3fs")
-    running = server.ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    running.start()
-    host, port = running.get_host_and_port()
-    patch = pytest.MonkeyPatch()
-    for name, value in {
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-    }.items():
-        patch.setenv(name, value)
-    yield f"http://{host}:{port}"
-    patch.undo()
-    running.stop()
+def server():
+    with s3.served() as faults:
+        yield faults
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(s3, catalogue, model, index, tmp_path):
-    system = fsspec.filesystem("s3")
-    system.mkdir("photos")
-    put(system, catalogue, "photos/catalog")
+def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(server, catalogue, model, index, tmp_path):
+    s3.put(catalogue, "photos/catalog")
     report = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     assert (report.photos, report.skipped) == (24, [])
     with Searcher.open(tmp_path / "index") as ours, Searcher.open(index) as theirs:
         assert list(ours.generation.rows) == list(theirs.generation.rows)
         assert ours.described.about["catalogue"] == "s3://photos/catalog"
     for path in catalogue.rglob("1.jpg"):
-        system.rm_file(f"photos/catalog/{path.relative_to(catalogue)}")
+        fsspec.filesystem("s3").rm_file(f"photos/catalog/{path.relative_to(catalogue)}")
     fsspec.filesystem("s3").invalidate_cache()
     again = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     assert (again.photos, again.embedded, again.removed) == (16, 0, 8)

@@ -26,6 +26,7 @@ from indexes.store.rows import key_of
 NAME, FORMAT = "CLUSTER.json", 1
 CLUSTER = re.compile(r"cluster-(\d{6,})")
 FOLDER = re.compile(r"shard-(\d{2,})-of-(\d{2,})")
+DIGEST = re.compile(r"[0-9a-f]{64}")
 MOST_SHARDS = 4096
 
 
@@ -100,10 +101,15 @@ def entry_of(cluster: Path, folder: str, generation: Generation, objects: int) -
 
 def write_cluster(folder: Path, manifest: ClusterManifest) -> None:
     """Put the file in its place: this cluster answers from now on."""
+    with naming(folder / NAME):
+        write_atomically(folder / NAME, cluster_file(manifest))
+
+
+def cluster_file(manifest: ClusterManifest) -> bytes:
+    """The content of the file."""
     content = {"format": FORMAT} | asdict(manifest)
     content["sha256"] = own_digest(content)
-    with naming(folder / NAME):
-        write_atomically(folder / NAME, encoded(content, indent=2) + b"\n")
+    return encoded(content, indent=2) + b"\n"
 
 
 def read_cluster(folder: Path) -> ClusterManifest:
@@ -153,6 +159,7 @@ def _is_entry(value: object) -> bool:
         and FOLDER.fullmatch(value["folder"])
         and GENERATION.fullmatch(value["generation"])
         and isinstance(value["sha256"], str)
+        and DIGEST.fullmatch(value["sha256"])
     )
 
 

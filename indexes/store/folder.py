@@ -208,11 +208,15 @@ class IndexStore:
         except BaseException:
             _discard(folder)
             raise
-        files.sync(self.path)
-        files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
+        self.make_current(name)
         generation.folder = self.path / name
         self.discard_before(name, keep)
         return generation
+
+    def make_current(self, name: str) -> None:
+        """Switch to a whole generation that lies there under that name. Raises OSError."""
+        files.sync(self.path)
+        files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
 
     def discard_before(self, name: str, keep: int = 2) -> None:
         """Delete the generations before the one of that name, but for `keep` of them that readers may just open."""

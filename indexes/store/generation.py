@@ -210,7 +210,7 @@ class Generation:
         return rows, spread
 
 
-def require_made_by(where: Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
+def require_made_by(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
     """Check that a fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
     for key, value in expect.items():
         got = fingerprint.get(key)

@@ -20,9 +20,11 @@ from typing import Any, TypeVar
 from indexes.errors import IndexesError
 from indexes.store.cluster import ClusterManifest, ShardEntry, open_shard
 from indexes.store.generation import require_made_by
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError, Unanswered
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import Stored, fingerprint, read_stored
+from retrieval.search.object_store import folder_with
 from retrieval.search.opening import described_cluster, folder_shard
 from retrieval.search.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
 
@@ -62,7 +64,7 @@ class ShardReplica:
 
     def __init__(self, cluster: str, entry: ShardEntry, made_by: dict[str, str], model: str, verify: bool) -> None:
         stored = read_stored(Path(model))
-        generation = open_shard(Path(cluster), entry, made_by, verify=verify, threads=1)
+        generation = open_shard(folder_with(cluster, entry), entry, made_by, verify=verify, threads=1)
         self._shard = folder_shard(generation, stored)
 
     def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged | Exception:
@@ -180,12 +182,13 @@ class Deployments:
         self._lock = threading.Lock()
         ray.serve.start(proxy_location="Disabled")
 
-    def open(self, cluster: Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
+    def open(self, cluster: str | Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
         """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
         require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
         names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._own}" for entry in manifest.shards}
         with self._lock:
-            self._deploy(names, cluster.resolve(), manifest, stored)
+            where = cluster if is_url(cluster) else Path(cluster).resolve()
+            self._deploy(names, str(where), manifest, stored)
             self._users.update(names.values())
         handles = {folder: self._ray.serve.get_app_handle(name) for folder, name in names.items()}
         opened = RayShards(described_cluster(manifest), manifest.shards, handles, self._held)
@@ -199,7 +202,7 @@ class Deployments:
     def _deploy(
         self,
         names: dict[str, str],
-        cluster: Path,
+        cluster: str,
         manifest: ClusterManifest,
         stored: Stored,
     ) -> None:
@@ -228,7 +231,7 @@ class Deployments:
         )
         targets = [
             serve.RunTarget(
-                deployment.bind(str(cluster), entry, made_by, model, self._verify),
+                deployment.bind(cluster, entry, made_by, model, self._verify),
                 name=names[entry.folder],
                 route_prefix=None,
             )

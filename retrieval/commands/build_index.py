@@ -1,5 +1,6 @@
 """`retrieve build-index`: make a folder of photos searchable."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,7 +32,7 @@ def build_index(
         ),
     ] = None,
     model: Model = None,
-    out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
+    out: Annotated[str, typer.Option(help="index folder; or a URL, where shards are put")] = "index",
     kind: Annotated[
         str | None,
         typer.Option(help=f"candidate index: {', '.join(KINDS)} (default: exact, unless a bound asks for more)"),
@@ -60,22 +61,30 @@ def build_index(
     ] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="read every photo's file, also those whose size, times and inode did not change"),
+        typer.Option(
+            "--verify",
+            help="read every photo's file, also those whose size, times and inode did not change; and of a URL what "
+            "was put there",
+        ),
     ] = False,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
-    from indexes.store.cluster import is_cluster, read_cluster
+    from indexes.errors import NoIndex
     from retrieval.data.sources import is_elsewhere
+    from retrieval.data.storage import is_url
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
     from retrieval.search import build, build_cluster, defaults
+    from retrieval.search.object_store import StoredCluster, is_cluster, read_cluster
 
-    sheet = out.resolve().with_name(f"{out.resolve().name}-views.png")
+    folder = Path(out).resolve()
+    sheet = folder.with_name(f"{folder.name}-views.png")
     if preview:
         require_ours(sheet, PREVIEW)
-        if is_elsewhere(catalogue):
-            raise BadInput(f"--preview shows photos of a folder of this machine; {catalogue} is none")
+        for place, is_far in ((catalogue, is_elsewhere), (out, is_url)):
+            if is_far(place):
+                raise BadInput(f"--preview shows photos of a folder of this machine beside it; {place} is none")
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
     checkpoint = load_checkpoint(path)
@@ -87,7 +96,9 @@ def build_index(
         "verify": verify,
     }
     if shards is None and is_cluster(out):
-        shards = read_cluster(out).of
+        with suppress(NoIndex):
+            shards = read_cluster(out).of
+        shards = shards or 1  # the first behind a URL
     if shards is None and (bad_share is not None or cluster):
         raise BadInput("--bad-share and --cluster are for a catalogue in shards; give --shards too")
     run = None
@@ -97,14 +108,15 @@ def build_index(
         run = by_ray()
     try:
         if shards is None:
-            report = build.build_index(catalogue, checkpoint, out, **asked)
+            report = build.build_index(catalogue, checkpoint, Path(out), **asked)
         else:
             allowed = build_cluster.BAD_SHARE if bad_share is None else bad_share
             report = build_cluster.build_cluster(
                 catalogue, checkpoint, out, shards, bad_share=allowed, run=run, **asked
             )
     except KeyboardInterrupt:
-        say(f"what was embedded is kept in {out}; the same command goes on with it")
+        kept = StoredCluster(out).work if is_url(out) else out
+        say(f"what was embedded is kept in {kept}; the same command goes on with it")
         raise
     defaults.remember("index", out)
     if defaults.is_shipped(path) and (made := export_to_cache(checkpoint)):
@@ -115,7 +127,7 @@ def build_index(
         from indexes.store.folder import IndexStore
         from retrieval.report.views import write_views
 
-        first = IndexStore(out / report.shards[0]["folder"] if report.shards else out)
+        first = IndexStore(folder / report.shards[0]["folder"] if report.shards else folder)
         rows = first.open(verify=False).rows
         chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
         write_views([Path(catalogue) / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)

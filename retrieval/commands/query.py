@@ -30,7 +30,10 @@ def query(
         ),
     ] = None,
     index: Annotated[
-        str | None, typer.Option(help="index folder (default: ./index, else the last one built from this folder)")
+        str | None,
+        typer.Option(
+            help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"
+        ),
     ] = None,
     model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
     top: Annotated[int, typer.Option(help="objects to return")] = 10,

@@ -3,7 +3,7 @@
 import os
 import webbrowser
 from contextlib import ExitStack
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -23,7 +23,10 @@ TOKEN = "RETRIEVE_TOKEN"
 def serve(
     *,
     index: Annotated[
-        str | None, typer.Option(help="index folder (default: ./index, else the last one built from this folder)")
+        str | None,
+        typer.Option(
+            help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"
+        ),
     ] = None,
     model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
     host: Annotated[str, typer.Option(help="where to listen; other machines reach it only with a token")] = "127.0.0.1",
@@ -65,11 +68,13 @@ def serve(
         from retrieval.serve.settings import ServiceSettings
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
+    from retrieval.data.storage import is_url
     from retrieval.search import defaults
 
     path, why = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({why})")
+    kept = Path(PurePosixPath(path).name if is_url(path) else path).resolve()
     settings = ServiceSettings(
         index=path,
         model=Path(model) if model else None,
@@ -81,7 +86,7 @@ def serve(
         workers=workers,
         batch_ms=batch_ms,
         deadline_s=deadline,
-        history=None if no_history else history or path.resolve().with_name(f"{path.resolve().name}-history"),
+        history=None if no_history else history or kept.with_name(f"{kept.name}-history"),
     )
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
@@ -98,12 +103,12 @@ def serve(
 
 
 def _held(
-    index: Path, closed: ExitStack, replicas: int, wait_s: float, least_share: float, verify: bool
+    index: str | Path, closed: ExitStack, replicas: int, wait_s: float, least_share: float, verify: bool
 ) -> "OpenShards":
     """Opens shards on Ray, which is joined or started. Raises BadInput where there is no cluster to hold."""
-    from indexes.store.cluster import is_cluster
     from retrieval.cluster.serving import Deployments, Held
     from retrieval.cluster.session import connected
+    from retrieval.search.object_store import is_cluster
 
     if not is_cluster(index):
         raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
@@ -114,7 +119,7 @@ def _held(
     return deployments.open
 
 
-def _recorder(folder: Path, index: Path, closed: ExitStack) -> "RecordingWriter":
+def _recorder(folder: Path, index: str | Path, closed: ExitStack) -> "RecordingWriter":
     """The writer of the recording of what people say. Raises RobotError."""
     from retrieval.model.stored import read_stored
     from retrieval.search.defaults import manifest_of, model_of
@@ -137,7 +142,7 @@ def _token(file: Path | None) -> str | None:
         raise ConfigError(f"{file} must hold a token in ASCII: {error}") from error
 
 
-def _live_rig(rig: str | None, index: Path) -> "LiveRig | None":
+def _live_rig(rig: str | None, index: str | Path) -> "LiveRig | None":
     """What the rig gives the service; without --rig, the simulated one where the index shows its objects."""
     from retrieval.serve.rig import of_index, of_rig
 

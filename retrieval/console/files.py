@@ -23,6 +23,16 @@ _HEAD = 4096
 _MOST_HEADER = 100_000_000  # what safetensors itself reads
 
 
+def cache_folder() -> Path | None:
+    """What may be made or fetched again is kept here: `$XDG_CACHE_HOME/touch-retrieval` (`~/.cache` where it is not
+    set). None where the user has no home."""
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return Path(home) / "touch-retrieval"
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of file that we write. is_ours: whether an opened file is one, by its content."""

@@ -17,12 +17,11 @@ import math
 import re
 import tarfile
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from retrieval.data.catalogue import (
     METADATA_FILE,
@@ -34,13 +33,9 @@ from retrieval.data.catalogue import (
 )
 from retrieval.data.images import MAX_BYTES
 from retrieval.data.naming import Naming
+from retrieval.data.storage import FINAL, file_system, is_url, tried
 from retrieval.errors import BadInput, DatasetError, ImageError
 
-T = TypeVar("T")
-WAITS_S = (0.1, 0.4, 1.6, 3.2, 6.4)
-"""Between one try and the next."""
-_FINAL = (FileNotFoundError, IsADirectoryError, PermissionError, ValueError, tarfile.TarError)
-"""What another try would say again."""
 _PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _GROUPS = 4
@@ -67,7 +62,7 @@ class Fetched(Catalogue):
         return self.url
 
     def read(self, path: str) -> bytes:
-        """The bytes of a photo's file. Raises ImageError for one that is gone or too large, and DatasetError where the
+        """The bytes of a photo's file. Raises ImageError for one that is gone or too large, and StorageError where the
         storage does not answer."""
         assert self.source is not None
         try:
@@ -83,7 +78,7 @@ class Fetched(Catalogue):
 
 def is_elsewhere(where: str | Path) -> bool:
     """Whether this is read by `list_photos` alone, not as a folder."""
-    return "://" in str(where) or str(where).endswith((".parquet", ".tar"))
+    return is_url(where) or str(where).endswith((".parquet", ".tar"))
 
 
 def list_photos(where: str | Path, naming: Naming | None = None) -> Catalogue:
@@ -94,36 +89,6 @@ def list_photos(where: str | Path, naming: Naming | None = None) -> Catalogue:
     if url.endswith(".parquet"):
         return _parquet(url, naming)
     return _archives(url, naming) if url.endswith(".tar") else _folder(url, naming)
-
-
-def file_system(url: str) -> tuple[Any, str]:
-    """The `fsspec` file system of a URL, and the path in it. Raises BadInput for one that nothing opens."""
-    try:
-        import fsspec
-    except ImportError as error:
-        raise BadInput(f"{url}: fsspec is missing; run: pip install 'touch-retrieval[cluster]'") from error
-    try:
-        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
-        return found
-    except (ValueError, ImportError) as error:
-        raise BadInput(f"{url} cannot be opened ({error}); for S3: pip install 'touch-retrieval[cluster]'") from error
-
-
-def tried(what: str, function: Callable[[], T]) -> T:
-    """What `function` gives, asked again where a storage refuses. Raises DatasetError where it goes on refusing."""
-    for wait in (*WAITS_S, None):
-        try:
-            return function()
-        except _FINAL:
-            raise
-        except Exception as error:  # each storage has its own errors
-            if wait is None:
-                raise DatasetError(
-                    f"{what}: the storage refused {len(WAITS_S) + 1} times ({type(error).__name__}: {error}); the same "
-                    "command goes on where it stopped"
-                ) from error
-            time.sleep(wait)
-    raise AssertionError
 
 
 # A folder --------------------------------------------------------------------------------------------------
@@ -147,7 +112,7 @@ def _folder(url: str, naming: Naming) -> Catalogue:
     below = root.rstrip("/") + "/"
     try:
         names = tried(url, lambda: sorted(system.find(root)))
-    except _FINAL as error:
+    except FINAL as error:
         raise DatasetError(f"the catalogue {url} cannot be listed: {error}") from error
     files, skipped = [], list[SkippedPhoto]()
     for name in (name.removeprefix(below) for name in names if name.startswith(below)):
@@ -238,7 +203,7 @@ def _matching(url: str) -> list[str]:
     system, path = file_system(url)
     try:
         found = tried(url, lambda: sorted(system.glob(path)) if "*" in path else [path])
-    except _FINAL as error:
+    except FINAL as error:
         raise DatasetError(f"{url} cannot be listed: {error}") from error
     if not found:
         raise DatasetError(f"{url} names no file")
@@ -250,7 +215,7 @@ def _parquet(url: str, naming: Naming) -> Catalogue:
     for file in _matching(url):
         try:
             column = tried(file, lambda file=file: _list_parquet(file, photos, places))  # type: ignore[misc]
-        except _FINAL as error:
+        except FINAL as error:
             raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
     source: Source = ParquetSource(column, places) if column else FolderSource(url.rpartition("/")[0] or ".")
     return _named(url, photos, naming, source)
@@ -311,7 +276,7 @@ def _archives(url: str, naming: Naming) -> Catalogue:
     for file in _matching(url):
         try:
             members = tried(file, lambda file=file: list(_members(file)))  # type: ignore[misc]
-        except _FINAL as error:
+        except FINAL as error:
             raise DatasetError(f"{file} is not a readable tar file: {error}") from error
         stem, about = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
         for name, data, _, _ in members:

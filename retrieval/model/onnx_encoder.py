@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.regular import read_regular
-from retrieval.console.files import SEAL
+from retrieval.console.files import SEAL, cache_folder
 from retrieval.data.resize import RgbImage
 from retrieval.errors import CheckpointError
 from retrieval.model.stored import Stored
@@ -103,13 +103,10 @@ def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) 
 
 
 def cached(digest: str) -> Path | None:
-    """Where the export is kept of a checkpoint with that digest beside which none can be written: in
-    `$XDG_CACHE_HOME/touch-retrieval` (`~/.cache` where it is not set). None where the user has no home."""
-    try:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:
-        return None
-    return Path(home) / "touch-retrieval" / f"{digest}{ENDING}"
+    """Where the export is kept of a checkpoint with that digest beside which none can be written: in the user's cache.
+    None where the user has no home."""
+    folder = cache_folder()
+    return None if folder is None else folder / f"{digest}{ENDING}"
 
 
 def exported(checkpoint: Stored, threads: int | None = None) -> OnnxEncoder | None:

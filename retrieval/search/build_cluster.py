@@ -3,6 +3,9 @@
 Each shard is built as an ordinary index is, over the photos of the objects that are its own: what was embedded before,
 in it, in the shards of another division, or by a build that was cut off, is not embedded again. The cluster's manifest
 is written when every shard is on the disk. Killed at any moment, a build leaves the cluster as it was.
+
+A cluster in an object store is made in a folder of this machine, each shard put into the store as soon as it is made
+(`retrieval.search.object_store`).
 """
 
 from collections import Counter
@@ -35,11 +38,13 @@ from indexes.store.locking import WriterLock
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint
 from retrieval.search.build import Wanted, build_listed, naming_by
 from retrieval.search.build_report import BuildReport
+from retrieval.search.object_store import StoredCluster, folder_with, names
 from retrieval.search.operating import Asked
 from retrieval.version import __version__
 
@@ -50,16 +55,16 @@ _KEEP_ALL = 10**6
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One shard to build, as it is sent to wherever it is built. donors: folders, and generations in them, of shards
-    of another division."""
+    """One shard to build, as it is sent to wherever it is built. cluster: its folder, or its URL. donors: shards of
+    another division."""
 
-    cluster: Path
+    cluster: str | Path
     folder: str
     catalogue: Catalogue
     model: Path
     naming: Naming
     asked: Asked
-    donors: Sequence[tuple[str, str]]
+    donors: Sequence[ShardEntry]
     verify: bool
     quiet: bool
 
@@ -83,7 +88,7 @@ Run = Callable[[Sequence[ShardJob], Checkpoint], Iterable[ShardBuilt]]
 def build_cluster(
     folder: str | Path,
     checkpoint: Checkpoint,
-    out: Path,
+    out: str | Path,
     shards: int,
     *,
     objects_from: str | None = None,
@@ -95,30 +100,33 @@ def build_cluster(
     quiet: bool = False,
     run: Run | None = None,
 ) -> BuildReport:
-    """Write the next generation of the cluster `out` over the catalogue `folder`, in so many shards.
+    """Write the next generation of the cluster `out`, a folder or a URL, over the catalogue `folder`.
 
-    run: builds the shards; None: here, one after another. What else is asked for is as `build_index` takes it, and
-    holds for each shard. Raises its errors; BadInput for a number of shards that is none, or where `out` is an index
-    folder; and TooManyBad where more than a share of `bad_share` of the photos cannot be read.
+    shards: into how many it is divided. run: builds them; None: here, one after another. What else is asked for is as
+    `build_index` takes it, and holds for each shard. Raises its errors; BadInput for a number of shards that is none,
+    or where `out` is an index folder; TooManyBad where more than a share of `bad_share` of the photos cannot be read;
+    and StorageError where what lies behind the URL goes on refusing.
     """
     if not 1 <= shards <= MOST_SHARDS:
         raise BadInput(f"shards must be from 1 to {MOST_SHARDS}; got {shards}")
     if not 0 <= bad_share <= 1:
         raise BadInput(f"the share of bad photos must be from 0 to 1; got {bad_share}")
-    if (out / "CURRENT").is_file():
+    stored = StoredCluster(str(out)) if is_url(out) else None
+    own = Path(out) if stored is None else stored.work
+    if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
     asked = Asked(kind, min_recall, max_ms)
-    with WriterLock(out / "LOCK"):
-        before, note = _before(out)
+    with WriterLock(own / "LOCK"):
+        seen = None if stored is None else stored.manifest()
+        before, note = _before(lambda: read_cluster(own) if stored is None else stored.parsed(seen))
         naming, renamed = naming_by(objects_from, {} if before is None else before.about)
         catalogue = list_photos(folder, naming)
-        _sweep(out, before, shards)
-        donors = (
-            [] if before is None or before.of == shards else [(one.folder, one.generation) for one in before.shards]
-        )
+        _sweep(own, before, shards)
+        left = {} if stored is None else stored.generations()
+        donors = [] if before is None or before.of == shards else before.shards
         jobs = [
-            ShardJob(out, shard_folder(number, shards), own, checkpoint.path, naming, asked, donors, verify, quiet)
-            for number, own in _divided(catalogue, shards)
+            ShardJob(out, shard_folder(number, shards), part, checkpoint.path, naming, asked, donors, verify, quiet)
+            for number, part in _divided(catalogue, shards)
         ]
         built = sorted((run or one_after_another)(jobs, checkpoint), key=lambda one: one.folder)
         report = _report(out, catalogue, naming, checkpoint, built)
@@ -130,10 +138,13 @@ def build_cluster(
             )
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report, asked)
         written = before is None or manifest.generation != before.generation
-        if written:
-            write_cluster(out, manifest)
+        if written and stored is None:
+            write_cluster(own, manifest)
+        elif written and stored is not None:
+            stored.switch(seen, manifest)
+            stored.discard(left.keys() - names([*manifest.shards, *([] if before is None else before.shards)]))
         for entry in manifest.shards:
-            IndexStore(out / entry.folder).discard_before(entry.generation)
+            IndexStore(own / entry.folder).discard_before(entry.generation)
     reason = " ".join(filter(None, (renamed, note, report.reason)))
     return replace(report, generation=manifest.generation, written=written, reason=reason)
 
@@ -146,10 +157,13 @@ def one_after_another(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Itera
 def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuilt:
     """Build one shard. Raises the errors of `build_index`, but none where no photo of this one can be read."""
     model = checkpoint or load_checkpoint(job.model)
-    store = IndexStore(job.cluster / job.folder)
-    donors = [_donor(job.cluster, *donor, fingerprint(model)) for donor in job.donors]
+    stored = StoredCluster(str(job.cluster)) if is_url(job.cluster) else None
+    cluster = Path(job.cluster) if stored is None else stored.work
+    if stored is not None:
+        stored.restore(job.folder)
+    store = IndexStore(cluster / job.folder)
+    usable = [one for donor in job.donors if (one := _donor(job.cluster, donor, fingerprint(model))) is not None]
     about = {"shard": job.folder}
-    usable = [one for one in donors if one is not None]
     wanted = Wanted(job.naming, job.asked, job.quiet, job.verify, "", about, usable, _KEEP_ALL)
     try:
         report = build_listed(job.catalogue, model, store.path, wanted)
@@ -157,14 +171,16 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
         return ShardBuilt(job.folder, None, None, [], error.skipped)
     generation = store.open(name=report.generation, verify=False)
     counts = np.bincount(generation.codes("object_id")).tolist()
-    entry = entry_of(job.cluster, job.folder, generation, len(counts))
+    entry = entry_of(cluster, job.folder, generation, len(counts))
+    if stored is not None:
+        stored.put(entry, job.verify)
     return ShardBuilt(job.folder, entry, report, counts, report.skipped)
 
 
-def _before(out: Path) -> tuple[ClusterManifest | None, str]:
+def _before(read: Callable[[], ClusterManifest]) -> tuple[ClusterManifest | None, str]:
     """The cluster there, and why it is of no use where it is not."""
     try:
-        before = read_cluster(out)
+        before = read()
     except NoIndex:
         return None, ""
     except (CorruptIndex, UnsupportedFormat) as error:
@@ -192,16 +208,16 @@ def _divided(catalogue: Catalogue, shards: int) -> list[tuple[int, Catalogue]]:
     ]
 
 
-def _donor(cluster: Path, folder: str, name: str, wanted: Mapping[str, str]) -> Generation | None:
+def _donor(cluster: str | Path, entry: ShardEntry, wanted: Mapping[str, str]) -> Generation | None:
     """A shard whose codes may be taken over; None where it cannot serve."""
     try:
-        return IndexStore(cluster / folder).open(name=name, expect=wanted)
+        return IndexStore(folder_with(cluster, entry) / entry.folder).open(name=entry.generation, expect=wanted)
     except IndexesError:
         return None
 
 
 def _report(
-    out: Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuilt]
+    out: str | Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuilt]
 ) -> BuildReport:
     """What all builds did together. Raises NoPhoto where none of them had a photo to write."""
     reports = [one.report for one in built if one.report is not None]

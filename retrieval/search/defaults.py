@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from indexes.store.files import file_digest, write_atomically
 from indexes.store.regular import read_json
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def is_shipped(path: Path) -> bool:
     return path.resolve() in [shipped_model(fingers).resolve() for fingers in SHIPPED]
 
 
-def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
+def find_model(given: str | None, index: str | Path = INDEX) -> tuple[Path, str]:
     """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
 
     given: a path, or one of `NAMED`. Raises CheckpointError where there is none, or where that of `index` is gone.
@@ -75,13 +76,14 @@ def find_model(given: str | None, index: Path = INDEX) -> tuple[Path, str]:
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
 
 
-def manifest_of(index: Path) -> "Manifest | ClusterManifest":
-    """What an index folder, or a cluster of them, says of what it holds now. Raises the errors of `indexes.store`."""
-    from indexes.store.cluster import is_cluster, read_cluster
+def manifest_of(index: str | Path) -> "Manifest | ClusterManifest":
+    """What an index folder, or a cluster of them, says of what it holds now. Raises the errors of `indexes.store`, and
+    StorageError of what lies behind a URL."""
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
+    from retrieval.search.object_store import is_cluster, read_cluster
 
-    return read_cluster(index) if is_cluster(index) else read_manifest(index / IndexStore(index).current())
+    return read_cluster(index) if is_cluster(index) else read_manifest(Path(index) / IndexStore(index).current())
 
 
 def model_of(manifest: "Manifest | ClusterManifest") -> Path:
@@ -100,14 +102,15 @@ def model_of(manifest: "Manifest | ClusterManifest") -> Path:
     )
 
 
-def find_index(given: str | None) -> tuple[Path, str]:
-    """The index to use and why: the one given, else ./index, else the last one built from this folder."""
+def find_index(given: str | None) -> tuple[str | Path, str]:
+    """The index to use, a folder or a URL, and why: the one given, else ./index, else the last one built from this
+    folder."""
     if given is not None:
-        return Path(given), "given"
+        return given if is_url(given) else Path(given), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
-    if (last := _noted().get("index")) and _is_index(Path(last)):
-        return Path(last), "the last one built from this folder"
+    if (last := _noted().get("index")) and (is_url(last) or _is_index(Path(last))):
+        return last if is_url(last) else Path(last), "the last one built from this folder"
     raise BadInput(
         "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
         "or name one with --index"
@@ -119,12 +122,12 @@ def _is_index(folder: Path) -> bool:
     return any((folder / name).is_file() for name in ("CURRENT", "CLUSTER.json"))
 
 
-def remember(kind: str, path: Path) -> None:
+def remember(kind: str, path: str | Path) -> None:
     """Note `path` as the last "model" or "index" made from the working folder; does nothing where it cannot."""
     try:
         here = str(Path.cwd())
         notes = _notes()
-        mine = {**notes.pop(here, {}), kind: str(path.resolve())}
+        mine = {**notes.pop(here, {}), kind: str(path if is_url(path) else Path(path).resolve())}
         notes = {**dict(list(notes.items())[-MOST_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
         write_atomically(_state_file(), json.dumps(notes).encode())

@@ -8,6 +8,7 @@ from indexes.store.generation import Generation, require_made_by
 from indexes.store.manifest import Manifest
 from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
 from retrieval.search import defaults
+from retrieval.search.object_store import folder_with
 from retrieval.search.objects import require_usable
 from retrieval.search.shard import Described, FolderShard, Shard, Shards
 
@@ -32,15 +33,18 @@ def folder_shard(generation: Generation, stored: Stored) -> FolderShard:
     return FolderShard(generation, read_judge(stored.path), stored.config.has_embeddings)
 
 
-OpenShards = Callable[[Path, ClusterManifest, Stored], Shard]
-"""Opens the shards of a cluster, wherever they are."""
+OpenShards = Callable[[str | Path, ClusterManifest, Stored], Shard]
+"""Opens the shards of a cluster, which lies in a folder or behind a URL, wherever they are held."""
 
 
-def open_cluster(cluster: Path, manifest: ClusterManifest, stored: Stored, verify: bool = True) -> Shard:
-    """All shards of a cluster in this process. Raises as `folder_shard` and `indexes.store.cluster.open_shard` do."""
+def open_cluster(cluster: str | Path, manifest: ClusterManifest, stored: Stored, verify: bool = True) -> Shard:
+    """All shards of a cluster in this process; fetched first where they lie behind a URL. Raises as `folder_shard`,
+    `folder_with` and `indexes.store.cluster.open_shard` do."""
     require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
     shards = [
-        folder_shard(open_shard(cluster, entry, manifest.fingerprint, verify=verify, threads=1), stored)
+        folder_shard(
+            open_shard(folder_with(cluster, entry), entry, manifest.fingerprint, verify=verify, threads=1), stored
+        )
         for entry in manifest.shards
     ]
     return Shards(shards, described_cluster(manifest))

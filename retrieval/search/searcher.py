@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
-from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
 from retrieval.model.onnx_encoder import exported
@@ -29,6 +29,7 @@ from retrieval.model.touches import (
     read_grasps,
 )
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
+from retrieval.search.object_store import is_cluster, read_cluster
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, folder_shard, open_cluster, stored_for
 from retrieval.search.shard import Felt, FolderShard, Judged, Shard
@@ -52,7 +53,7 @@ class Searcher:
     >>> searcher.close()
     """
 
-    def __init__(self, index: Path, shard: Shard, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
+    def __init__(self, index: str | Path, shard: Shard, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
         self.index, self.shard, self.checkpoint = index, shard, checkpoint
         self.encoder, self.judge, self.described = encoder, judge, shard.described
         self.gel_check = checkpoint.gel_check
@@ -81,6 +82,8 @@ class Searcher:
     ) -> "Searcher":
         """Open the current generation of an index, or of a cluster of them, with the checkpoint that built it.
 
+        index: its folder; of a cluster the URL too, from which shards are fetched once into the user's cache.
+
         model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
         threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
         the choice to the library. shards: opens those of a cluster; None: in this process, `open_cluster`.
@@ -96,17 +99,16 @@ class Searcher:
         >>> from_arrays.results == from_files.results
         True
         """
-        folder = Path(index)
-        if is_cluster(folder):
-            manifest = read_cluster(folder)
+        if is_cluster(index):
+            manifest = read_cluster(index)
             stored = stored_for(manifest, model)
-            shard = shards(folder, manifest, stored) if shards else open_cluster(folder, manifest, stored, verify)
+            shard = shards(index, manifest, stored) if shards else open_cluster(index, manifest, stored, verify)
         else:
             generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
             stored = stored_for(generation.manifest, model)
             shard = folder_shard(generation, stored)
         encoder = exported(stored, threads) or torch_encoder(stored, threads)
-        return cls(folder, shard, stored, encoder, read_judge(stored.path))
+        return cls(index if is_url(index) else Path(index), shard, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
         """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from indexes.errors import IndexesError
 from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
 from retrieval.serve.service import Grasped, LiveRig
 from robot.devices import TactileSensor
@@ -30,7 +31,7 @@ _FRESH = 10_000
 _TRIES = 20
 
 
-def of_rig(spec: str, index: Path) -> LiveRig:
+def of_rig(spec: str, index: str | Path) -> LiveRig:
     """The sensors of a rig, which are connected at once. Raises RobotError."""
     rig = load_rig(spec, seed=_seed(index) or 0)
     if isinstance(rig, SimRig):
@@ -40,16 +41,19 @@ def of_rig(spec: str, index: Path) -> LiveRig:
     return LiveRig({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
 
 
-def of_index(index: Path) -> LiveRig | None:
+def of_index(index: str | Path) -> LiveRig | None:
     """The simulated rig, where the index shows its objects."""
     seed = _seed(index)
     return None if seed is None else _simulated(SimRig(seed))
 
 
-def _seed(index: Path) -> int | None:
-    """Of the simulated objects that an index shows; None where its first is none."""
+def _seed(index: str | Path) -> int | None:
+    """Of the simulated objects that an index shows; None where its first is none, or lies behind a URL."""
+    if is_url(index):
+        return None
     try:
-        folder = index / read_cluster(index).shards[0].folder if is_cluster(index) else index
+        folder = Path(index)
+        folder = folder / read_cluster(folder).shards[0].folder if is_cluster(folder) else folder
         first = IndexStore(folder).open(verify=False).rows[0]["object_id"]
     except IndexesError:
         return None  # said when it is opened

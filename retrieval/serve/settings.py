@@ -28,7 +28,7 @@ class ServiceSettings:
     pictures of sensors that run at once.
     """
 
-    index: Path
+    index: str | Path
     model: Path | None = None
     verify: bool = True
     host: str = "127.0.0.1"

@@ -2,9 +2,9 @@
 
 Catalogues are drawn as `tests.benchmarks.scale` draws them, blended of the codes of made-up pictures; the touches are
 those that the checkpoint keeps. Each is written as one index folder and as a cluster, and both are asked in turns, in
-this process, by one thread: the same winners, how long a shard takes, what both hold in memory, and how long whoever
-asks takes to open the cluster, its manifest and the model, without a shard of its own. With --ray Ray Serve holds a
-cluster of one shard: the way there and back, against the folder.
+this process, by one thread: the same winners, how long a shard takes, what both hold in memory. Last, how long whoever
+asks takes to open the cluster, its manifest and the model, without a shard of its own: of all sizes, in turns. With
+--ray Ray Serve holds a cluster of one shard: the way there and back, against the folder.
 
 Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1). A million photos take 3 GB on the disk.
 """
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from indexes.store.cluster import (
     ClusterManifest,
@@ -45,7 +46,8 @@ from retrieval.search.shard import Felt, FolderShard, Shard
 from tests import synthetic
 from tests.benchmarks.scale import Crowd
 
-TOUCHES, ALL_JUDGED = 200, 3
+TOUCHES, OPENINGS = 200, 21
+BLOCK = 10_000
 CANDIDATES = 5300
 """Of a million photos, that hold 99 % of the winners; of others, as N^0.8 (docs/performance.md)."""
 OPENED = """
@@ -54,11 +56,11 @@ from pathlib import Path
 from indexes.store.cluster import read_cluster
 from retrieval.model.stored import read_stored
 from retrieval.search.opening import described_cluster
-start = time.perf_counter()
+start = time.process_time()
 manifest = read_cluster(Path(sys.argv[1]))
 described = described_cluster(manifest)
 read_stored(Path(sys.argv[2]))
-print(time.perf_counter() - start, described.photos)
+print(time.process_time() - start, described.photos)
 """
 HELD = """
 import sys
@@ -104,9 +106,10 @@ def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]
     folder_s = time.perf_counter() - start
     measured = {"candidates": {"k": candidates_of(photos // shards)}}
     entries, start = list[ShardEntry](), time.perf_counter()
+    places = np.array([shard_of(row["object_id"], shards) for row in whole.rows])
     for number in range(shards):
         name = shard_folder(number, shards)
-        blocks = _of_shard(crowd.blocks(0, photos, 0), number, shards)
+        blocks = _blocks_of(whole, np.flatnonzero(places == number))
         made = IndexStore(out / "cluster" / name).write_blocks(blocks, calibration, about=about | measured, **said)
         entries.append(entry_of(out / "cluster", name, made, len(np.unique(made.codes("object_id")))))
     manifest = ClusterManifest(
@@ -117,15 +120,13 @@ def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]
     return {"folder_s": folder_s, "shards_s": time.perf_counter() - start, "bytes_per_photo": size / photos}
 
 
-def _of_shard(blocks: Iterator[Block], number: int, shards: int) -> Iterator[Block]:
-    for block in blocks:
-        own = np.array([shard_of(row["object_id"], shards) == number for row in block.rows])
-        if own.any():
-            rows = [row for row, mine in zip(block.rows, own, strict=True) if mine]
-            yield Block(rows, block.embeddings[own], {"halves": block.arrays["halves"][own]})
+def _blocks_of(whole: Generation, rows: NDArray[np.int64]) -> Iterator[Block]:
+    for some in np.array_split(rows, -(-len(rows) // BLOCK)):
+        halves = whole.arrays["halves"][some]
+        yield Block([whole.rows[row] for row in some], whole.embeddings[whole.slots[some]], {"halves": halves})
 
 
-def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int) -> dict[str, float]:
+def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int, judged: int) -> dict[str, float]:
     """Ask both in turns; how often the winners agree, with candidates and with all judged, and times."""
     halves = crowd.touches[:touches]
     embeddings = crowd.embeddings(halves, "touch")
@@ -148,10 +149,15 @@ def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int) -> dict[s
         times["rerank"].append(alone.timing_ms["rerank"] / 1e3)
         same += one.best[0].photo == many.best[0].photo
         better += many.best[0].logit >= one.best[0].logit - 1e-5
-    exact, error = 0, 0.0
-    for number in range(ALL_JUDGED):
+    exact, winners, error, whole_s = 0, 0, 0.0, list[list[float]]()
+    for number in range(judged):
         felt = Felt(embeddings[number : number + 1], halves[number : number + 1])
-        one, many = (shard.ask(felt, 10, photos, posterior) for shard in (folder, cluster))
+        start = time.thread_time()
+        one = folder.ask(felt, 10, photos, posterior)
+        middle = time.thread_time()
+        many = cluster.ask(felt, 10, photos, posterior)
+        whole_s.append([middle - start, time.thread_time() - middle])
+        winners += one.best[0].photo == many.best[0].photo
         exact += [each.photo for each in one.best] == [each.photo for each in many.best]
         error = max(error, *(abs(a.logit - b.logit) for a, b in zip(one.best, many.best, strict=True)))
         if posterior is not None and one.mass is not None and many.mass is not None:
@@ -160,11 +166,17 @@ def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int) -> dict[s
     found = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
     found["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
     shares = {"same_winner": same / len(halves), "winner_no_worse": better / len(halves)}
-    return found | shares | {"all_judged_same": exact / ALL_JUDGED, "all_judged_error": error}
+    folder_s, shards_s = np.median(whole_s, axis=0)
+    return (
+        found
+        | shares
+        | {"all_judged": judged, "all_judged_winner": winners / judged, "all_judged_same": exact / judged}
+        | {"all_judged_error": error, "all_judged_folder_s": float(folder_s), "all_judged_shards_s": float(shards_s)}
+    )
 
 
-def measure(crowd: Crowd, photos: int, shards: int, touches: int, out: Path) -> dict[str, float]:
-    """Everything at one number of photos."""
+def measure(crowd: Crowd, photos: int, shards: int, touches: int, judged: int, out: Path) -> dict[str, float]:
+    """Everything at one number of photos. judged: touches for which all photos are."""
     figures: dict[str, float] = {"photos": photos, "shards": shards} | write(crowd, photos, shards, out)
     stored = read_stored(crowd.checkpoint.path)
     start = time.perf_counter()
@@ -172,14 +184,20 @@ def measure(crowd: Crowd, photos: int, shards: int, touches: int, out: Path) -> 
     figures["folder_open_s"] = time.perf_counter() - start
     manifest = read_cluster(out / "cluster")
     cluster = open_cluster(out / "cluster", manifest, stored, verify=False)
-    figures |= compare(crowd, folder, cluster, touches)
+    figures |= compare(crowd, folder, cluster, touches, judged)
     np.savez(out / "codes.npz", halves=crowd.touches, embeddings=crowd.embeddings(crowd.touches, "touch"))
-    model = str(crowd.checkpoint.path)
-    opened = [_probe(OPENED, out / "cluster", model)[0] for _ in range(5)]
-    figures["client_open_s"] = float(np.median(opened))
     figures["folder_mb"] = _probe(HELD, out / "index", out / "codes.npz")[0]
     figures["shard_mb"] = _probe(HELD, out / "cluster" / manifest.shards[0].folder, out / "codes.npz")[0]
     return figures
+
+
+def opened(places: dict[str, Path], model: Path) -> dict[str, float]:
+    """Processor time in which clusters are opened by whoever asks, in turns; {what it is called: seconds}."""
+    taken: dict[str, list[float]] = {name: [] for name in places}
+    for _ in range(OPENINGS):
+        for name, place in places.items():
+            taken[name].append(_probe(OPENED, place / "cluster", model)[0])
+    return {f"client_open_{name}_s": float(np.median(one)) for name, one in taken.items()}
 
 
 def _probe(program: str, *words: Any) -> list[float]:
@@ -223,14 +241,18 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5, 1e6])
     parser.add_argument("--shards", type=int, default=8)
     parser.add_argument("--touches", type=int, default=TOUCHES)
+    parser.add_argument("--judged", type=int, default=3, help="touches for which all photos are judged")
     parser.add_argument("--model", type=Path, default=shipped_model())
     parser.add_argument("--ray", action="store_true", help="the way over Ray too, with the first of the sizes")
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     crowd = drawn_crowd(load_checkpoint(arguments.model))
-    for size in arguments.sizes:
-        with tempfile.TemporaryDirectory() as name:
-            _show(measure(crowd, int(size), arguments.shards, arguments.touches, Path(name)), arguments.json)
+    with tempfile.TemporaryDirectory() as name:
+        places = {f"{size:.0e}": Path(name) / str(int(size)) for size in arguments.sizes}
+        for size, place in zip(arguments.sizes, places.values(), strict=True):
+            asked = arguments.shards, arguments.touches, arguments.judged
+            _show(measure(crowd, int(size), *asked, place), arguments.json)
+        _show(opened(places, arguments.model), arguments.json)
     if arguments.ray:
         with tempfile.TemporaryDirectory() as name:
             _show(on_ray(crowd, int(arguments.sizes[0]), arguments.touches, Path(name)), arguments.json)

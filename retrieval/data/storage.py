@@ -1,0 +1,50 @@
+"""Storage behind a URL: whatever `fsspec` opens. What it refuses is asked for again, until an error says so."""
+
+import tarfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from retrieval.errors import BadInput, StorageError
+
+T = TypeVar("T")
+WAITS_S = (0.1, 0.4, 1.6, 3.2, 6.4)
+"""Between one try and the next."""
+FINAL = (FileNotFoundError, IsADirectoryError, PermissionError, ValueError, tarfile.TarError)
+"""What another try would say again."""
+
+
+def is_url(where: str | Path) -> bool:
+    """Whether this names a place by URL, not a path of this machine."""
+    return isinstance(where, str) and "://" in where
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """The `fsspec` file system of a URL, and the path in it. Raises BadInput for one that nothing opens."""
+    try:
+        import fsspec
+    except ImportError as error:
+        raise BadInput(f"{url}: fsspec is missing; run: pip install 'touch-retrieval[cluster]'") from error
+    try:
+        found: tuple[Any, str] = fsspec.core.url_to_fs(url)
+        return found
+    except (ValueError, ImportError) as error:
+        raise BadInput(f"{url} cannot be opened ({error}); for S3: pip install 'touch-retrieval[cluster]'") from error
+
+
+def tried(what: str, function: Callable[[], T]) -> T:
+    """What `function` gives, asked again where a storage refuses. Raises StorageError where it goes on refusing."""
+    for wait in (*WAITS_S, None):
+        try:
+            return function()
+        except FINAL:
+            raise
+        except Exception as error:  # each storage has its own errors
+            if wait is None:
+                raise StorageError(
+                    f"{what}: the storage refused {len(WAITS_S) + 1} times ({type(error).__name__}: {error}); the same "
+                    "command goes on where it stopped"
+                ) from error
+            time.sleep(wait)
+    raise AssertionError

@@ -1,0 +1,276 @@
+"""A cluster in an object store: whatever `fsspec` writes to, by its URL.
+
+    CLUSTER.json                               as in a folder (`indexes.store.cluster`); put last, by one request
+    shard-00-of-04/gen-000007-<SHA-256>/       a generation, under the digest of its manifest
+        rows.jsonl, ...
+        manifest.json                          put last
+
+The name of a generation stands for every byte of it, so that it is never changed, and two builds cannot mix theirs. It
+is there when its manifest is, and its files have the sizes that this one says: what was torn on its way is put again.
+Files that were altered at the same size are found when they are fetched, for they are checked by their digests.
+
+Generations are made in a folder of this machine, an ordinary cluster's, and fetched into another one to be searched.
+Both lie in the user's cache and may be deleted at any time: a build takes up what the store has, and a search fetches
+it again.
+"""
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+from indexes.errors import AGAIN, CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.store import cluster as folders
+from indexes.store.cluster import FOLDER, ClusterManifest, ShardEntry, cluster_file
+from indexes.store.files import file_digest, remove_folder, write_atomically
+from indexes.store.folder import IndexStore
+from indexes.store.locking import one_at_a_time
+from indexes.store.manifest import NAME as MANIFEST
+from indexes.store.manifest import read_manifest
+from retrieval.console.files import cache_folder
+from retrieval.data.storage import FINAL, file_system, is_url, tried
+from retrieval.errors import BadInput, StorageError
+
+T = TypeVar("T")
+GENERATION = re.compile(r"(gen-\d{6,})-([0-9a-f]{64})")
+MOST_BYTES = 16 * 2**20
+"""Of a manifest."""
+KEPT = 2
+"""Generations of a shard that stay fetched: one that is searched while the next is."""
+
+
+def is_cluster(where: str | Path) -> bool:
+    """Whether a cluster lies in this folder; what lies behind a URL is always one."""
+    return is_url(where) or folders.is_cluster(Path(where))
+
+
+def read_cluster(where: str | Path) -> ClusterManifest:
+    """The manifest of a cluster in a folder or behind a URL. Raises the errors of `indexes.store.cluster`, and
+    StorageError."""
+    if not is_url(where):
+        return folders.read_cluster(Path(where))
+    stored = StoredCluster(str(where))
+    return stored.parsed(stored.manifest())
+
+
+def folder_with(where: str | Path, entry: ShardEntry) -> Path:
+    """The folder of a cluster in which this shard lies on this machine, fetched first where it lies elsewhere."""
+    return StoredCluster(str(where)).fetch(entry) if is_url(where) else Path(where)
+
+
+class StoredCluster:
+    """The cluster behind a URL. work: the folder of this machine in which its shards are made.
+
+    Raises BadInput for a URL that nothing opens, or that means a folder of this machine.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        if self.url.startswith(("file:", "local:")):
+            raise BadInput(f"{url} is a folder of this machine; name it by its path")
+        self._system, root = file_system(self.url)
+        self._root = root.rstrip("/")
+        cache = cache_folder()
+        if cache is None:
+            raise BadInput(f"{url}: there is no folder to work in; set XDG_CACHE_HOME")
+        key = hashlib.sha256(self.url.encode()).hexdigest()[:32]
+        self.work, self._fetched = cache / "building" / key, cache / "shards" / key
+
+    # Reading ---------------------------------------------------------------------------------------------------
+
+    def manifest(self) -> bytes | None:
+        """What its manifest holds; None without one. Raises StorageError."""
+
+        def whole(path: str) -> bytes | None:
+            try:
+                data: bytes = self._system.cat_file(path, start=0, end=MOST_BYTES + 1)
+            except FileNotFoundError:
+                return None
+            if len(data) > MOST_BYTES:
+                raise ValueError(f"a manifest has at most {MOST_BYTES} bytes")
+            return data
+
+        return self._try(folders.NAME, whole)
+
+    def parsed(self, manifest: bytes | None) -> ClusterManifest:
+        """A manifest that was read here. Raises NoIndex where there is none, CorruptIndex and UnsupportedFormat."""
+        if manifest is None:
+            raise NoIndex(f"{self.url}: there is no cluster here; run `retrieve build-index --out {self.url}` first")
+        own = self._fetched / folders.NAME
+        own.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(own, manifest)
+        try:
+            return folders.read_cluster(own.parent)
+        except (CorruptIndex, UnsupportedFormat) as error:
+            raise type(error)(f"{self.url}: {error}") from error
+
+    def fetch(self, entry: ShardEntry) -> Path:
+        """The folder of a cluster, on this machine, in which this shard lies. Only what is not there is fetched.
+
+        Raises CorruptIndex for one that is not what the cluster was made of, and StorageError.
+        """
+        own = self._fetched / entry.sha256[:32]
+        place = own / entry.folder / entry.generation
+        if not place.is_dir():
+            with one_at_a_time(own.with_name(f"{own.name}.lock")):
+                if not place.is_dir():
+                    self._fetch(f"{entry.folder}/{_name(entry)}", entry.sha256, place)
+            with suppress(OSError):  # another process does the same
+                old = sorted(self._fetched.glob(f"*/{entry.folder}"), key=lambda path: path.stat().st_mtime)
+                for path in old[:-KEPT]:
+                    remove_folder(path.parent)
+        return own
+
+    def restore(self, folder: str) -> None:
+        """Make the newest whole generation of this shard the current one of the folder to work in, unless it lies there
+        already: what was embedded on another machine need not be again. One that is damaged is left."""
+        whole = [name for name, is_whole in self.generations(folder).items() if is_whole]
+        if not whole:
+            return
+        store, name = IndexStore(self.work / folder), max(whole)
+        generation, sha256 = GENERATION.fullmatch(name).groups()  # type: ignore[union-attr]
+        place = store.path / generation
+        if place.is_dir():
+            if file_digest(place / MANIFEST) == sha256:
+                return
+            remove_folder(place)  # of another history: what the store has counts
+        with suppress(IndexesError):
+            self._fetch(f"{folder}/{name}", sha256, place)
+            store.make_current(generation)
+
+    def generations(self, folder: str = "") -> dict[str, bool]:
+        """{name of a generation: whether its manifest is there}: of one shard, or `<shard>/<name>` of all."""
+        files = self._sizes(folder)
+        names = {file.rpartition("/")[0] for file in files}
+        found = {name: f"{name}/{MANIFEST}" in files for name in names if GENERATION.fullmatch(name.rpartition("/")[2])}
+        return {name: whole for name, whole in found.items() if folder or FOLDER.fullmatch(name.rpartition("/")[0])}
+
+    # Writing ---------------------------------------------------------------------------------------------------
+
+    def put(self, entry: ShardEntry, verify: bool = False) -> None:
+        """Put the shard that lies in the folder to work in, but for files that are there: by their size, and by what
+        they hold with `verify`. Raises StorageError."""
+        place, own = f"{entry.folder}/{_name(entry)}", self.work / entry.folder / entry.generation
+        there = self._sizes(place)
+        must = {name: file["sha256"] for name, file in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
+        for name, sha256 in must.items():
+            size = (own / name).stat().st_size
+            if there.get(name) != size or (verify and self._digest(f"{place}/{name}") != sha256):
+                self._put(own / name, f"{place}/{name}")
+
+    def switch(self, before: bytes | None, manifest: ClusterManifest) -> None:
+        """Put the manifest in its place: this cluster answers from now on. before: what was there when the build began.
+
+        Raises StorageError, where another build has put its own meanwhile too.
+        """
+        content = cluster_file(manifest)
+        if self.manifest() not in (before, content):
+            raise StorageError(
+                f"{self.url}: another build put its own cluster there meanwhile; run the same command again, which "
+                "embeds nothing twice"
+            )
+
+        def put(path: str) -> None:
+            self._system.pipe_file(path, content)
+            if self._system.cat_file(path) != content:
+                raise OSError("it was torn on its way")
+
+        self._try(folders.NAME, put)
+
+    def discard(self, names: Iterable[str]) -> None:
+        """Delete generations, as `generations` names them, each manifest first."""
+
+        def delete(path: str) -> None:
+            with suppress(FileNotFoundError):  # by a try that was not answered
+                self._system.rm_file(path)
+
+        for name in names:
+            for file in sorted(self._sizes(name), key=lambda file: file != MANIFEST):
+                self._try(f"{name}/{file}", delete)
+
+    # The store -------------------------------------------------------------------------------------------------
+
+    def _try(self, name: str, function: Callable[[str], T]) -> T:
+        """Call it with the whole path of `name`, again where the store refuses. Raises StorageError."""
+        what = f"{self.url}/{name}".rstrip("/")
+        try:
+            return tried(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
+        except FINAL as error:
+            raise StorageError(f"{what}: the storage refuses ({type(error).__name__}: {error})") from error
+
+    def _sizes(self, name: str) -> dict[str, int]:
+        """{file below `name`: its bytes}."""
+
+        def sizes(path: str) -> dict[str, int]:
+            self._system.invalidate_cache()
+            try:
+                found = self._system.find(path, detail=True)
+            except FileNotFoundError:
+                return {}
+            below = f"{path}/"
+            pairs = {one["name"]: one["size"] for one in found.values()}
+            return {name.removeprefix(below): size for name, size in pairs.items() if name.startswith(below)}
+
+        return self._try(name, sizes)
+
+    def _size(self, path: str) -> int:
+        """Of a file, as the store says now; -1 where it is not there."""
+        self._system.invalidate_cache()
+        try:
+            return int(self._system.info(path)["size"])
+        except FileNotFoundError:
+            return -1
+
+    def _digest(self, name: str) -> str:
+        def digest(path: str) -> str:
+            with self._system.open(path, "rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+
+        return self._try(name, digest)
+
+    def _put(self, file: Path, name: str) -> None:
+        def put(path: str) -> None:
+            self._system.put_file(str(file), path)
+            if self._size(path) != file.stat().st_size:
+                raise OSError("it was torn on its way")
+
+        self._try(name, put)
+
+    def _fetch(self, name: str, sha256: str, place: Path) -> None:
+        """A generation into `place`, where it stands only when it is whole. Files that an earlier try fetched stay."""
+        part = place.with_name(f"{place.name}.part")
+        part.mkdir(parents=True, exist_ok=True)
+        self._fetch_file(f"{name}/{MANIFEST}", part / MANIFEST, None, sha256)
+        for file, must in read_manifest(part).files.items():
+            self._fetch_file(f"{name}/{file}", part / file, must["bytes"], must["sha256"])
+        part.rename(place)
+
+    def _fetch_file(self, name: str, file: Path, must: int | None, sha256: str) -> None:
+        """must: the bytes that it has; None for a manifest."""
+        if file.is_file() and file_digest(file) == sha256:
+            return
+        size = self._try(name, self._size)
+        if size < 0 or (size > MOST_BYTES if must is None else size != must):
+            what = "is missing" if size < 0 else f"has {size} bytes, and not {must or MOST_BYTES}"
+            raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
+
+        def fetch(path: str) -> None:
+            self._system.get_file(path, str(file))
+            if file.stat().st_size != size:
+                raise OSError("it was torn on its way")
+
+        self._try(name, fetch)
+        if file_digest(file) != sha256:
+            file.unlink()
+            raise CorruptIndex(f"{self.url}/{name} was altered; `retrieve build-index --verify` mends it")
+
+
+def names(entries: Iterable[ShardEntry]) -> set[str]:
+    """Generations, as `StoredCluster.generations` names them."""
+    return {f"{entry.folder}/{_name(entry)}" for entry in entries}
+
+
+def _name(entry: ShardEntry) -> str:
+    return f"{entry.generation}-{entry.sha256}"

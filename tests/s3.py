@@ -1,0 +1,86 @@
+"""A server that speaks S3 (moto), on this machine alone, and faults that it may have."""
+
+import io
+import threading
+from contextlib import contextmanager
+
+import pytest
+
+CREDENTIALS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
+LEAST = 200
+"""Bytes of an upload that may be torn."""
+
+
+class Faults:
+    """In front of the server's application. refuse: every so many-th request; tear: every so many-th upload, of which
+    all but the last half arrives, as if the sender had died. None: none. refused, torn: how many were."""
+
+    def __init__(self, application):
+        self.application, self.refuse, self.tear = application, None, None
+        self.requests = self.uploads = self.refused = self.torn = 0
+        self._lock = threading.Lock()
+
+    def __call__(self, environ, start):
+        with self._lock:
+            self.requests += 1
+            refused = bool(self.refuse) and self.requests % self.refuse == 0
+            self.refused += refused
+            size = int(environ.get("CONTENT_LENGTH") or 0)
+            is_upload = environ["REQUEST_METHOD"] == "PUT" and size > LEAST and not refused
+            self.uploads += is_upload
+            torn = bool(self.tear) and is_upload and self.uploads % self.tear == 0
+            self.torn += torn
+        body = environ["wsgi.input"].read(size)  # what is left in the line would be taken for the next request
+        environ["wsgi.input"] = io.BytesIO(body)
+        if refused:
+            start("503 Slow Down", [("Content-Type", "application/xml")])
+            return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
+        if torn:
+            environ["wsgi.input"], environ["CONTENT_LENGTH"] = io.BytesIO(body[: size // 2]), str(size // 2)
+            for name in [name for name in environ if "CHECKSUM" in name or name in ("HTTP_CONTENT_MD5", TRAILER)]:
+                del environ[name]
+        return self.application(environ, start)
+
+
+TRAILER = "HTTP_X_AMZ_TRAILER"
+
+
+@contextmanager
+def served():
+    """The server's faults, while it runs; the environment names it to whoever speaks S3."""
+    pytest.importorskip("moto.server", reason="needs moto[server]")
+    pytest.importorskip("s3fs", reason="needs s3fs")
+    import s3fs
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+    from werkzeug.serving import WSGIRequestHandler, make_server
+
+    class Quiet(WSGIRequestHandler):
+        def log(self, *_):
+            pass
+
+    faults = Faults(DomainDispatcherApplication(create_backend_app))
+    server = make_server("127.0.0.1", 0, faults, threaded=True, request_handler=Quiet)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    patch = pytest.MonkeyPatch()
+    for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}"}.items():
+        patch.setenv(name, value)
+    try:
+        yield faults
+    finally:
+        patch.undo()
+        s3fs.S3FileSystem.clear_instance_cache()
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def put(folder, place):
+    """Put the files of a folder at bucket/place; the bucket is made."""
+    import s3fs
+
+    system = s3fs.S3FileSystem()
+    system.makedirs(place.partition("/")[0], exist_ok=True)
+    for path in folder.rglob("*"):
+        if path.is_file():
+            system.pipe_file(f"{place}/{path.relative_to(folder)}", path.read_bytes())
