@@ -117,22 +117,26 @@ class Pinch:
     def _reached(self, turns: Sequence[float]) -> Array:
         """(turns, fingers): how far along its rays each finger goes until it touches; inf where it meets nothing."""
         self.passes["turn"] += 1
-        rays = [self._rays(side, _FEELERS, self._turn(angle)) for angle in turns for side in SIDES.values()]
-        starts, directions = (np.concatenate(parts) for parts in zip(*rays, strict=True))
+        placements = [self._turn(angle) for angle in turns]
+        rays = [self._rays(side, _FEELERS, placements) for side in SIDES.values()]
+        starts, directions = (np.stack(parts, axis=1).reshape(-1, 3) for parts in zip(*rays, strict=True))
         reach = self.obj.body.cast(starts, directions)
         return np.asarray(reach.reshape(len(turns), len(SIDES), -1).min(axis=2))
 
-    def _rays(self, side: float, grid: tuple[int, int], placement: Placement) -> tuple[Array, Array]:
-        """Starts and directions, in the object's frame, of parallel rays from the pad of a finger."""
+    def _rays(self, side: float, grid: tuple[int, int], placements: Sequence[Placement]) -> tuple[Array, Array]:
+        """Starts and directions, (placements, pixels, 3) in the object's frame as it is placed, of parallel rays from
+        the pad of a finger."""
         height, width = self._field_mm
         z = height * (0.5 - (np.arange(grid[0]) + 0.5) / grid[0])
         y = -side * width * ((np.arange(grid[1]) + 0.5) / grid[1] - 0.5)
         yy, zz = np.meshgrid(y, z)
         local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
-        pose = self.grip.pose
+        pose, rotations = self.grip.pose, np.stack([placement.rotation() for placement in placements])
         closing = Placement(yaw_rad=pose.yaw_rad).rotation()
-        starts = placement.to_object(local @ closing.T + [pose.x_mm, pose.y_mm, pose.z_mm])
-        return starts, np.broadcast_to((side * closing[:, 0]) @ placement.rotation(), starts.shape)
+        pad = local @ closing.T + [pose.x_mm - self.placement.x_mm, pose.y_mm - self.placement.y_mm, pose.z_mm]
+        starts = pad @ rotations
+        directions = (side * closing[:, 0]) @ rotations
+        return starts, np.broadcast_to(directions[:, None], starts.shape)
 
     @cached_property
     def _field_mm(self) -> tuple[float, float]:
@@ -155,8 +159,8 @@ class Pinch:
         for finger, side in SIDES.items():
             grid = self.hand.grid if finger in self.sensors else _FEELERS
             self.passes["wall" if finger in self.sensors else "feel"] += 1
-            rays = self._rays(side, grid, self.turned)
-            walls[finger] = self.obj.body.cast(*rays, beyond_mm=_DEEPEST_MM).reshape(grid)
+            (starts,), (directions,) = self._rays(side, grid, [self.turned])
+            walls[finger] = self.obj.body.cast(starts, directions, beyond_mm=_DEEPEST_MM).reshape(grid)
         return walls
 
     # What the fingers feel ----------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from robot.sim.objects.body import Body, ClippedRays, Vectors
 from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.objects.looks import draw_looks
 from robot.sim.objects.materials import draw_material
+from robot.sim.objects.packets import March
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes.base import Cylindrical, Floats, relief_limit
 from robot.sim.objects.wall import Wall, bake_plain, ends_weight, smoothstep
@@ -139,17 +140,21 @@ class MeshBody(Body):
         return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
+        ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
+        origins, directions, near = rays.origins[ahead], rays.directions[ahead], rays.near_mm[ahead]
         # A face that lies in the bounding box would be missed by rays that start on it.
-        back = np.minimum(rays.near_mm, _BACK_MM)
-        face, distance = self._first(rays.origins - back[:, None] * rays.directions, rays.directions)
+        start = near - np.minimum(near, _BACK_MM)
+        face, distance = self._first(origins + start[:, None] * directions, directions)
         hit = np.flatnonzero(face >= 0)
-        result = np.full(len(back), np.inf)
-        result[hit] = distance - back[hit]
-        cosine = -np.einsum("ij,ij->i", rays.directions[hit], self.mesh.face_normals[face[hit]])
-        outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (back[hit] == 0)]
-        result[inside] = 0.0
-        result[outside] -= self._lift(face[outside], rays, outside, result[outside])
-        return np.asarray(np.maximum(result, 0.0))
+        result = np.full(len(ahead), np.inf)
+        result[hit] = start[hit] + distance
+        cosine = -np.einsum("ij,ij->i", directions[hit], self.mesh.face_normals[face[hit]])
+        outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (start[hit] == near[hit])]
+        result[inside] = near[inside]
+        result[outside] -= self._lift(face[outside], origins[outside], directions[outside], result[outside], rays.march)
+        distances = np.full(len(rays.near_mm), np.inf)
+        distances[ahead] = np.maximum(result, near)
+        return distances
 
     def _first(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
         """First face along each ray (-1: none), and for those with one the distance to its plane, in float64."""
@@ -160,18 +165,17 @@ class MeshBody(Body):
         offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
 
-    def _lift(self, face: Faces, rays: ClippedRays, chosen: Faces, distance: Vectors) -> Vectors:
+    def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, march: March) -> Vectors:
         """How much earlier (or, engraved, later) rays meet the relief than the mesh."""
         if self.wall is None:
             return np.zeros(len(face))
-        origins, directions = rays.origins[chosen], rays.directions[chosen]
         normals = self.mesh.normals_at(face, origins + distance[:, None] * directions)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
         lift = np.zeros(len(face))
         # Twice, as where the ray meets the relief is not above where it meets the mesh.
         for _ in range(2):
             points = origins + (distance - lift)[:, None] * directions
-            lift = self._height(points, normals, rays.step_mm) / cosine
+            lift = self._height(points, normals, march.step_mm) / cosine
         return lift
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:

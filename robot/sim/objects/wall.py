@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robot.sim.objects.packets import heights
 from robot.sim.objects.relief import Relief, Sheet
 from robot.sim.objects.shapes.base import Chart, Floats, Points, Shape
 
@@ -17,7 +18,6 @@ FINEST_MM = 0.14
 _MOST_NODES = 1.2e6
 _LEVELS = 4
 _CELL_MM = 1.5
-_REMAP_LIMIT = 32000  # cv2 counts pixels of a row in 16 bits
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,7 @@ class Level:
 
     def at(self, s: Floats, t: Floats) -> Floats:
         """Heights at map coordinates in mm, (N,) each."""
-        u, v = s * np.float32(self.per_s), t * np.float32(self.per_t)
-        parts = [slice(start, start + _REMAP_LIMIT) for start in range(0, len(u), _REMAP_LIMIT)]
-        heights = [
-            cv2.remap(self.height_mm, u[None, part], v[None, part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for part in parts
-        ]
-        return np.concatenate(heights, axis=1)[0] if heights else u
+        return heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t))
 
 
 @dataclass(frozen=True)

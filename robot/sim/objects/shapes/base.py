@@ -6,9 +6,14 @@ than there is: |d(p) - d(q)| <= |p - q|, the condition under which sphere tracin
 """
 
 from abc import ABC, abstractmethod
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robot.sim.objects.formula import record
+from robot.sim.objects.packets import Formula, run
 
 Floats = NDArray[np.float32]
 Points = NDArray[np.floating]
@@ -58,14 +63,21 @@ class Shape(ABC):
     # The most that relief may add to or take from the surface without ruining the shape.
     relief_limit_mm: float
 
+    @cached_property
+    def formula(self) -> Formula:
+        """Of `distance_xyz`, for compiled code."""
+        return record(self.distance_xyz, 3)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "formula"}
+
     def distance(self, points: Points) -> Floats:
         """Signed distance in mm of points (N, 3), negative inside; never more than the true one."""
-        columns = np.asarray(points, np.float32).T
-        return self.distance_xyz(*np.ascontiguousarray(columns))
+        return run(self.formula, *np.asarray(points, np.float32).T)[0]
 
     @abstractmethod
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """The same for coordinates in three arrays (N,) of float32, which is faster."""
+        """The same for coordinates in three arrays (N,) of float32, by functions that `record` knows."""
 
     def macro(self, s: Floats, t: Floats) -> Floats | None:
         """Height in mm of what the shape itself wears on its wall, such as a thread: (len(t), len(s)) or None."""
@@ -131,11 +143,13 @@ def smooth_min(a: Floats, b: Floats, blend_mm: float) -> Floats:
     if blend_mm <= 0:
         return np.minimum(a, b)
     near = np.maximum(np.float32(blend_mm) - np.abs(a - b), np.float32(0))
-    return np.asarray(np.minimum(a, b) - near * near * np.float32(0.25 / blend_mm))
+    blended: Floats = np.minimum(a, b) - near * near * np.float32(0.25 / blend_mm)
+    return blended
 
 
 def rounded(a: Floats, b: Floats, radius: float) -> Floats:
     """Corner of two half-spaces with distances a and b, rounded by `radius`: exact outside and inside."""
     p, q = a + np.float32(radius), b + np.float32(radius)
     outside = length(np.maximum(p, 0), np.maximum(q, 0))
-    return np.asarray(outside + np.minimum(np.maximum(p, q), 0) - np.float32(radius))
+    corner: Floats = outside + np.minimum(np.maximum(p, q), 0) - np.float32(radius)
+    return corner

@@ -81,7 +81,8 @@ class RoundedRectangle(Outline):
         along = np.clip(a + p, 0, a) + angle * np.float32(self.corner_mm) + np.clip(-q, 0, b)
         quarter = np.float32(self.length_mm / 4)
         s = np.where(y > 0, along, 2 * quarter - along)
-        return np.asarray(np.where(x > 0, 4 * quarter - s, s))
+        unrolled: Floats = np.where(x > 0, 4 * quarter - s, s)
+        return unrolled
 
     def place(self, s: Floats) -> tuple[Points, Points]:
         a, b = self._inner

@@ -113,7 +113,8 @@ class Revolution(Shape):
         if self.hollow is None:
             return None
         inner = length(x, y) - np.float32(self.hollow.radius_mm)
-        return np.asarray(np.clip(inner * np.float32(1 / self._mask_width), 0, 1))
+        weight: Floats = np.clip(inner * np.float32(1 / self._mask_width), 0, 1)
+        return weight
 
 
 class Rod(Revolution):

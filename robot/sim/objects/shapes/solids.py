@@ -58,7 +58,8 @@ class Superquadric(Shape):
         a, b, c = (np.float32(1 / half) for half in self.half_mm)
         e, f = self.round_power, self.upright_power
         norm = _norm(_norm(x * a, y * b, e), (z - np.float32(self.middle_mm)) * c, f)
-        return np.asarray(np.maximum((norm - 1) * np.float32(min(self.half_mm)), -z))
+        distance: Floats = np.maximum((norm - 1) * np.float32(min(self.half_mm)), -z)
+        return distance
 
 
 def _norm(a: Floats, b: Floats, power: float) -> Floats:
@@ -93,7 +94,8 @@ class Blobs(Shape):
             ball = np.sqrt(p * p + q * q + r * r) - np.float32(radius)
             distance = ball if distance is None else smooth_min(distance, ball, self.blend_mm)
         assert distance is not None
-        return np.asarray(np.maximum(distance, -z))
+        cut: Floats = np.maximum(distance, -z)
+        return cut
 
 
 class Ring(Shape):
@@ -112,7 +114,8 @@ class Ring(Shape):
         rise = z - np.float32(self.middle_mm)
         rise = rise - np.clip(rise, -half, half)
         tube = length(length(x, rise) - np.float32(self.ring_mm), y) - np.float32(self.tube_mm)
-        return np.asarray(np.maximum(tube, -z))
+        distance: Floats = np.maximum(tube, -z)
+        return distance
 
 
 class Mug(Revolution):
@@ -190,7 +193,8 @@ class Comb(Shape):
         cells = np.float32(max(int(room / self.pitch_mm), 0))
         along = along - np.float32(self.pitch_mm) * np.clip(np.rint(along / np.float32(self.pitch_mm)), -cells, cells)
         slot = np.maximum(np.abs(along) - np.float32(self.gap_mm / 2), np.float32(self.slot_mm) - across)
-        return np.asarray(np.maximum(self.slab.distance(x, y, z), -slot))
+        distance: Floats = np.maximum(self.slab.distance(x, y, z), -slot)
+        return distance
 
 
 class Brush(Shape):
@@ -208,8 +212,10 @@ class Brush(Shape):
         rows = max((half - self.bristle_mm) / self.pitch_mm, 0)
         if int(2 * rows) % 2:  # an even number of rows stands astride the middle
             x = np.abs(x) - pitch / 2
-            return np.asarray(x - pitch * np.clip(np.rint(x / pitch), 0, np.float32(int(rows - 0.5))))
-        return np.asarray(x - pitch * np.clip(np.rint(x / pitch), -np.float32(int(rows)), np.float32(int(rows))))
+            row: Floats = np.clip(np.rint(x / pitch), 0, np.float32(int(rows - 0.5)))
+        else:
+            row = np.clip(np.rint(x / pitch), -np.float32(int(rows)), np.float32(int(rows)))
+        return x - pitch * row
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
         across = length(self._fold(x, self.block.half_mm[0]), self._fold(y, self.block.half_mm[1]))

@@ -1,0 +1,21 @@
+"""Functions in machine code, for loops over rays and pixels that numpy cannot say in few passes over memory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as numba compiles it when it is first called with arguments of a type.
+
+    What was compiled is kept beside the source (or, where that cannot be written, in the user's cache) and made anew
+    when the function's own file has changed: what it calls stands in that file too. Divisions by 0 are numpy's. It uses
+    no threads, so that processes that use it may fork, and it lets other threads run.
+    """
+    settings = {"error_model": "numpy", "nogil": True}
+    try:
+        made: Callable[..., Any] = numba.njit(cache=True, **settings)(function)
+    except RuntimeError:  # there is no place to keep it
+        made = numba.njit(**settings)(function)
+    return made

@@ -1,0 +1,41 @@
+"""Where rays enter and leave a bounding box."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import SceneError
+from robot.sim.compiled import compiled
+
+Vectors = NDArray[np.float64]
+
+
+def clipped(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vectors) -> tuple[Vectors, Vectors]:
+    """Where rays (n, 3) enter and leave a box, (n,) each, at least 0; a miss enters after it leaves.
+
+    Raises SceneError for an origin that is not finite, or a direction that is not of unit length.
+    """
+    near, far = np.empty(len(origins)), np.empty(len(origins))
+    wrong = _clip(origins, directions, lower, upper, near, far)
+    if wrong:
+        raise SceneError(wrong)
+    return near, far
+
+
+@compiled
+def _clip(origins, directions, lower, upper, near, far):  # type: ignore[no-untyped-def]
+    """Fill near and far; what is wrong with a ray, if anything is."""
+    for number in range(len(near)):
+        enters, leaves, square = 0.0, np.inf, 0.0
+        for axis in range(3):
+            start, along = origins[number, axis], directions[number, axis]
+            if not np.isfinite(start):
+                return "ray origins must be finite"
+            square += along * along
+            # A direction of 0 becomes tiny, so that 0 * inf cannot make NaN.
+            speed = 1e-300 if abs(along) < 1e-300 else along
+            one, two = (lower[axis] - start) / speed, (upper[axis] - start) / speed
+            enters, leaves = max(enters, min(one, two)), min(leaves, max(one, two))
+        if not abs(square - 1) < 1e-4:
+            return "ray directions must be of unit length; divide each by its norm"
+        near[number], far[number] = enters, leaves
+    return ""

@@ -1,0 +1,383 @@
+"""Formulas at work: rays and points in packets of `LANES`, by compiled code. All that it calls stands here (see
+robot.sim.compiled).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.sim.compiled import compiled
+
+Floats = NDArray[np.float32]
+Vectors = NDArray[np.float64]
+
+LANES = 64
+"""Points in a packet."""
+
+MOST_STEPS = 600
+OPERATIONS = (
+    *("add", "subtract", "multiply", "divide", "maximum", "minimum", "absolute", "sqrt", "rint"),
+    *("floor", "copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
+)
+"""Names of the operations; a formula calls them by their place here."""
+
+(_ADD, _SUBTRACT, _MULTIPLY, _DIVIDE, _MAXIMUM, _MINIMUM, _ABSOLUTE, _SQRT, _RINT) = range(9)
+(_FLOOR, _COPYSIGN, _GREATER, _SIN, _COS, _EXP, _LOG, _LOG1P, _WHERE) = range(9, 18)
+
+
+class Formula(NamedTuple):
+    """Operations on rows of `LANES` numbers (robot.sim.objects.formula makes them).
+
+    code      (operations, 5) int64: the operation, the row of its result and of its one to three operands
+    start     (rows,) float32: constants, in the rows that hold them; the first rows are the operands
+    results   (n,) int64: the rows that hold what the function returns when the code has run
+    """
+
+    code: NDArray[np.int64]
+    start: Floats
+    results: NDArray[np.int64]
+
+
+class Worn(NamedTuple):
+    """A solid under relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
+
+    distance: formula of (x, y, z). place: formula of (x, y, z) to map coordinates s, t and the mask. height_mm: the map
+    (rows, columns), empty for none; per_s, per_t: its pixels per mm; highest_mm: of its points; slope: how fast
+    relief can change, mm per mm.
+    """
+
+    distance: Formula
+    place: Formula
+    height_mm: Floats
+    per_s: float
+    per_t: float
+    highest_mm: float
+    slope: float
+
+
+class March(NamedTuple):
+    """How fine rays look: step_mm is the finest detail that matters, beyond_mm what lies how far behind the nearest
+    hit may be missed."""
+
+    step_mm: float
+    beyond_mm: float
+
+
+def run(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
+    """What the function of the formula returns for arrays (n,) of float32."""
+    given = np.stack(operands)
+    results = np.empty((len(formula.results), given.shape[1]), np.float32)
+    _run_all(formula.code, _rows(formula), formula.results, given, results)
+    return tuple(results)
+
+
+def _rows(formula: Formula) -> Floats:
+    return np.repeat(formula.start[:, None], LANES, axis=1)
+
+
+@compiled
+def _run_all(code, rows, places, given, results):  # type: ignore[no-untyped-def]
+    for first in range(0, given.shape[1], LANES):
+        count = min(LANES, given.shape[1] - first)
+        for row in range(given.shape[0]):
+            for i in range(count):
+                rows[row, i] = given[row, first + i]
+        _run(code, rows)
+        for number in range(len(places)):
+            for i in range(count):
+                results[number, first + i] = rows[places[number], i]
+
+
+@compiled
+def _run(code, r):  # type: ignore[no-untyped-def]
+    """Carry out the code on all lanes of the rows."""
+    for line in range(len(code)):
+        name, d, a, b, c = code[line, 0], code[line, 1], code[line, 2], code[line, 3], code[line, 4]
+        if name == _ADD:
+            for i in range(LANES):
+                r[d, i] = r[a, i] + r[b, i]
+        elif name == _SUBTRACT:
+            for i in range(LANES):
+                r[d, i] = r[a, i] - r[b, i]
+        elif name == _MULTIPLY:
+            for i in range(LANES):
+                r[d, i] = r[a, i] * r[b, i]
+        elif name == _MAXIMUM:
+            for i in range(LANES):
+                r[d, i] = r[a, i] if r[a, i] > r[b, i] else r[b, i]
+        elif name == _MINIMUM:
+            for i in range(LANES):
+                r[d, i] = r[a, i] if r[a, i] < r[b, i] else r[b, i]
+        elif name == _ABSOLUTE:
+            for i in range(LANES):
+                r[d, i] = abs(r[a, i])
+        elif name == _SQRT:
+            for i in range(LANES):
+                r[d, i] = np.sqrt(r[a, i])
+        elif name == _DIVIDE:
+            for i in range(LANES):
+                r[d, i] = r[a, i] / r[b, i]
+        elif name == _WHERE:
+            for i in range(LANES):
+                yes, no = r[b, i], r[c, i]
+                r[d, i] = yes if r[a, i] != 0 else no
+        elif name == _GREATER:
+            for i in range(LANES):
+                r[d, i] = np.float32(1) if r[a, i] > r[b, i] else np.float32(0)
+        elif name == _RINT:
+            for i in range(LANES):
+                r[d, i] = np.rint(r[a, i])
+        elif name == _FLOOR:
+            for i in range(LANES):
+                r[d, i] = np.floor(r[a, i])
+        elif name == _COPYSIGN:
+            for i in range(LANES):
+                r[d, i] = np.copysign(r[a, i], r[b, i])
+        elif name == _SIN:
+            for i in range(LANES):
+                r[d, i] = np.sin(r[a, i])
+        elif name == _COS:
+            for i in range(LANES):
+                r[d, i] = np.cos(r[a, i])
+        elif name == _EXP:
+            for i in range(LANES):
+                r[d, i] = np.exp(r[a, i])
+        elif name == _LOG:
+            for i in range(LANES):
+                r[d, i] = np.log(r[a, i])
+        else:
+            for i in range(LANES):
+                r[d, i] = np.log1p(r[a, i])
+
+
+# A solid under relief ----------------------------------------------------------------------------------------
+
+
+def heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
+    """The map (rows, columns) between its pixels at columns u and rows v, (n,) each; beyond its border as on it."""
+    out = np.empty(len(u), np.float32)
+    _heights(height_mm, u, v, out)
+    return out
+
+
+def gradients(worn: Worn, points: Vectors, step_mm: float) -> Vectors:
+    """Differences of f, (n, 3), over the corners of a tetrahedron of that size: four evaluations instead of six."""
+    out = np.zeros(points.shape)
+    _gradients(worn, _rows_of(worn), points, np.float32(step_mm / 2), out)
+    return out
+
+
+def first_hits(worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, march: March) -> Vectors:
+    """Distance (n,) along rays (n, 3) to the first place where f is 0, looked for from `near` to `far`; inf: none."""
+    found = np.full((4, len(near)), np.inf, np.float32)
+    rows = _rows_of(worn)
+    _march(worn, rows, origins, directions, near, far, march, found)
+    out = np.full(len(near), np.inf)
+    _refine(worn, rows, origins, directions, near, found, out)
+    if np.isfinite(march.beyond_mm):  # the same ones whatever the order in which rays were cast
+        out[out > out.min(initial=np.inf) + march.beyond_mm] = np.inf
+    return out
+
+
+def _rows_of(worn: Worn) -> tuple[Floats, Floats]:
+    """Rows of the two formulas, to work on."""
+    return _rows(worn.distance), _rows(worn.place)
+
+
+@compiled
+def _bilinear(height, u, v):  # type: ignore[no-untyped-def]
+    last_row, last_column = height.shape[0] - 1, height.shape[1] - 1
+    u = min(max(u, np.float32(0)), np.float32(last_column))
+    v = min(max(v, np.float32(0)), np.float32(last_row))
+    column, row = np.uint64(u), np.uint64(v)
+    right = column + np.uint64(column < last_column)
+    below = row + np.uint64(row < last_row)
+    p, q = u - np.float32(column), v - np.float32(row)
+    upper = height[row, column] + p * (height[row, right] - height[row, column])
+    lower = height[below, column] + p * (height[below, right] - height[below, column])
+    return upper + q * (lower - upper)
+
+
+@compiled
+def _heights(height, u, v, out):  # type: ignore[no-untyped-def]
+    for i in range(len(u)):
+        out[i] = _bilinear(height, u[i], v[i])
+
+
+@compiled
+def _lifts(worn, rows, count):  # type: ignore[no-untyped-def]
+    """Relief at the points in the rows, into the first row."""
+    _run(worn.place.code, rows)
+    s, t, mask = worn.place.results[0], worn.place.results[1], worn.place.results[2]
+    per_s, per_t = np.float32(worn.per_s), np.float32(worn.per_t)
+    for i in range(count):
+        rows[0, i] = _bilinear(worn.height_mm, rows[s, i] * per_s, rows[t, i] * per_t) * rows[mask, i]
+
+
+@compiled
+def _fields(worn, rows, count):  # type: ignore[no-untyped-def]
+    """f at the points in the first rows of rows[0], into its row of results."""
+    base, wear = rows
+    if worn.height_mm.size:
+        for row in range(3):
+            for i in range(count):
+                wear[row, i] = base[row, i]
+    _run(worn.distance.code, base)
+    if worn.height_mm.size:
+        _lifts(worn, wear, count)
+        for i in range(count):
+            base[worn.distance.results[0], i] -= wear[0, i]
+
+
+@compiled
+def _gradients(worn, rows, points, half, out):  # type: ignore[no-untyped-def]
+    for first in range(0, len(out), LANES):
+        count = min(LANES, len(out) - first)
+        for corner in range(4):
+            # (1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)
+            for axis in range(3):
+                side = half if corner == 0 or corner == axis + 1 else -half
+                for i in range(count):
+                    rows[0][axis, i] = np.float32(points[first + i, axis]) + side
+            _fields(worn, rows, count)
+            for axis in range(3):
+                sign = 1.0 if corner == 0 or corner == axis + 1 else -1.0
+                for i in range(count):
+                    out[first + i, axis] += sign * rows[0][worn.distance.results[0], i]
+
+
+# Rays --------------------------------------------------------------------------------------------------------
+
+_ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _LANE_ROWS = 0, 3, 6, 7, 8, 9
+
+
+@compiled
+def _march(worn, rows, origins, directions, near, far, march, found):  # type: ignore[no-untyped-def]
+    """Sphere tracing until f changes sign: `found` is t and f just inside (inf: a miss), t and f just outside.
+
+    Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the
+    slope of f), and no step is shorter than a stride: half the finest detail, and up to four times that for rays that
+    graze for long. A lane whose ray has ended takes the next ray, so that packets stay full.
+    """
+    base, wear = rows
+    result, worn_out = worn.distance.results[0], worn.height_mm.size > 0
+    highest = np.float32(worn.highest_mm)
+    bound = np.float32(1 + worn.slope) if worn_out else np.float32(1)
+    finest, beyond = np.float32(0.5 * march.step_mm), march.beyond_mm
+    lanes = np.empty((_LANE_ROWS, LANES), np.float32)
+    gaps = np.empty(LANES, np.float32)
+    ray, step, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    nearest, upcoming, count = np.inf, 0, 0
+    while True:
+        while count < LANES and upcoming < len(near):
+            if near[upcoming] <= far[upcoming]:
+                ray[count], step[count] = upcoming, 0
+                for axis in range(3):
+                    start = origins[upcoming, axis] + near[upcoming] * directions[upcoming, axis]
+                    lanes[_ORIGIN + axis, count] = np.float32(start)
+                    lanes[_DIRECTION + axis, count] = np.float32(directions[upcoming, axis])
+                lanes[_T, count] = lanes[_BEFORE, count] = lanes[_F_BEFORE, count] = np.float32(0)
+                count += 1
+            upcoming += 1
+        if count == 0:
+            break
+        for axis in range(3):
+            for i in range(LANES):
+                base[axis, i] = lanes[_ORIGIN + axis, i] + lanes[_T, i] * lanes[_DIRECTION + axis, i]
+        touched = 0
+        if worn_out:
+            for axis in range(3):
+                for i in range(LANES):
+                    wear[axis, i] = base[axis, i]
+        _run(worn.distance.code, base)
+        for i in range(LANES):
+            gaps[i] = base[result, i] - highest
+        if worn_out:
+            for i in range(count):
+                if gaps[i] <= 0:
+                    low[touched] = i
+                    for axis in range(3):
+                        wear[axis, touched] = wear[axis, i]
+                    touched += 1
+            if touched:
+                _lifts(worn, wear, touched)
+        for i in range(LANES):
+            base[0, i] = gaps[i]
+        for k in range(touched):
+            base[0, low[k]] = gaps[low[k]] + highest - wear[0, k]
+        i = 0
+        end = count
+        while i < end:
+            f, gap, t = base[0, i], gaps[i], lanes[_T, i]
+            number = ray[i]
+            over = False
+            if f <= 0:
+                found[0, number], found[1, number] = t, f
+                found[2, number], found[3, number] = lanes[_BEFORE, i], lanes[_F_BEFORE, i]
+                nearest = min(nearest, near[number] + t)
+                over = True
+            else:
+                stride = finest * np.float32(min(max(step[i] / 40, 1.0), 4.0))
+                forward = max(gap, f / bound)
+                if gap > 0:
+                    # f is not known outside the shell: 0 asks for it to be worked out.
+                    forward += stride
+                    lanes[_BEFORE, i], lanes[_F_BEFORE, i] = t + gap, np.float32(0)
+                else:
+                    lanes[_BEFORE, i], lanes[_F_BEFORE, i] = t, f
+                lanes[_T, i] = t + max(stride, forward)
+                step[i] += 1
+                last = min(far[number], nearest + beyond) - near[number]
+                over = lanes[_BEFORE, i] > last or step[i] >= MOST_STEPS
+            if over:
+                # The last lane comes here, with what was worked out for it.
+                end -= 1
+                base[0, i], gaps[i], ray[i], step[i] = base[0, end], gaps[end], ray[end], step[end]
+                for row in range(_LANE_ROWS):
+                    lanes[row, i] = lanes[row, end]
+            else:
+                i += 1
+        count = end
+
+
+@compiled
+def _refine(worn, rows, origins, directions, near, found, out):  # type: ignore[no-untyped-def]
+    """Close in on the zero between a point outside and one inside, by false position, twice and once more."""
+    base, result = rows[0], worn.distance.results[0]
+    ray = np.empty(LANES, np.int64)
+    upcoming = 0
+    while upcoming < len(near):
+        count = 0
+        while count < LANES and upcoming < len(near):
+            if np.isfinite(found[0, upcoming]):
+                ray[count] = upcoming
+                count += 1
+            upcoming += 1
+        for turn in range(3):
+            for i in range(count):
+                number = ray[i]
+                t = _between(found, number) if turn else found[2, number]
+                for axis in range(3):
+                    start = origins[number, axis] + near[number] * directions[number, axis]
+                    base[axis, i] = np.float32(start) + t * np.float32(directions[number, axis])
+            _fields(worn, rows, count)
+            for i in range(count):
+                number, f = ray[i], base[result, i]
+                if turn == 0:
+                    if found[3, number] == 0:
+                        found[3, number] = f
+                elif f > 0:
+                    found[2, number], found[3, number] = _between(found, number), f
+                else:
+                    found[0, number], found[1, number] = _between(found, number), f
+        for i in range(count):
+            out[ray[i]] = near[ray[i]] + _between(found, ray[i])
+
+
+@compiled
+def _between(found, number):  # type: ignore[no-untyped-def]
+    """Where the chord from f > 0 before to f <= 0 at the hit meets 0."""
+    high, f_high, low, f_low = found[0, number], found[1, number], found[2, number], found[3, number]
+    share = f_low / max(f_low - f_high, np.float32(1e-9))
+    return low + min(max(share, np.float32(0)), np.float32(1)) * (high - low)

@@ -1,0 +1,151 @@
+"""Formulas against the numpy functions that they were recorded from, and a body in packets against plain numpy."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot.errors import SceneError
+from robot.sim.compiled import compiled
+from robot.sim.objects.draw import draw_object
+from robot.sim.objects.formula import record
+from robot.sim.objects.packets import LANES, OPERATIONS, heights, run
+from robot.sim.objects.shapes import SHAPES
+from robot.sim.objects.shapes.base import arctan2, rounded
+
+SIZES = (1, LANES - 1, LANES, LANES + 1, 5 * LANES + 7)
+
+
+def numbers(count, size, seed=0):
+    return list(np.random.default_rng(seed).normal(0, 20, (count, size)).astype(np.float32))
+
+
+def everything(a, b):
+    """Each operation once, and constants of every kind."""
+    inside = np.where(np.abs(a) > np.float32(3), b, 2.0 * a)
+    angle = np.copysign(np.rint(inside / 7), -b) + np.floor(a)
+    angle *= 0.5
+    waves = np.sin(angle) + np.cos(angle) - np.minimum(a, b) * (a < b)
+    return (
+        np.sqrt(np.maximum(waves, 0)) + np.exp(-np.abs(a)),
+        np.log1p(np.abs(b)) + np.log(np.abs(a) + 1),
+        np.clip(a, -1, 1),
+    )
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_formula_gives_what_its_function_gives(size):
+    operands = numbers(2, size)
+    formula = record(everything, 2)
+    for ours, exact in zip(run(formula, *operands), everything(*operands), strict=True):
+        np.testing.assert_allclose(ours, exact, rtol=3e-6, atol=1e-6)
+    assert {OPERATIONS[name] for name in formula.code[:, 0]} == set(OPERATIONS)
+
+
+def test_operations_without_rounding_of_their_own_are_equal_bit_by_bit():
+    operands = numbers(2, 1000)
+    for function in (lambda a, b: rounded(a, b, 1.5), arctan2):
+        np.testing.assert_array_equal(run(record(function, 2), *operands)[0], function(*operands))
+
+
+def test_what_is_written_twice_is_worked_out_once_and_rows_are_used_again():
+    formula = record(lambda a: (a + 1) * (a + 1) + (a + 1), 1)
+    assert [OPERATIONS[name] for name in formula.code[:, 0]] == ["add", "multiply", "add"]
+
+    def long(a):
+        for _ in range(100):
+            a = a * 0.5 + 1
+        return a
+
+    assert len(record(long, 1).start) == 5  # the operand, two constants, two that take turns
+
+
+def test_no_operation_writes_over_what_it_reads():
+    """The compiled loops are vectorised on that condition."""
+    for name in SHAPES:
+        shape = draw_object(0, 1, family=name).body.shape
+        for function in (shape.distance_xyz, shape.chart.locate):
+            for _, result, *read in record(function, 3).code:
+                assert result not in read
+
+
+def test_a_result_may_be_an_operand_or_a_constant():
+    constant, same = run(record(lambda a: (np.full_like(a, 3.0), a), 1), *numbers(1, 70))
+    np.testing.assert_array_equal(constant, 3)
+    np.testing.assert_array_equal(same, *numbers(1, 70))
+
+
+@given(st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=130), st.floats(-5, 5))
+def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
+    def function(a):
+        return np.maximum(np.minimum(a, limit), -2), np.where(a > limit, a, limit), np.abs(a)
+
+    operand = np.array(values, np.float32)
+    for ours, exact in zip(run(record(function, 1), operand), function(operand), strict=True):
+        np.testing.assert_array_equal(ours, exact.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [
+        (lambda a: np.arctan(a), "arctan"),
+        (lambda a: np.add.reduce(a), "add"),
+        (lambda a: np.linalg.norm(a), "norm"),
+        (lambda a: np.clip(a, 0, 1, out=a), "clip"),
+    ],
+)
+def test_a_function_of_other_operations_is_refused_by_name(function, says):
+    with pytest.raises(SceneError, match=f"(?s)a formula must be made of.*{says}"):
+        record(function, 1)
+
+
+# Against plain numpy -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", SHAPES)
+def test_every_family_is_in_packets_what_it_is_in_numpy(family):
+    body = draw_object(3, 5, family=family, relief="knurl").body
+    rng = np.random.default_rng(1)
+    points = rng.uniform(body.lower - 3, body.upper + 3, (2000, 3)).astype(np.float32).T
+    for function in (body.shape.distance_xyz, body.located):
+        exact = function(*points)
+        for ours, numpys in zip(run(record(function, 3), *points), np.atleast_2d(exact), strict=True):
+            np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32's sines and powers of some 100 mm
+
+
+def test_normals_in_packets_are_differences_of_the_field():
+    body, h = draw_object(3, 5, relief="knurl").body, 0.1
+    points = np.random.default_rng(1).uniform(body.lower, body.upper, (300, 3))
+    sides = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
+    values = [body.field(*(points + h / 2 * side).astype(np.float32).T, step_mm=h) for side in sides]
+    plain = np.sum([value[:, None] * side for value, side in zip(values, sides, strict=True)], axis=0)
+    plain /= np.linalg.norm(plain, axis=1, keepdims=True)
+    np.testing.assert_allclose(body.normals(points, h), plain, atol=2e-3)
+
+
+def test_heights_lie_between_pixels_and_end_at_the_border():
+    grid = np.array([[0, 1, 2], [10, 11, 12]], np.float32)
+    u, v = np.array([0.25, 1.5, 9, -3, 2], np.float32), np.array([0, 0.5, 9, -3, 1], np.float32)
+    np.testing.assert_allclose(heights(grid, u, v), [0.25, 6.5, 12, 0, 12])
+    assert heights(grid, u[:0], v[:0]).shape == (0,)
+
+
+def test_what_lies_beyond_is_left_out_whatever_the_order_of_the_rays():
+    body = draw_object(0, 14).body
+    width = np.linspace(*body.lower[[0]], *body.upper[[0]], 400)
+    origins = np.stack([width, np.full(400, -300.0), np.full(400, 0.5 * body.upper[2])], axis=1)
+    directions = np.broadcast_to([0.0, 1.0, 0.0], origins.shape)
+    order = np.random.default_rng(0).permutation(400)
+    near = body.cast(origins, directions, beyond_mm=6.0)
+    np.testing.assert_array_equal(body.cast(origins[order], directions, beyond_mm=6.0), near[order])
+    every = body.cast(origins, directions)
+    np.testing.assert_array_equal(np.isfinite(near), every <= every.min() + 6.0)
+    assert np.isfinite(every).sum() > np.isfinite(near).sum() > 0
+
+
+def test_code_that_cannot_be_kept_is_compiled_for_the_process():
+    function = eval("lambda a: a + 1")  # which stands in no file, so that there is no place beside it
+    with pytest.raises(RuntimeError, match="no locator"):
+        numba.njit(cache=True)(function)
+    assert compiled(function)(2) == 3
