@@ -332,4 +332,4 @@ def test_files_are_in_the_order_of_their_numbers(tmp_path):
         (tmp_path / each).touch()
     found = [path.name for _, path in numbered(tmp_path, re.compile(r"img_(\d+).*\.png"))]
     assert found == ["img_2_a.png", "img_2_b.png", "img_9.png", "img_10.png"]
-    assert numbered(tmp_path / "gone", re.compile(".*")) == []
+    assert not list(numbered(tmp_path / "gone", re.compile(".*")))

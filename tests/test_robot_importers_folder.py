@@ -1,9 +1,6 @@
 """Pictures of one's own, by patterns and by files of pairs; what holds of every importer is in test_robot_importers."""
 
 import json
-import os
-import shutil
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -177,30 +174,3 @@ def test_a_file_that_lists_no_pairs_is_refused(source, tmp_path, kind, content):
     with pytest.raises(ImporterError, match=r"pairs\.(csv|jsonl)"):
         import_folder(source, tmp_path / "out", pairs=f"pairs.{kind}")
     assert not (tmp_path / "out").exists()
-
-
-def resident_mb():
-    """Of this process, now."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
-def test_memory_does_not_grow_with_the_pictures(source, tmp_path):
-    """100,000 rows of a picture of 4 kB: 400 MB. What grows is the names of the grasps, 0.1 kB each."""
-    picture(source / "noise.png", 1, (40, 40), noise=True)
-    assert (source / "noise.png").stat().st_size > 4000
-    with open(source / "pairs.jsonl", "w") as file:
-        for _ in range(100_000):
-            file.write(json.dumps(row(1, touch="noise.png")) + "\n")
-    at = {}
-
-    def look(done, total):
-        assert total == 100_000
-        if done % 10_000 == 0:
-            at[done] = resident_mb()
-
-    recording = import_folder(source, tmp_path / "out", look, pairs="pairs.jsonl")
-    assert len(recording.grasps) == 100_000
-    shutil.rmtree(tmp_path / "out")
-    assert at[100_000] - at[10_000] < 40, at

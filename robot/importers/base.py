@@ -10,6 +10,7 @@ passed over unread, so an import that was stopped goes on where it stopped.
 """
 
 import json
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,6 +36,7 @@ Images = Mapping[str, Source | Shared]
 SPLITS_FOLDER = "splits"
 _MOST_REASONS, _EXAMPLES = 20, 3
 _ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
+_DIGITS = re.compile(r"[0-9]{1,4000}")
 _TAIL = 65536
 """Bytes after the end of a JPEG that a camera may have put there."""
 
@@ -250,12 +252,28 @@ def name_of(*parts: str) -> str:
     return f"{plain}-{sha256('/'.join(parts).encode()).hexdigest()[:8]}"
 
 
-def numbered(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Match[str], Path]]:
+@dataclass(frozen=True)
+class Numbered:
+    """Files of a folder whose names fit a pattern, in the order of their numbers. Only their names are in memory."""
+
+    folder: Path
+    pattern: re.Pattern[str]
+    names: Sequence[str]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[tuple[re.Match[str], Path]]:
+        for name in self.names:
+            match = self.pattern.fullmatch(name)
+            assert match is not None
+            yield match, self.folder / name
+
+
+def numbered(folder: Path, pattern: re.Pattern[str]) -> Numbered:
     """The files of a folder whose names fit, sorted by their numbers as numbers; none where there is no folder."""
-    if not folder.is_dir():
-        return []
-    found = [(match, path) for path in folder.iterdir() if (match := pattern.fullmatch(path.name))]
-    return sorted(found, key=lambda each: natural(each[1].name))
+    names = os.listdir(folder) if folder.is_dir() else []
+    return Numbered(folder, pattern, sorted(filter(pattern.fullmatch, names), key=natural))
 
 
 def folders(parent: Path) -> list[Path]:
@@ -269,9 +287,10 @@ def folders(parent: Path) -> list[Path]:
         raise ImporterError(f"{parent} cannot be read: {error.strerror}") from error
 
 
-def natural(name: str) -> list[tuple[int, str]]:
-    """Digits compare as numbers, after text."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)] + [(0, name)]
+def natural(name: str) -> str:
+    """A key by which digits compare as numbers, after all text: the number of their digits goes before them."""
+    key = _DIGITS.sub(lambda digits: f"\0{len(number := str(int(digits[0]))):04}{number}", name)
+    return f"{key}\0{name}"
 
 
 def library(name: str, what: str) -> Any:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, import_items
+from robot.importers.base import DataSet, Item, Progress, Skip, folders, import_items
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -37,28 +37,34 @@ _Files = dict[str, Path]  # "photo" and "touch" of one place
 
 def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Recording:
     """Import the billets below `src`. Raises ImporterError for a source without any pair."""
-    found = _find_files(Path(src))
-    if not any(len(files) == 2 for files in found.values()):
+    src = Path(src)
+    total, pairs = 0, False
+    for item in _places(src):
+        total, pairs = total + 1, pairs or isinstance(item, Item)
+    if not pairs:
         raise DATA_SET.refusal(src, "it holds no pair")
-    return import_items(DATA_SET, _places(found), out, total=len(found), progress=progress)
+    return import_items(DATA_SET, _places(src), out, total=total, progress=progress)
 
 
-def _places(found: dict[tuple[str, str], _Files]) -> Iterator[Item | Skip]:
-    for (billet, place), files in sorted(found.items()):
-        name = f"{billet}-{place}"
-        if len(files) < 2:
-            yield Skip("its photo or touch is missing", f"{billet}/{next(iter(files.values())).name}")
-        else:
-            yield Item(name, name, {"photo": files["photo"], "touch_a": files["touch"]}, {"sequence_id": billet})
+def _places(src: Path) -> Iterator[Item | Skip]:
+    for billet in folders(src):
+        for place, files in sorted(_find_files(billet).items()):
+            name = f"{billet.name}-{place}"
+            if len(files) < 2:
+                yield Skip("its photo or touch is missing", f"{billet.name}/{next(iter(files.values())).name}")
+            else:
+                images = {"photo": files["photo"], "touch_a": files["touch"]}
+                yield Item(name, name, images, {"sequence_id": billet.name})
 
 
-def _find_files(src: Path) -> dict[tuple[str, str], _Files]:
-    found: dict[tuple[str, str], _Files] = defaultdict(dict)
+def _find_files(billet: Path) -> dict[str, _Files]:
+    """The files of one billet by place. Raises ImporterError."""
+    found: dict[str, _Files] = defaultdict(dict)
     try:
-        for path in sorted(src.glob("*/*")):
+        for path in sorted(billet.iterdir()):
             match = _FILE.fullmatch(path.name)
             if match and not path.name.startswith("."):
-                found[path.parent.name, match["place"]][match["kind"].lower()] = path
+                found[match["place"]][match["kind"].lower()] = path
     except OSError as error:
-        raise ImporterError(f"{src} cannot be read: {error.strerror}") from error
+        raise ImporterError(f"{billet} cannot be read: {error.strerror}") from error
     return found

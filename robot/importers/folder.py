@@ -18,8 +18,9 @@ too, finds the no-contact frames: `rest_{finger}.png` one a finger, `{object}/re
 import csv
 import os
 import re
+import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -123,37 +124,45 @@ class _Found:
                 raise ImporterError(
                     f"the pattern {option} must say where {{object}} stands, such as {{object}}/touch_*"
                 )
-        files = list(_pictures(src))
-        self._touches = [(path, words) for path in files if (words := self._touch.fit(path))]
-        self._photos = [(path, words) for path in files if (words := self._photo.fit(path))]
-        for option, text, fits in (("touch", touch, self._touches), ("photo", photo, self._photos)):
+        self._photos = _Agreeing(self._photo, self._touch)
+        self._frames = _Agreeing(self._background, self._touch)
+        some, touched, names = "", False, set[str]()
+        for path in _pictures(src):
+            some = some or path
+            words, seen = self._touch.fit(path), self._photo.fit(path)
+            if words and seen:
+                raise ImporterError(f"{path} fits both patterns; make touch and photo tell them apart")
+            if words:
+                touched = True
+                names.add(words.get("finger", ""))
+            self._photos.add(path)
+            self._frames.add(path)
+        for option, text, fits in (("touch", touch, touched), ("photo", photo, bool(self._photos))):
             if not fits:
-                some = f"such as {files[0]}" if files else "and no picture at all"
+                there = f"such as {some}" if some else "and no picture at all"
                 raise ImporterError(
-                    f"{src} must hold a {option} that fits {text!r}, and holds none, {some}; see --option"
+                    f"{src} must hold a {option} that fits {text!r}, and holds none, {there}; see --option"
                 )
-        both = {path for path, _ in self._touches} & {path for path, _ in self._photos}
-        if both:
-            raise ImporterError(f"{min(both)} fits both patterns; make touch and photo tell them apart")
-        self._frames = [(path, words) for path in files if self._background and (words := self._background.fit(path))]
-        names = sorted({words.get("finger", "") for _, words in self._touches}, key=natural)
         if len(names) > len(ascii_lowercase):
-            raise ImporterError(f"{{finger}} must name at most 26 fingers, got {len(names)}, such as {names[:3]}")
-        self.fingers = dict(zip(names, ascii_lowercase, strict=False))
+            first = sorted(names, key=natural)[:3]
+            raise ImporterError(f"{{finger}} must name at most 26 fingers, got {len(names)}, such as {first}")
+        self.fingers = dict(zip(sorted(names, key=natural), ascii_lowercase, strict=False))
         self.has_background = bool(self._frames)
         self._repeated: list[str] = []
         self._grasps = self._by_words()
 
-    def _by_words(self) -> dict[tuple[str, ...], dict[str, tuple[str, Words]]]:
-        """Grasps by their words but the finger's: finger -> (path, words)."""
-        grasps: dict[tuple[str, ...], dict[str, tuple[str, Words]]] = defaultdict(dict)
-        for path, words in self._touches:
-            others = tuple(value for key, value in words.items() if key not in ("object", "finger"))
-            by_finger = grasps[words["object"], *others]
-            if words.get("finger", "") in by_finger:
-                self._repeated.append(path)
-            else:
-                by_finger[words.get("finger", "")] = path, words
+    def _by_words(self) -> dict[tuple[str, ...], list[str]]:
+        """Grasps by their words but the finger's: the path of each finger's picture, empty where it has none."""
+        grasps: dict[tuple[str, ...], list[str]] = {}
+        place = {finger: number for number, finger in enumerate(self.fingers)}
+        for path in _pictures(self.src):
+            if (words := self._touch.fit(path)) and words.get("finger", "") in place:
+                others = (value for key, value in words.items() if key not in ("object", "finger"))
+                paths = grasps.setdefault((sys.intern(words["object"]), *others), [""] * len(place))
+                if paths[place[words.get("finger", "")]]:
+                    self._repeated.append(path)
+                else:
+                    paths[place[words.get("finger", "")]] = path
         return grasps
 
     @property
@@ -161,14 +170,12 @@ class _Found:
         return len(self._grasps) + len(self._repeated)
 
     def items(self) -> Iterator[Item | Skip]:
-        photos = _Agreeing(self._photos, self._touch.words)
-        frames = _Agreeing(self._frames, self._touch.words)
         dealt: Counter[tuple[str, ...]] = Counter()
         yield from (Skip("another touch has the same words in its path", path) for path in self._repeated)
-        for key, by_finger in self._grasps.items():
-            name, (_, words) = name_of(*key), next(iter(by_finger.values()))
-            choice, which = photos.of(words)
-            if len(by_finger) < len(self.fingers):
+        for key, paths in self._grasps.items():
+            name, words = name_of(*key), self._touch.fit(next(filter(None, paths))) or {}
+            choice, which = self._photos.of(words)
+            if not all(paths):
                 yield Skip("a finger has no picture", name)
             elif not choice:
                 yield Skip("no photo agrees with it", name)
@@ -176,9 +183,9 @@ class _Found:
                 photo = choice[dealt[which] % len(choice)]
                 dealt[which] += 1
                 images: Images = {"photo": _shared(self.src, photo)}
-                for finger, (path, own) in by_finger.items():
-                    column = f"touch_{self.fingers[finger]}"
-                    before = frames.of(own)[0]
+                for letter, path in zip(self.fingers.values(), paths, strict=True):
+                    column = f"touch_{letter}"
+                    before = self._frames.of(self._touch.fit(path) or {})[0]
                     images = {**images, column: self.src / path}
                     if before:
                         images[f"{column}_before"] = _shared(self.src, before[0])
@@ -188,11 +195,18 @@ class _Found:
 class _Agreeing:
     """Files by the words that their pattern shares with that of the touches."""
 
-    def __init__(self, files: Sequence[tuple[str, Words]], others: frozenset[str]) -> None:
-        self._words = sorted(others & files[0][1].keys()) if files else []
+    def __init__(self, pattern: _Pattern | None, others: _Pattern) -> None:
+        self._pattern = pattern
+        self._words = sorted(pattern.words & others.words) if pattern else []
         self._files: dict[tuple[str, ...], list[str]] = defaultdict(list)
-        for path, words in files:
+
+    def add(self, path: str) -> None:
+        """Take a file, where it fits the pattern."""
+        if self._pattern and (words := self._pattern.fit(path)):
             self._files[self._key(words)].append(path)
+
+    def __bool__(self) -> bool:
+        return bool(self._files)
 
     def of(self, words: Words) -> tuple[list[str], tuple[str, ...]]:
         """The files that agree with a touch, and the words by which."""

@@ -69,14 +69,14 @@ def import_lerobot(
     library("pyarrow", _WHAT)
     library("av", _WHAT)
     source = _Source(src, touch, photo)
-    rows = list(source.episodes(("episode_index", "object_id", "tasks")))
+    total = sum(1 for _ in source.episodes(("episode_index",)))
     return import_items(
         replace(DATA_SET, fingers=len(source.touch), **source.said()),
         source.items(),
         out,
-        total=len(rows),
+        total=total,
         progress=progress,
-        published=Published({}, source.splits([_object(row) for row in rows])),
+        published=Published({}, source.splits()),
     )
 
 
@@ -121,7 +121,7 @@ class _Source:
         texts = {key: own.get(key) for key in ("source", "licence", "citation", "rig", "sensor")}
         return {"sensor": ", ".join(self.touch)} | {key: text for key, text in texts.items() if isinstance(text, str)}
 
-    def splits(self, objects: Sequence[str]) -> dict[str, dict[str, list[str]]]:
+    def splits(self) -> dict[str, dict[str, list[str]]]:
         """The split of info.json, "0:80" for each part, where it has several parts."""
         said = self.info.get("splits")
         ranges = {
@@ -129,8 +129,14 @@ class _Source:
             for part, text in (said.items() if isinstance(said, dict) else ())
             if (found := re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)))
         }
-        parts = {part: sorted(set(objects[start:stop])) for part, (start, stop) in ranges.items()}
-        return {"published": parts} if len(parts) > 1 else {}
+        if len(ranges) < 2:
+            return {}
+        parts: dict[str, set[str]] = {part: set() for part in ranges}
+        for place, row in enumerate(self.episodes(("object_id", "tasks"))):
+            for part, (start, stop) in ranges.items():
+                if start <= place < stop:
+                    parts[part].add(_object(row))
+        return {"published": {part: sorted(objects) for part, objects in parts.items()}}
 
     # Episodes ----------------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
     else:
         objects = [(each.name, each / "tactile", each / "visual") for each in folders(src)]
     objects = [each for each in objects if each[0].isdecimal() and each[1].is_dir()]
-    touched = [touch for _, touch, _ in objects for _, touch in numbered(touch, _PICTURE)[:1]]
+    touched = [touch for _, touch, _ in objects for _, touch in islice(numbered(touch, _PICTURE), 1)]
     if not touched:
         raw = any((each / "tactile_data").is_dir() for each in folders(src))
         raise DATA_SET.refusal(src, "it holds raw videos, without photos" if raw else "it holds no touch of that kind")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Progress, Published, Skip, import_items, numbered
+from robot.importers.base import DataSet, Images, Item, Numbered, Progress, Published, Skip, import_items, numbered
 from robot.importers.row_splits import RowSplit
 from robot.importers.tvl import LICENCE, csv_rows
 from robot.recording.folder import Recording, Shared
@@ -49,17 +49,20 @@ def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, bloc
         raise ImporterError(f"block must be 1 or more pairs, got {block}")
     root = Path(src) / "ssvtp" if (Path(src) / "ssvtp").is_dir() else Path(src)
     touches = numbered(root / "images_tac", _TOUCH)
-    if not touches:
+    if not len(touches):
         raise DATA_SET.refusal(Path(src), "images_tac/ has no such file, or is not there")
     known = {int(match[1]) for match, _ in touches}
     split, captions = RowSplit("published"), dict[str, dict[str, Any]]()
+    same: dict[str | None, dict[str, Any]] = {}  # many pairs share a caption
     for side in ("train", "test"):
         for row in csv_rows(root / f"{side}.csv"):
             url = _URL.fullmatch(row.get("url") or "")
             if url and int(url[1]) in known:
                 number = int(url[1])
                 split.add(side, _object(number), _sequence(number, block))
-                captions[_object(number)] = {"caption": row.get("caption")}
+                caption = row.get("caption")
+                captions[_object(number)] = same.setdefault(caption, {"caption": caption})
+    del known
     splits, said = split.settle()
     background = root / "tac_background.png"
     facts = replace(DATA_SET, traps=(*DATA_SET.traps, *said))
@@ -81,9 +84,7 @@ def _sequence(number: int, block: int) -> str:
     return f"block-{number // block}"
 
 
-def _items(
-    root: Path, touches: list[tuple[re.Match[str], Path]], background: Path, block: int
-) -> Iterator[Item | Skip]:
+def _items(root: Path, touches: Numbered, background: Path, block: int) -> Iterator[Item | Skip]:
     for match, touch in touches:
         number = int(match[1])
         photo = next((path for suffix in ("jpg", "png") if (path := _photo(root, match[1], suffix)).exists()), None)

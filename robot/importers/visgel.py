@@ -52,16 +52,15 @@ _DEPTH = 4
 def import_visgel(src: Path, out: Path, progress: Progress | None = None) -> Recording:
     """Import a touch of each recording below `src`. Raises ImporterError where there is none."""
     src = Path(src)
-    parts = {part: list(_recordings(src / f"data_{part}")) for part in ("seen", "unseen")}
-    if not any(parts.values()):
+    objects = {part: [_name(part, each) for each in _recordings(src / f"data_{part}")] for part in ("seen", "unseen")}
+    if not any(objects.values()):
         raise DATA_SET.refusal(src, "it holds no recording of a touch")
-    objects = {part: [_name(part, each) for each in found] for part, found in parts.items()}
-    splits = {"unseen": {"train": objects["seen"], "test": objects["unseen"]}} if all(parts.values()) else {}
+    splits = {"unseen": {"train": objects["seen"], "test": objects["unseen"]}} if all(objects.values()) else {}
     return import_items(
         DATA_SET,
-        _items(parts),
+        _items(src),
         out,
-        total=sum(map(len, parts.values())),
+        total=sum(map(len, objects.values())),
         progress=progress,
         published=Published(splits=splits),
     )
@@ -83,9 +82,9 @@ def _name(part: str, recording: Path) -> str:
     return name_of(part, recording.parent.name, recording.name)
 
 
-def _items(parts: dict[str, list[Path]]) -> Iterator[Item | Skip]:
-    for part, recordings in parts.items():
-        for recording in recordings:
+def _items(src: Path) -> Iterator[Item | Skip]:
+    for part in ("seen", "unseen"):
+        for recording in _recordings(src / f"data_{part}"):
             pressed = _Pressed(recording)
             images = {
                 "photo": pressed.photo,

@@ -103,7 +103,7 @@ def _look(folder: Path) -> _Object:
     kind, instance = folder.parent.name, folder.name
     found = numbered(folder, _TOUCH)
     name = kind.partition("_")[2]
-    about = {"class": name, "instance": instance, "nickname": found[0][0]["nickname"] if found else None}
+    about = {"class": name, "instance": instance, "nickname": next((match["nickname"] for match, _ in found), None)}
     vision = folder.parents[2] / "vision" / kind / instance
     return _Object(name_of(kind, instance), folder, vision, len(found), about)
 

@@ -18,10 +18,11 @@ A line is written when its images are on the disk: a crash leaves whole grasps; 
 """
 
 import fcntl
+import io
 import json
 import os
 import re
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -111,25 +112,32 @@ def read_recording(folder: str | Path) -> Recording:
     root = Path(folder)
     info = read_info(root)
     path = root / METADATA_FILE
-    lines, torn = _whole_lines(content_of(path, RecordingError))
-    grasps: dict[str, RecordedGrasp] = {}
+    data = content_of(path, RecordingError)
     ignored: set[str] = set()
-    for number, line in enumerate(lines, start=1):
+    grasps = tuple(_grasps(path, data, ignored))
+    torn = len(_torn(data))
+    notes = [f"{path}: dropped a half-written last line ({torn} bytes) that a crash left"] if torn else []
+    if ignored:
+        notes.append(f"{path}: passed over keys that are not of the format: {', '.join(sorted(ignored))}")
+    return Recording(root, info, grasps, tuple(notes))
+
+
+def _grasps(path: Path, data: bytes, ignored: set[str]) -> Iterator[RecordedGrasp]:
+    """The grasps of a metadata.jsonl, line by line; keys that mean nothing go to `ignored`. Raises RecordingError."""
+    seen: set[str] = set()
+    for number, line in enumerate(io.BytesIO(data.removesuffix(_torn(data))), start=1):
         if not line.strip():
             continue
         try:
             row = object_of(line, RecordingError)
             grasp = RecordedGrasp.from_row(row)
-            if grasp.grasp_id in grasps:
+            if grasp.grasp_id in seen:
                 raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
-        grasps[grasp.grasp_id] = grasp
+        seen.add(grasp.grasp_id)
         ignored |= unknown_keys(row)
-    notes = [f"{path}: dropped a half-written last line ({len(torn)} bytes) that a crash left"] if torn else []
-    if ignored:
-        notes.append(f"{path}: passed over keys that are not of the format: {', '.join(sorted(ignored))}")
-    return Recording(root, info, tuple(grasps.values()), tuple(notes))
+        yield grasp
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -154,14 +162,18 @@ def _check_info(info: Mapping[str, Any]) -> None:
         check_name(key, info.get(key))
 
 
-def _whole_lines(data: bytes) -> tuple[list[bytes], bytes]:
-    """Split into (lines, what a crash left of a last one); one that only lacks its newline is whole."""
-    *lines, last = data.split(b"\n")
+def _torn(data: bytes) -> bytes:
+    """What a crash left of a last line; one that only lacks its newline is whole."""
+    last = _after_last_newline(data)
     try:
         json.loads(last)
     except (ValueError, RecursionError):
-        return lines, last
-    return [*lines, last], b""
+        return last
+    return b""
+
+
+def _after_last_newline(data: bytes) -> bytes:
+    return data[data.rfind(b"\n") + 1 :]
 
 
 # Writing ---------------------------------------------------------------------------------------------------
@@ -206,20 +218,18 @@ class RecordingWriter:
         if not (self.folder / INFO_FILE).exists():
             write_file(self.folder / INFO_FILE, _text_of(wanted))
             sync_folder(self.folder)
-        recording = read_recording(self.folder)
-        self.info = recording.info
+        self.info = read_info(self.folder)
         for key in _MUST_AGREE:
             if (old := self.info.get(key)) != (new := wanted.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
-        self._grasp_ids = {grasp.grasp_id: None for grasp in recording.grasps}
         self._shared: dict[str, str] = {}
         data = self._file.read()
-        lines, torn = _whole_lines(data)
-        self._end = len(data) - len(torn)
+        self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, data, set())}
+        self._end = len(data) - len(_torn(data))
         self._file.truncate(self._end)
-        if lines and not torn and not data.endswith(b"\n"):
-            self._end -= len(lines[-1])
-            self._write_line(lines[-1])
+        if (last := _after_last_newline(data)) and not _torn(data):
+            self._end -= len(last)
+            self._write_line(last)
 
     @property
     def grasp_ids(self) -> Set[str]:
