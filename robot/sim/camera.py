@@ -14,13 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import SceneError
+from robot.sim.light import Floats, Lamps, Surfaces, developed, radiance
 from robot.sim.objects.draw import SimObject
+from robot.sim.objects.materials import ObjectMaterial
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
-_GAMMA = 2.2
+_NOISE = 1.5
+"""Grey levels of the sensor's noise."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
+_SKY_STEPS = 4
+_TABLE_GLOSS = 0.03
 _TABLE_PX_PER_MM = 0.8
 _TABLE_PX = (400, 560)
 _SHADOW_DETAIL = 2.0
@@ -153,13 +158,21 @@ def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = 
     light = np.asarray(lighting.direction)
     normals = np.tile([0.0, 0.0, 1.0], (px * px, 1))
     normals[view.is_object] = _object_normals(view)
-    lit = np.maximum(normals @ light, 0.0)
-    if shadow:
-        lit *= _lamp_seen(view, normals, light)
-    radiance = _albedo(view, lighting) * (lit[:, None] * lighting.lamp + _sky(view, normals)[:, None] * lighting.sky)
-    radiance += _highlight(view, normals, light, lit)[:, None] * lighting.lamp
-    linear = cv2.GaussianBlur((radiance * lighting.exposure).reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
-    return _develop(linear, noise_seed)
+    seen = _lamp_seen(view, normals, light) if shadow else np.ones(px * px, np.float32)
+    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, _hidden_sky(view), _colour(view, lighting))
+    linear = radiance(surfaces, _lamps(lighting, view.obj.material))
+    linear = cv2.GaussianBlur(linear.reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
+    noise = np.random.default_rng([72, noise_seed]).normal(0.0, _NOISE, linear.shape)
+    return developed(linear, noise)
+
+
+def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
+    """The rougher the material, the wider and weaker its highlight."""
+    sharpness = 4.0 + 120.0 * (1.0 - material.roughness) ** 2
+    strength = (sharpness + 8.0) / 60.0
+    lamp, sky = (lighting.exposure * np.array(colour) for colour in (lighting.lamp, lighting.sky))
+    gloss = strength * material.gloss, strength * _TABLE_GLOSS
+    return Lamps(np.array(lighting.direction), lamp, sky, gloss, sharpness)
 
 
 def _object_normals(view: CameraView) -> Array:
@@ -168,43 +181,36 @@ def _object_normals(view: CameraView) -> Array:
     return view.obj.body.normals(points, 0.4 * view.detail_mm) @ view.placement.rotation().T
 
 
-def _lamp_seen(view: CameraView, normals: Array, light: Array) -> Array:
+def _lamp_seen(view: CameraView, normals: Array, light: Array) -> Floats:
     """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size."""
     px = view.camera.px
     starts = view.placement.to_object(view.points + _OFF_SURFACE_MM * normals)
     facing = normals @ light > 0
-    seen = np.ones(px * px)
+    seen = np.ones(px * px, np.float32)
     towards = np.broadcast_to(light @ view.placement.rotation(), starts[facing].shape)
     seen[facing] = ~np.isfinite(view.obj.body.cast(starts[facing], towards, _SHADOW_DETAIL * view.detail_mm))
     return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
 
 
-def _sky(view: CameraView, normals: Array) -> Array:
-    """0..1: the sky seen by each point: the half above, dimmer on the table close to the object."""
-    px = view.camera.px
-    beside = cv2.GaussianBlur(view.is_object.reshape(px, px).astype(np.float64), (0, 0), 0.03 * px).ravel()
-    return (0.6 + 0.4 * normals[:, 2]) * np.where(view.is_object, 1.0, 1.0 - 0.45 * beside)
+def _hidden_sky(view: CameraView) -> Floats:
+    """0..1: how much of the sky the object hides from the table beside it, on a grid finer than the blur."""
+    px, width = view.camera.px, 0.03 * view.camera.px
+    coarse = max(1, round(px * _SKY_STEPS / width))
+    shares = cv2.resize(
+        view.is_object.reshape(px, px).astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA
+    )
+    blurred = cv2.GaussianBlur(shares, (0, 0), width * coarse / px)
+    return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC)).ravel()
 
 
-def _highlight(view: CameraView, normals: Array, light: Array, lit: Array) -> Array:
-    """Blinn's highlight of the object's pixels; the rougher the material, the wider and weaker."""
-    half = light - view.camera.rays
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    material = view.obj.material
-    sharpness = 4.0 + 120.0 * (1.0 - material.roughness) ** 2
-    cosine = np.maximum(np.einsum("ij,ij->i", normals, half), 0.0)
-    strength = np.where(view.is_object, material.gloss, 0.03) * (sharpness + 8.0) / 60.0
-    return np.asarray(strength * cosine**sharpness * (lit > 0))
+def _colour(view: CameraView, lighting: Lighting) -> Floats:
+    """(px * px, 3): of the object its linear reflectance, of the table its grey levels, 0..1."""
+    colour = _table(lighting.table_seed, view.points)
+    colour[view.is_object] = view.obj.looks.albedo(view.placement.to_object(view.points[view.is_object]))
+    return colour
 
 
-def _albedo(view: CameraView, lighting: Lighting) -> Array:
-    """Linear reflectance of each pixel, 0..1."""
-    albedo = _table(lighting.table_seed, view.points) ** _GAMMA
-    albedo[view.is_object] = view.obj.looks.albedo(view.placement.to_object(view.points[view.is_object]))
-    return albedo
-
-
-def _table(seed: int, points: Array) -> Array:
+def _table(seed: int, points: Array) -> Floats:
     """Colour (px * px, 3) of the table top under points of the rig frame: weakly streaked like wood, or speckled."""
     rng = np.random.default_rng([71, seed])
     colour = np.clip(rng.uniform(0.35, 0.85) + rng.uniform(-0.08, 0.08, 3), 0, 1)
@@ -214,14 +220,8 @@ def _table(seed: int, points: Array) -> Array:
     at = (points[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
     at = at.reshape(math.isqrt(len(points)), -1, 2)  # OpenCV wants pictures, and no side of more than 32,767
     shade = cv2.remap(grain, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    return np.asarray(np.clip(colour * (1 + strength * shade.reshape(-1, 1)), 0, 1))
-
-
-def _develop(linear: Array, noise_seed: int) -> Picture:
-    """Gamma, sensor noise of about 1.5 grey levels, 8 bits."""
-    rng = np.random.default_rng([72, noise_seed])
-    values = 255.0 * np.clip(linear, 0.0, 1.0) ** (1 / _GAMMA) + rng.normal(0.0, 1.5, linear.shape)
-    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
+    tone = 1 + np.float32(strength) * shade.reshape(-1, 1)
+    return np.asarray(np.clip(colour.astype(np.float32) * tone, 0, 1))
 
 
 # Depth ------------------------------------------------------------------------------------------------------

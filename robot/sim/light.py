@@ -1,0 +1,89 @@
+"""What light does at each pixel of the camera, in one compiled pass: reflectance and lamps to radiance, radiance to
+grey levels. Powers of float32 are exponentials of logarithms: they err by less than a thousandth of a grey level."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.sim.compiled import compiled
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+GAMMA = 2.2
+
+
+class Surfaces(NamedTuple):
+    """Of each pixel, (n,) or (n, 3): its ray and outward normal, whether it is the object's, how much of the lamp it
+    sees and how much of the sky around is hidden by the object (0..1), and the colour there before any light: of the
+    object its reflectance, of the table its grey levels from 0 to 1."""
+
+    rays: Array
+    normals: Array
+    is_object: NDArray[np.bool_]
+    lamp_seen: Floats
+    hidden: Floats
+    colour: Floats
+
+
+class Lamps(NamedTuple):
+    """Unit direction to the lamp, its colour and the sky's, all with the exposure; gloss and sharpness of the object's
+    highlight and of the table's."""
+
+    direction: Array
+    lamp: Array
+    sky: Array
+    gloss: tuple[float, float]
+    sharpness: float
+
+
+def radiance(surfaces: Surfaces, lamps: Lamps) -> Floats:
+    """(n, 3): by the lamp (Lambert, and Blinn's highlight) and the sky, whose half above is seen."""
+    out = np.empty(surfaces.rays.shape, np.float32)
+    _shade(surfaces, lamps, out)
+    return out
+
+
+def developed(linear: Floats, noise: Array) -> Picture:
+    """(rows, columns, 3) grey levels of a linear picture, with the noise of the sensor in grey levels."""
+    out = np.empty(linear.shape, np.uint8)
+    _develop(linear.reshape(-1), noise.reshape(-1), out.reshape(-1))
+    return out
+
+
+@compiled
+def _shade(surfaces, lamps, out):  # type: ignore[no-untyped-def]
+    x, y, z = np.float32(lamps.direction[0]), np.float32(lamps.direction[1]), np.float32(lamps.direction[2])
+    sharpness, gamma = np.float32(lamps.sharpness), np.float32(GAMMA)
+    for i in range(len(out)):
+        n_x, n_y = np.float32(surfaces.normals[i, 0]), np.float32(surfaces.normals[i, 1])
+        n_z, is_object = np.float32(surfaces.normals[i, 2]), surfaces.is_object[i]
+        lit = max(n_x * x + n_y * y + n_z * z, np.float32(0)) * surfaces.lamp_seen[i]
+        above = np.float32(0.6) + np.float32(0.4) * n_z
+        if not is_object:
+            above *= np.float32(1) - np.float32(0.45) * surfaces.hidden[i]
+        shine = np.float32(0)
+        if lit > 0:
+            h_x = x - np.float32(surfaces.rays[i, 0])
+            h_y = y - np.float32(surfaces.rays[i, 1])
+            h_z = z - np.float32(surfaces.rays[i, 2])
+            cosine = (n_x * h_x + n_y * h_y + n_z * h_z) / np.sqrt(h_x * h_x + h_y * h_y + h_z * h_z)
+            if cosine > 0:
+                gloss = np.float32(lamps.gloss[0] if is_object else lamps.gloss[1])
+                shine = gloss * np.exp(sharpness * np.log(cosine))
+        for channel in range(3):
+            colour = surfaces.colour[i, channel]
+            if not is_object:
+                colour = np.exp(gamma * np.log(colour)) if colour > 0 else np.float32(0)
+            lamp, sky = np.float32(lamps.lamp[channel]), np.float32(lamps.sky[channel])
+            out[i, channel] = colour * (lit * lamp + above * sky) + shine * lamp
+
+
+@compiled
+def _develop(linear, noise, out):  # type: ignore[no-untyped-def]
+    power = np.float32(1 / GAMMA)
+    for i in range(len(out)):
+        light = min(linear[i], np.float32(1))
+        grey = np.float32(255) * np.exp(power * np.log(light)) if light > 0 else np.float32(0)
+        out[i] = np.uint8(min(max(grey + noise[i] + 0.5, 0.0), 255.0))
