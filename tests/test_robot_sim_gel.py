@@ -15,7 +15,7 @@ from robot.sim.gel import optics
 from robot.sim.gel import sensor as gel
 from robot.sim.gel.fitted_optics import fitted_names, load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_positions
-from robot.sim.gel.optics import LedBar, LedOptics, cast_shadows, led_rays
+from robot.sim.gel.optics import LedBar, LedOptics, cast_shadows
 from robot.sim.gel.sensor import OPTICS, GelSensor, Noise, draw_sensor
 from robot.sim.gel.surface import Field, Surface, resized
 
@@ -156,7 +156,9 @@ def test_light_of_a_bar_is_the_near_field_formula(points):
     rng = np.random.default_rng(0)
     slope_x, slope_y = rng.normal(0, 1.5, (2, 5, 6)).astype(np.float32)
     bar = LedBar(math.radians(30), points=points, order=1.7)
-    light = optics._relative_light(led_rays(bar, field), (slope_x, slope_y))
+    one = LedOptics((bar,) * 3, mix=tuple(map(tuple, np.eye(3))), ambient=0.0, shadow=0.0)
+    flat = Surface(np.zeros((5, 6)), field)
+    light = one.colours(flat, (slope_x, slope_y))[..., 1] / one.backdrop(field)[..., 1]
     np.testing.assert_allclose(light, by_two_loops(bar, field, slope_x, slope_y), rtol=1e-4, atol=1e-5)
     assert (light == 0).any() or points > 1
 

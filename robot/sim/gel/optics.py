@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from robot.errors import RobotConfigError
+from robot.sim.gel.pixels import lit_by_bars
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
 Triple = tuple[float, float, float]
@@ -125,55 +126,56 @@ class LedOptics(Optics):
             raise RobotConfigError(f"each row of mix must be shares that add up to 1, got {self.mix}")
 
     def backdrop(self, field: Field) -> Array:
-        return np.stack([glow(field) for glow in self.glows], axis=-1)
+        return _backdrop(self.glows, field)
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
-        lit = [_relative_light(rays, slopes) for rays in _bar_rays(self.bars, surface.field)]
+        field = surface.field
+        (leds, strengths), (x, y) = _leds(self.bars, field), field.positions()
+        shades = np.ones((len(self.bars), field.rows, field.cols), np.float32)
         if self.shadow > 0 and surface.displacement_mm.any():
-            shades = cast_shadows(surface, self.bars)
-            lit = [light * (1 - np.float32(self.shadow) * shade) for light, shade in zip(lit, shades, strict=True)]
-        out = self.backdrop(surface.field)
-        for channel, row in enumerate(self.mix):
-            light = sum(np.float32(share) * one for share, one in zip(row, lit, strict=True))
-            out[..., channel] *= np.float32(self.ambient) + np.float32(1 - self.ambient) * light
+            for shade, cast in zip(shades, cast_shadows(surface, self.bars), strict=True):
+                shade -= np.float32(self.shadow) * cast
+        axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
+        out = np.empty((field.rows, field.cols, 3), np.float32)
+        lit_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, self.backdrop(field), out)
         return out
 
 
-@lru_cache(maxsize=6)
-def _bar_rays(bars: tuple[LedBar, ...], field: Field) -> tuple[list[tuple[Array, Array, Array]], ...]:
-    return tuple(led_rays(bar, field) for bar in bars)
+@lru_cache(maxsize=16)
+def _backdrop(glows: tuple[Glow, ...], field: Field) -> Array:
+    whole = np.stack([glow(field) for glow in glows], axis=-1)
+    whole.flags.writeable = False
+    return whole
 
 
-def led_rays(bar: LedBar, field: Field) -> list[tuple[Array, Array, Array]]:
-    """For each LED the vector (x, y, z maps) whose product with the normal is its share of w / w_flat."""
+@lru_cache(maxsize=16)
+def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
+    """Places (bars, points, 3) of the LEDs, and what each gives to a facet (bars, points, rows, cols), for lit_by_bars;
+    of a bar with fewer points than the longest the rest give nothing."""
+    points = max(bar.points for bar in bars)
+    places = np.zeros((len(bars), points, 3), np.float32)
+    strengths = np.zeros((len(bars), points, field.rows, field.cols), np.float32)
+    for number, bar in enumerate(bars):
+        places[number, : bar.points] = bar.positions()
+        strengths[number, : bar.points] = led_strengths(bar, field)
+    return places, strengths
+
+
+def led_strengths(bar: LedBar, field: Field) -> Array:
+    """(points, rows, cols): the factor by which the product of a normal and the way to an LED is its share of
+    w / w_flat."""
     middle = np.array([0.0, 0.0, 0.0])
     x, y = (axis.astype(np.float64) for axis in field.positions())
-    rays, flat = [], np.zeros((field.rows, field.cols))
+    strengths, flat = [], np.zeros((field.rows, field.cols))
     for led in bar.positions():
         away = (led[0] - x, led[1] - y, np.full((1, 1), led[2]))
         distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
         axis = (middle - led) / np.linalg.norm(middle - led)
         facing = np.maximum(0, -sum(a * b for a, b in zip(axis, away, strict=True)) / distance)
-        strength = facing**bar.order / distance**3
-        rays.append([part * strength for part in away])
-        flat += rays[-1][2]
+        strengths.append(facing**bar.order / distance**3)
+        flat += strengths[-1] * led[2]
     flat = np.maximum(flat, np.finfo(np.float64).tiny)
-    return [tuple((part / flat).astype(np.float32) for part in ray) for ray in rays]
-
-
-def _relative_light(rays: list[tuple[Array, Array, Array]], slopes: tuple[Array, Array]) -> Array:
-    """sum of max(0, n . ray): 1 where the gel is flat. A facet turned away from a LED gets nothing from it."""
-    slope_x, slope_y = slopes
-    total, one, part = np.zeros_like(slope_x), np.empty_like(slope_x), np.empty_like(slope_x)
-    for x, y, z in rays:
-        np.multiply(slope_x, x, out=one)
-        np.multiply(slope_y, y, out=part)
-        one += part
-        np.subtract(z, one, out=one)
-        np.maximum(one, 0, out=one)
-        total += one
-    total /= np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
-    return total
+    return np.stack([strength / flat for strength in strengths]).astype(np.float32)
 
 
 # Shadows ---------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from robot.sim.contact.layer import Layer
 from robot.sim.gel.fitted_optics import load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
 from robot.sim.gel.optics import MINI_BARS, MINI_GLOWS, Glow, LedBar, LedOptics, Optics, Triple
+from robot.sim.gel.pixels import exposed
 from robot.sim.gel.surface import Array, Field, Surface
 
 Picture = NDArray[np.uint8]
@@ -117,11 +118,14 @@ class GelSensor:
         """With noise, rounded and clipped to 0..255."""
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
-        spread = np.maximum(clean, 0) * np.float32(self.noise.shot)
-        spread += np.float32(self.noise.read**2)
-        cv2.sqrt(spread, dst=spread)
-        spread *= _noise_tile(self.rows, self.cols, seed)
-        out: Picture = cv2.add(clean, spread, dtype=cv2.CV_8U)
+        out = np.empty(clean.shape, np.uint8)
+        exposed(
+            clean,
+            _noise_tile(self.rows, self.cols, seed),
+            np.float32(self.noise.read),
+            np.float32(self.noise.shot),
+            out,
+        )
         return out
 
 
@@ -133,10 +137,11 @@ def _untouched(sensor: GelSensor) -> Array:
 _TILE_MARGIN = 64
 
 
-@lru_cache(maxsize=2)
-def _tile(rows: int, cols: int) -> Array:
+@lru_cache(maxsize=4)
+def _tile(sign: int, rows: int, cols: int) -> Array:
     shape = (rows + _TILE_MARGIN, cols + _TILE_MARGIN, 3)
-    return np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
+    drawn = np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
+    return sign * drawn
 
 
 def _noise_tile(rows: int, cols: int, seed: int) -> Array:
@@ -148,8 +153,8 @@ def _noise_tile(rows: int, cols: int, seed: int) -> Array:
     rng = np.random.default_rng([seed, 0x7015E])
     down, right = (int(value) for value in rng.integers(0, _TILE_MARGIN, 2))
     flip_rows, flip_cols, sign = (1 if value else -1 for value in rng.integers(0, 2, 3))
-    window = _tile(rows, cols)[down : down + rows, right : right + cols][::flip_rows, ::flip_cols]
-    return window * np.float32(sign)
+    window = _tile(sign, rows, cols)[down : down + rows, right : right + cols]
+    return window[::flip_rows, ::flip_cols]
 
 
 # Drawing sensors -------------------------------------------------------------------------------------------
