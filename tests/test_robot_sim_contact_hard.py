@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.lab.hard_cases.contact import hard_cases, hard_gaps, hard_layers, is_finite, naive_solve
-from robot.sim.contact.constrained_cg import ContactProblem, nearest_of_sum
+from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, nearest_of_sum
 from robot.sim.contact.kernels import Operator, influence, periodic_influence
-from robot.sim.contact.layer import Layer, press
+from robot.sim.contact.layer import SINGLE_FROM, Layer, press
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,18 @@ def conditions(gap, layer, contact, padded):
     inside = math.sqrt(float(np.mean(distance[touching] ** 2))) if touching.any() else 0.0
     beside = -float(distance[~touching].min(initial=0.0))
     return inside / scale, beside / scale, -float(contact.pressure_mpa.min())
+
+
+@pytest.mark.parametrize("name", hard_gaps())
+def test_hard_shapes_meet_them_with_products_in_float32_as_far_as_the_tolerance_asks(name):
+    gap, rough = hard_gaps()[name], 2 * SINGLE_FROM
+    for layer, force in itertools.product(hard_layers(), (1e-6, 0.1, 1e4)):
+        contact = press(gap, 1.0, layer, force_n=force, tolerance=rough)
+        assert is_finite(contact)
+        assert contact.converged
+        assert contact.force_n == pytest.approx(force, rel=1e-9)
+        rounding = 1e-13 * abs(contact.approach_mm) / max(contact.displacement_mm.max(), 1e-300)
+        assert max(conditions(gap, layer, contact, True)) <= rough / GAP_WEIGHT + 1e-6 + rounding
 
 
 @pytest.mark.parametrize("padded", [True, False])

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from robot.sim.compiled import compiled_sums
 from robot.sim.contact.kernels import Floats, Operator
 
 # The contact conditions are held tighter than the pressure: a displacement is seen, a pressure is not.
@@ -70,104 +70,79 @@ class ContactProblem:
         return float(punch[np.count_nonzero(np.sort(above) < punch) - 1])
 
 
-def _dot(a: Floats, b: Floats) -> float:
-    """Not BLAS's: that shares the sum among threads, which costs more than it saves and lets their number show."""
-    return float(np.einsum("ij,ij->", a, b))
-
-
 class _Run:
     """One descent: the pressure, what follows from it, and the direction last gone along."""
 
     def __init__(self, problem: ContactProblem, start: Floats) -> None:
         self.problem = problem
-        self.there = np.isfinite(problem.gap)
-        self.gap = np.where(self.there, problem.gap, 0.0)
         self.change = np.inf  # relative, of the pressure in the last step
-        self.direction, self.squares, self.conjugate = np.zeros_like(start), 1.0, False
-        self._accept(*self._measure(start, problem.operator(start)))
+        self.direction, self.went, self.conjugate = np.zeros_like(start), 1.0, False
+        self._accept(*self._measure(np.ascontiguousarray(start), problem.operator(start)))
 
     def _measure(self, pressure: Floats, displacement: Floats) -> tuple[Floats, Floats, float]:
         """With its energy, which is infinite if nothing is left to carry a load."""
-        energy = 0.5 * _dot(pressure, displacement) + _dot(pressure, self.gap)
-        total = float(pressure.sum())
+        energy, total = _energy(pressure, displacement, self.problem.gap)
         if self.problem.load is None:
             return pressure, displacement, energy - self.problem.depth * total
         return pressure, displacement, energy if total > 0.0 else math.inf
 
     def _accept(self, pressure: Floats, displacement: Floats, energy: float) -> None:
         self.pressure, self.displacement, self.energy = pressure, displacement, energy
-        self.contact: npt.NDArray[np.bool_] = pressure > 0.0
-        self.count = max(int(np.count_nonzero(self.contact)), 1)
-        distance = displacement + self.gap
-        self.approach = self.problem.depth if self.problem.load is None else self._mean(distance)
-        distance -= self.approach
-        distance[~self.there] = np.inf
-        self.distance, self.inside = distance, np.where(self.contact, distance, 0.0)
-        self.residual = max(self.change, GAP_WEIGHT * self._gap_error())
-
-    def _mean(self, values: Floats) -> float:
-        return float(values[self.contact].sum()) / self.count
-
-    def _gap_error(self) -> float:
-        """Of the contact conditions, over the largest displacement (or what of it would be rounding)."""
-        rounding = _ROUNDING * self.problem.operator.bound * float(self.pressure.max())
-        scale = max(float(np.abs(self.displacement).max()), rounding) or 1.0
-        inside = math.sqrt(_dot(self.inside, self.inside) / self.count)
-        beside = -float(np.min(self.distance, where=~self.contact, initial=0.0))
-        return max(inside, beside) / scale
+        self.distance, self.inside = np.empty_like(pressure), np.empty_like(pressure)
+        by_load, depth = self.problem.load is not None, self.problem.depth
+        self.approach, self.count, self.squares, beside, largest = _look(
+            pressure, displacement, self.problem.gap, by_load, depth, self.distance, self.inside
+        )
+        # What of the largest displacement would be rounding counts for nothing.
+        rounding = _ROUNDING * self.problem.operator.bound * float(pressure.max())
+        error = max(math.sqrt(self.squares / self.count), beside) / (max(largest, rounding) or 1.0)
+        self.residual = max(self.change, GAP_WEIGHT * error)
 
     def step(self) -> None:
         """Along the conjugate direction; if that raises the energy, by the safe step."""
         before = self.pressure
         pressure, displacement = self._conjugate_step()
         reached = self._measure(pressure, displacement)
-        if not reached[2] <= self.energy + _ROUNDING * abs(self.energy):
+        if not reached[2] <= self.energy + self.problem.operator.rounding * abs(self.energy):
             self.conjugate = False
             pressure = self._safe_step()
             reached = self._measure(pressure, self.problem.operator(pressure))
-        self.change = float(np.abs(reached[0] - before).sum() / (reached[0].sum() or 1.0))
+        self.change = _change(before, reached[0])
         self._accept(*reached)
 
     def _conjugate_step(self) -> tuple[Floats, Floats]:
-        squares = _dot(self.inside, self.inside)
-        beta = squares / self.squares if self.conjugate and self.squares > 0.0 else 0.0
-        self.direction = self.inside + beta * np.where(self.contact, self.direction, 0.0)
-        self.squares = squares
-        moved = self.problem.operator(self.direction)
-        length = self._length(moved)
-        pressure = self.pressure - length * self.direction
-        leaving = pressure.min() < 0.0
-        if leaving:
-            np.maximum(pressure, 0.0, out=pressure)
-        entering = (self.distance < 0.0) & (pressure <= 0.0)
-        self.conjugate = not entering.any()
-        pressure[entering] -= length * self.distance[entering]
-        factor = self._factor(pressure)
+        """Along the direction to the least energy, then to pressures that are allowed and to the load."""
+        beta = self.squares / self.went if self.conjugate and self.went > 0.0 else 0.0
+        direction = np.empty_like(self.direction)
+        slope, total = _turn(self.inside, self.pressure, self.direction, beta, direction)
+        self.direction, self.went = direction, self.squares
+        moved = self.problem.operator(direction)
+        bend, raised = _bend(moved, direction, self.pressure)
+        if self.problem.load is not None:
+            bend -= raised / self.count * total
+        # 1/bound where the energy does not bend.
+        length = slope / bend if bend > 0.0 and slope > 0.0 else 1.0 / self.problem.operator.bound
+        pressure = np.empty_like(self.pressure)
+        leaving, entering, total = _go(self.pressure, direction, self.distance, length, pressure)
+        self.conjugate = not entering
+        factor = self._factor(total)
         pressure *= factor
-        if leaving or not self.conjugate:
+        if leaving or entering:
             return pressure, self.problem.operator(pressure)
         return pressure, (self.displacement - length * moved) * factor
 
-    def _length(self, moved: Floats) -> float:
-        """Of the step that minimises the energy along the direction; 1/bound where the energy does not bend."""
-        bend = _dot(moved, self.direction)
-        if self.problem.load is not None:
-            bend -= self._mean(moved) * float(self.direction.sum())
-        slope = _dot(self.inside, self.direction)
-        return slope / bend if bend > 0.0 and slope > 0.0 else 1.0 / self.problem.operator.bound
-
-    def _factor(self, pressure: Floats) -> float:
+    def _factor(self, total: float) -> float:
         """What brings the pressure back to the load; nothing does if none is left, and the safe step follows."""
-        total = float(pressure.sum())
         return 1.0 if self.problem.load is None or total <= 0.0 else self.problem.load / total
 
     def _safe_step(self) -> Floats:
         """Down the gradient by 1/bound, to the nearest pressure that is allowed."""
-        wanted = self.pressure - np.where(self.there, self.distance, 0.0) / self.problem.operator.bound
+        there = np.isfinite(self.problem.gap)
+        wanted = self.pressure - np.where(there, self.distance, 0.0) / self.problem.operator.bound
         if self.problem.load is None:
             return np.maximum(wanted, 0.0)
         pressure = np.zeros_like(wanted)
-        pressure[self.there] = nearest_of_sum(wanted[self.there], self.problem.load)
+        pressure[there] = nearest_of_sum(wanted[there], self.problem.load)
         return pressure
 
     def solution(self, iterations: int, converged: bool) -> Solution:
@@ -180,3 +155,102 @@ def nearest_of_sum(values: Floats, total: float) -> Floats:
     excess = (np.cumsum(falling) - total) / np.arange(1, values.size + 1)
     last = int(np.nonzero(falling > excess)[0][-1])
     return np.asarray(np.maximum(values - excess[last], 0.0))
+
+
+# One pass over the pixels each ------------------------------------------------------------------------------
+
+
+@compiled_sums
+def _energy(pressure, displacement, gap):  # type: ignore[no-untyped-def]
+    """The energy but for the depth's share, and the sum of pressures; where the gap is infinite there is none."""
+    energy, total = 0.0, 0.0
+    for row in range(pressure.shape[0]):
+        for i in range(pressure.shape[1]):
+            p = pressure[row, i]
+            energy += p * (0.5 * displacement[row, i] + gap[row, i]) if p > 0.0 else 0.0
+            total += p
+    return energy, total
+
+
+@compiled_sums
+def _look(pressure, displacement, gap, by_load, depth, distance, inside):  # type: ignore[no-untyped-def]
+    """Fill `distance` (inf where nothing is) and what of it lies `inside` the contact.
+
+    Returns the approach (by load, what makes the mean distance inside 0), the number of pixels inside (at least 1), the
+    sum of the squares of their distances, the deepest penetration beside them, and the largest displacement.
+    """
+    count, total, largest = 0, 0.0, 0.0
+    for row in range(pressure.shape[0]):
+        for i in range(pressure.shape[1]):
+            if pressure[row, i] > 0.0:
+                count += 1
+                total += displacement[row, i] + gap[row, i]
+            size = abs(displacement[row, i])
+            largest = size if size > largest else largest
+    count = max(count, 1)
+    approach = total / count if by_load else depth
+    squares, lowest = 0.0, 0.0
+    for row in range(pressure.shape[0]):
+        for i in range(pressure.shape[1]):
+            apart = displacement[row, i] + gap[row, i] - approach
+            touching = pressure[row, i] > 0.0
+            within = apart if touching else 0.0
+            distance[row, i], inside[row, i] = apart, within
+            squares += within * within
+            below = 0.0 if touching else apart
+            lowest = below if below < lowest else lowest
+    return approach, count, squares, -lowest, largest
+
+
+@compiled_sums
+def _turn(inside, pressure, before, beta, direction):  # type: ignore[no-untyped-def]
+    """Fill `direction` with `inside` + beta times the one before, within the contact; the energy's slope along it, and
+    its sum."""
+    slope, total = 0.0, 0.0
+    for row in range(pressure.shape[0]):
+        for i in range(pressure.shape[1]):
+            along = inside[row, i] + beta * (before[row, i] if pressure[row, i] > 0.0 else 0.0)
+            direction[row, i] = along
+            slope += inside[row, i] * along
+            total += along
+    return slope, total
+
+
+@compiled_sums
+def _bend(moved, direction, pressure):  # type: ignore[no-untyped-def]
+    """How the energy bends along the direction, and the sum of the displacement by it within the contact."""
+    bend, raised = 0.0, 0.0
+    for row in range(pressure.shape[0]):
+        for i in range(pressure.shape[1]):
+            bend += moved[row, i] * direction[row, i]
+            raised += moved[row, i] if pressure[row, i] > 0.0 else 0.0
+    return bend, raised
+
+
+@compiled_sums
+def _go(before, direction, distance, length, pressure):  # type: ignore[no-untyped-def]
+    """Fill `pressure` with what lies a step ahead and is allowed; whether pixels leave and enter the contact, and its
+    sum."""
+    leaving, entering, total = 0, 0, 0.0
+    for row in range(before.shape[0]):
+        for i in range(before.shape[1]):
+            p = before[row, i] - length * direction[row, i]
+            leaving += p < 0.0
+            p = p if p > 0.0 else 0.0
+            enters = distance[row, i] < 0.0 and p <= 0.0
+            entering += enters
+            p = -length * distance[row, i] if enters else p
+            pressure[row, i] = p
+            total += p
+    return leaving > 0, entering > 0, total
+
+
+@compiled_sums
+def _change(before, pressure):  # type: ignore[no-untyped-def]
+    """Of the pressure, relative."""
+    change, total = 0.0, 0.0
+    for row in range(before.shape[0]):
+        for i in range(before.shape[1]):
+            change += abs(pressure[row, i] - before[row, i])
+            total += pressure[row, i]
+    return change / (total if total != 0.0 else 1.0)

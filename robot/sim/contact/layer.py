@@ -19,6 +19,7 @@ from robot.sim.contact.kernels import Floats
 from robot.sim.contact.scaled_problem import ElasticSurface, Task
 
 STRAIN_LIMIT = 0.5  # of displacement over thickness, and of slope, that linear elasticity may claim
+SINGLE_FROM = 5e-3  # a tolerance: products in float32 err by thousands of times less
 _SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
 
 
@@ -100,7 +101,9 @@ def press(
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
         return _untouched(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded)
+    # Of a plane on a periodic surface nothing is left but what float32 rounds away.
+    single = padded and tolerance >= SINGLE_FROM
+    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single)
     if depth_mm is not None and not surface.loses_volume() and depth_mm > gap.mean():
         return _untouched(gap, math.inf, depth_mm, ("rigid_volume",))
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)

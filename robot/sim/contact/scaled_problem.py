@@ -27,23 +27,26 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class ElasticSurface:
-    """A layer `thickness` pixels thick; `softness` is its E* over the object's, 0 for a rigid object."""
+    """A layer `thickness` pixels thick; `softness` is its E* over the object's, 0 for a rigid object; `single`: by
+    products in float32."""
 
     thickness: float
     poisson: float
     softness: float
     periodic: bool
+    single: bool = False
 
     def gel(self, grid: Quadrant, window: Quadrant) -> Operator:
         """Displacement of the gel by a pressure on a window of the grid."""
-        return _operator(grid, window, self.thickness, self.poisson, self.periodic)
+        return _operator(grid, window, self.thickness, self.poisson, self.periodic, self.single)
 
     def both(self, grid: Quadrant, window: Quadrant) -> Operator:
         """Displacement of the gel and of the object, a half-space, together."""
         gel = self.gel(grid, window)
         if self.softness == 0.0:
             return gel
-        return gel.plus(_operator(grid, window, math.inf, self.poisson, self.periodic), self.softness)
+        half_space = _operator(grid, window, math.inf, self.poisson, self.periodic, self.single)
+        return gel.plus(half_space, self.softness)
 
     def loses_volume(self) -> bool:
         """Whether the mean displacement can differ from 0."""
@@ -51,9 +54,11 @@ class ElasticSurface:
 
 
 @functools.lru_cache(maxsize=128)
-def _operator(grid: Quadrant, window: Quadrant, thickness: float, poisson: float, periodic: bool) -> Operator:
+def _operator(
+    grid: Quadrant, window: Quadrant, thickness: float, poisson: float, periodic: bool, single: bool
+) -> Operator:
     table = periodic_influence(grid, thickness, poisson) if periodic else influence(grid, thickness, poisson)
-    return Operator(table, window, periodic=periodic)
+    return Operator(table, window, periodic=periodic, single=single)
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ class Task:
         return self._refine(start)
 
     def _problem(self, window: Window) -> ContactProblem:
-        gap = self.gap[window]
+        gap = np.ascontiguousarray(self.gap[window])
         return ContactProblem(self.surface.both(self.gap.shape, gap.shape), gap, self.load, self.depth)
 
     def _coarse_start(self) -> Floats | None:
