@@ -179,7 +179,10 @@ def test_a_shard_that_hangs_is_told_and_never_passed_over_in_silence(ray, cluste
     assert answer.none_probability + shown + answer.posterior["unjudged_probability"] == pytest.approx(1, abs=1e-9)
 
 
-@pytest.mark.parametrize("field", [{"replicas": 0}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}])
+@pytest.mark.parametrize(
+    "field",
+    [{"replicas": 0}, {"replicas": 3, "most_replicas": 2}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}],
+)
 def test_settings_that_are_none_are_refused(field):
     from retrieval.cluster.serving import Held
 
@@ -215,6 +218,37 @@ def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluste
         thread.join(300)
     assert set(told) == {("cluster-000001", 24, 1.0), ("cluster-000002", 25, 1.0)}
     assert told == sorted(told)
+
+
+def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
+    grown = deployments(ray, wait_s=120.0, most_replicas=2, ongoing=2)
+    expected, stop, found = names(held.query(grasps[0])), threading.Event(), set()
+    with Searcher.open(cluster, shards=grown.open) as searcher:
+        own = [name for name in ray.serve.status().applications if name.endswith(grown._own)]
+
+        def ask():
+            while not stop.is_set():
+                found.add(tuple(names(searcher.query(grasps[0]))))
+
+        def replicas():
+            applications = ray.serve.status().applications
+            return sum(sum(applications[name].deployments["shard"].replica_states.values()) for name in own)
+
+        threads = [threading.Thread(target=ask) for _ in range(12)]
+        try:
+            assert replicas() == 4
+            for thread in threads:
+                thread.start()
+            until = time.monotonic() + 240
+            while replicas() <= 4 and time.monotonic() < until:
+                time.sleep(0.2)
+            assert 4 < replicas() <= 8
+        finally:
+            stop.set()
+            for thread in threads:
+                thread.join(300)
+    grown.close()
+    assert found == {tuple(expected)}
 
 
 # Building -------------------------------------------------------------------------------------------------------------

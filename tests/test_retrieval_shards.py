@@ -4,6 +4,8 @@ import dataclasses
 import json
 import math
 import shutil
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +14,11 @@ from indexes.errors import CorruptIndex, MismatchedIndex, UnsupportedFormat
 from indexes.store.cluster import read_cluster, shard_of, write_cluster
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import own_digest
-from retrieval.errors import BadInput, TooManyBad
+from retrieval.errors import BadInput, RetrievalError, TooManyBad
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Mass, Posterior
 from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster
+from retrieval.search.build_cluster import build_cluster, build_shard
 from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import Judged, Ranked, merged
@@ -309,6 +311,49 @@ def test_a_number_of_shards_that_is_none_is_refused(shards, catalogue, model, tm
 def test_an_index_folder_is_not_made_a_cluster(catalogue, model, index):
     with pytest.raises(BadInput, match="is an index folder; give another one"):
         build_cluster(catalogue, load_checkpoint(model), index, 2, quiet=True)
+
+
+# Built side by side ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Ray that fails as a whole, so many times and after so many shards each: what it was asked for."""
+    building, asked, plain = pytest.importorskip("retrieval.cluster.building"), [], build_shard
+
+    def fail(times, after):
+        def answers(ray, jobs, checkpoint, processes):
+            asked.append([job.folder for job in jobs])
+            for number, job in enumerate(jobs):
+                if number == after and len(asked) <= times:
+                    raise KeyError("ObjectRef(00ff)")
+                yield plain(job, checkpoint)
+
+        monkeypatch.setattr(building, "_answers", answers)
+        return asked
+
+    parts = SimpleNamespace(data=SimpleNamespace(DataContext=SimpleNamespace(get_current=SimpleNamespace)))
+    monkeypatch.setattr(building, "connected", lambda cpus: nullcontext(parts))
+    return fail
+
+
+def test_where_ray_fails_as_a_whole_only_what_is_missing_is_built_again(failing, catalogue, model, tmp_path, embedded):
+    from retrieval.cluster.building import by_ray
+
+    asked = failing(times=2, after=1)
+    report = build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray(1, 1))
+    assert (report.photos, sum(embedded), len(report.shards)) == (24, 24, 4)
+    assert [len(jobs) for jobs in asked] == [4, 3, 2]
+    assert asked[2] == asked[0][2:]
+
+
+def test_ray_that_goes_on_failing_ends_the_build_in_a_sentence(failing, catalogue, model, tmp_path):
+    from retrieval.cluster.building import FAILURES, by_ray
+
+    asked = failing(times=99, after=0)
+    with pytest.raises(RetrievalError, match=r"Ray failed 4 times without a shard \(KeyError: .*goes on where it"):
+        build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray(1, 1))
+    assert len(asked) == FAILURES + 1
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
+    from retrieval.cluster.serving import Held
     from retrieval.search.opening import OpenShards
     from retrieval.serve.service import LiveRig
     from robot.recording.folder import RecordingWriter
@@ -52,6 +53,9 @@ def serve(
         bool, typer.Option("--cluster", help="Ray holds the shards of a cluster: that of RAY_ADDRESS, else one here")
     ] = False,
     replicas: Annotated[int, typer.Option(help="of --cluster: processes that hold the same shard")] = 1,
+    most_replicas: Annotated[
+        int | None, typer.Option(help="of --cluster: to how many they grow while requests wait (default: they do not)")
+    ] = None,
     shard_wait: Annotated[
         float, typer.Option(metavar="SECONDS", help="of --cluster: how long a shard is waited for")
     ] = 5.0,
@@ -90,7 +94,12 @@ def serve(
     )
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
-        held = _held(path, closed, replicas, shard_wait, least_share, not no_verify) if cluster else None
+        held = None
+        if cluster:
+            from retrieval.cluster.serving import Held
+
+            how = Held(replicas, most_replicas, wait_s=shard_wait, least_share=least_share)
+            held = _held(path, closed, how, not no_verify)
         app = create_app(settings, _live_rig(rig, path), recorder, trials, held)
 
         def started(bound: int) -> None:
@@ -102,19 +111,16 @@ def serve(
         run(app, started)
 
 
-def _held(
-    index: str | Path, closed: ExitStack, replicas: int, wait_s: float, least_share: float, verify: bool
-) -> "OpenShards":
+def _held(index: str | Path, closed: ExitStack, how: "Held", verify: bool) -> "OpenShards":
     """Opens shards on Ray, which is joined or started. Raises BadInput where there is no cluster to hold."""
-    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.serving import Deployments
     from retrieval.cluster.session import connected
     from retrieval.search.object_store import is_cluster
 
     if not is_cluster(index):
         raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
-    held = Held(replicas=replicas, wait_s=wait_s, least_share=least_share)
     ray = closed.enter_context(connected())
-    deployments = Deployments(ray, held, verify)
+    deployments = Deployments(ray, how, verify)
     closed.callback(deployments.close)
     return deployments.open
 

@@ -46,9 +46,15 @@ def train(
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="Ray Train starts the ranks: that of RAY_ADDRESS, else one here")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(help="of --cluster: ranks (default: 2)")] = None,
 ) -> None:
     """Train a matcher, a tower that sees relief, or a gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
+    if (cluster and task != "match") or (workers is not None and not cluster):
+        raise BadInput("--cluster trains matchers (--task match), and --workers says on how many ranks")
     if task == "grasp-success":
         for name, value in {"config": config, "split": split, "resume": resume, **inits}.items():
             if value:
@@ -69,7 +75,13 @@ def train(
 
     try:
         settings = training_config(config, iterations, seed=seed, **inits)
-        checkpoint = train_matcher(recording, out, settings, split=read_split(split), resume=resume)
+        asked: dict[str, Any] = {"split": read_split(split), "resume": resume}
+        if cluster:
+            from retrieval.cluster.training import train_by_ray
+
+            checkpoint = train_by_ray(recording, out, settings, workers=2 if workers is None else workers, **asked)
+        else:
+            checkpoint = train_matcher(recording, out, settings, **asked)
         if distributed.rank():
             return
     finally:

@@ -61,6 +61,14 @@ def state_path(out: Path) -> Path:
     return beside(out, ".state.safetensors")
 
 
+def require_fresh(out: Path) -> None:
+    """Raises CheckpointError where an unfinished training of `out` would be lost."""
+    if state_path(out).exists():
+        raise CheckpointError(
+            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
+        )
+
+
 def train(
     recording: Path,
     out: Path,
@@ -88,11 +96,9 @@ def train(
         require_fit(split, grasps)
     require_writable(out)
     trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
-    if not resume and state_path(out).exists():
-        raise CheckpointError(
-            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
-        )
-    if resume:
+    if not resume:
+        require_fresh(out)
+    else:
         trainer.resume()
     trainer.run(quiet)
     return load_checkpoint(out)
