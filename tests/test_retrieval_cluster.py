@@ -270,6 +270,7 @@ def test_shards_built_by_ray_are_those_built_here(ray, catalogue, cluster, model
 
     report = build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray())
     assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
+    assert ray.is_initialized()  # it was before, and others may use it
     ours, theirs = halves_of(tmp_path / "c"), halves_of(cluster)
     assert ours.keys() == theirs.keys()
     for name, half in ours.items():

@@ -1,5 +1,6 @@
 """Ray, joined where there is one, else started here for as long as it is wanted."""
 
+import gc
 import logging
 import os
 import warnings
@@ -34,7 +35,8 @@ def _quiet() -> Iterator[None]:
 @contextmanager
 def connected(cpus: int | None = None) -> Iterator[Any]:
     """Ray with its parts `data` and `serve`, connected to the cluster that the variable RAY_ADDRESS names ("auto": one
-    of this machine), else to one that is started here, on 127.0.0.1 alone, and ends with the block.
+    of this machine), else to one that is started here, on 127.0.0.1 alone, and ends with the block. Where this process
+    is connected already, it stays so.
 
     cpus: of a Ray that is started here, None: all. Raises BadInput without Ray, RetrievalError where it cannot be had.
     """
@@ -57,6 +59,7 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
             "include_dashboard": False,
             "runtime_env": {"worker_process_setup_hook": "retrieval.cluster.session.on_loopback"},
         }
+    ours = not ray.is_initialized()
     try:
         with _quiet():
             ray.init(address=joined, **said)
@@ -74,7 +77,11 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
         with _quiet():
             yield ray
     finally:
-        ray.shutdown()
+        if ours:
+            ray.shutdown()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ResourceWarning)
+                gc.collect()  # Ray waits for none of the processes that it started
 
 
 def on_loopback() -> None:
