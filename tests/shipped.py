@@ -6,7 +6,7 @@
                                                          FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one
                                                          for touches of one gel image, of the same grasps
     python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
-                                                         recording and the features that `make` left in FOLDER
+                                                         recording, pictures and features that `make` left in FOLDER
     python -m tests.shipped verdicts FOLDER              fit the posterior and the gel check of the shipped checkpoint
                                                          again, on its validation objects and as many training ones,
                                                          collected into FOLDER/verdicts
@@ -35,6 +35,7 @@ from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import load_config
 from retrieval.model.encode import default_device, one_thread
+from retrieval.model.stored import HALVES_OF
 from retrieval.search import defaults
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures
@@ -195,15 +196,22 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
     assert shipped.split is not None
     train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
-    store(taught(shipped, train, validation, arguments.steps), arguments.folder / defaults.SHIPPED[2])
+    paths = {"photos": str(arguments.folder / "photos"), "touches": str(arguments.folder / "touches")}
+    training = dataclasses.replace(shipped.config.training, **paths)
+    pairs = labelled_pairs(dataclasses.replace(shipped.config, training=training))
+    train = train.joined(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
+    made = taught(shipped, train, validation, arguments.steps)
+    # An index of the one before is given new embeddings from its halves.
+    halves_of = [*shipped.provenance.get(HALVES_OF, []), shipped.digest]
+    made = dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
+    store(made, arguments.folder / defaults.SHIPPED[2])
     return 0
 
 
 def taught(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
-    """A checkpoint with a pruner of the preset's width."""
-    matcher = dataclasses.replace(made.config.matcher, pruner_width=load_config(PRESET).matcher.pruner_width)
+    """A checkpoint with the preset's pruner."""
     training = dataclasses.replace(made.config.training, distil_steps=steps)
-    config = dataclasses.replace(made.config, matcher=matcher, training=training)
+    config = dataclasses.replace(made.config.with_pruner_of(load_config(PRESET)), training=training)
     with one_thread():  # as training on features that stand still
         halves = (distil.feature_halves(made.matcher, part) for part in (train, validation))
         return distil.with_pruner(made, config, *halves)

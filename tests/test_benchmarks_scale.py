@@ -22,14 +22,14 @@ def crowd():
     checkpoint = Checkpoint.__new__(Checkpoint)
     object.__setattr__(checkpoint, "matcher", matcher)
     rng = np.random.default_rng(0)
-    photos, touches = (rng.normal(size=(n, config.matcher.half)).astype(np.float32) for n in (50, 12))
-    return scale.Crowd(checkpoint, judge_of(matcher.head), photos, touches)
+    photos, touches = (rng.normal(size=(n, config.matcher.half)).astype(np.float32) for n in (50, 19))
+    return scale.Crowd(checkpoint, judge_of(matcher.head), photos, touches[:12], touches[12:])
 
 
 def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
     monkeypatch.setattr(scale, "ADDED", 20)
     size = scale.measure(crowd, 700, ("flat", "ivf_sq8"), tmp_path / "index", queries=5)
-    assert (size.photos, size.queries) == (700, 5)
+    assert (size.photos, size.queries, size.held_out) == (700, 5, 7)
     for kind in ("flat", "ivf_sq8"):
         figures = size.kinds[kind]
         assert 0 <= figures["low"] <= figures["recall"] <= figures["high"] <= 1
@@ -51,6 +51,26 @@ def test_contrastive_embeddings_are_the_last_part_of_the_halves_at_unit_length(c
     assert found.tolist() == pytest.approx(np.array([[0.6, 0.8], [0, -1]]))
 
 
+def test_held_out_touches_judge_candidates_that_others_chose(crowd, tmp_path, monkeypatch):
+    """Where a search never names the winner of a held-out touch, and always that of the others."""
+    asked = {touch.tobytes(): number for number, touch in enumerate(crowd.embeddings(crowd.touches, "touch"))}
+
+    def point(winner_of):
+        found = SimpleNamespace(
+            count=9,
+            manifest=None,
+            arrays={"halves": np.zeros((9, crowd.photos.shape[1]), np.float16)},
+            index=SimpleNamespace(along_ladder=lambda: [SimpleNamespace(settings=dict)]),
+            search=lambda query, k: [(np.array([winner_of(asked.get(query[0].tobytes()))]), None)],
+        )
+        touches = np.concatenate([crowd.touches, crowd.held_out])
+        winners = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
+        return scale._operating_point(crowd, found, touches, winners, asked=12)
+
+    assert point(lambda number: 0 if number is None else number % 9)["recall"] == 0
+    assert point(lambda number: 8 if number is None else number % 9)["recall"] == 1
+
+
 def test_a_kind_that_needs_more_photos_says_so(crowd, tmp_path):
     size = scale.measure(crowd, 100, ("ivf_sq8",), tmp_path / "index", queries=2)
     assert "624 or more vectors" in "\n".join(scale.lines(size))
@@ -68,6 +88,7 @@ def test_the_winner_is_the_photo_that_the_classifier_puts_first(crowd):
 
 def test_the_slope_of_a_power_of_n_is_its_exponent():
     sizes = [
-        scale.Size(n, 1, {"exhaustive_s": 3 * n**0.7}, {"flat": {"search_s": 2.0 * n}}) for n in (10**3, 10**4, 10**6)
+        scale.Size(n, figures={"exhaustive_s": 3 * n**0.7}, kinds={"flat": {"search_s": 2.0 * n}})
+        for n in (10**3, 10**4, 10**6)
     ]
     assert dict(scale.slopes(sizes)) == pytest.approx({"exhaustive_s": 0.7, "flat search_s": 1.0})

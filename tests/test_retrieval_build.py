@@ -23,6 +23,7 @@ from retrieval.search.build import build_index
 from retrieval.search.embed import ahead
 from retrieval.search.measuring import NeighbourBench, WinnerBench
 from retrieval.search.searcher import Searcher
+from retrieval.version import __version__
 from tests import synthetic
 
 
@@ -232,7 +233,10 @@ def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, e
     other = changed_model(checkpoint, tmp_path / "other.safetensors")
     report = build_index(own, other, index, quiet=True)
     assert (sum(embedded), report.embedded, report.reused) == (24, 24, 0)
-    assert report.reason.startswith("The model or its preprocessing changed, so every photo was embedded again.")
+    assert report.reason.startswith(
+        "Every photo was embedded again: another model makes what is stored of it; the index there is of version "
+        f"{__version__}."
+    )
 
 
 def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):

@@ -12,7 +12,7 @@ from retrieval.errors import Interrupted, NumericalError
 from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.prune_rerank import PruneRerank
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors, store_checkpoint, write_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.training import distil
@@ -40,6 +40,7 @@ def matcher():
 def _small_batches(monkeypatch):
     monkeypatch.setattr(distil, "TOUCHES", 16)
     monkeypatch.setattr(distil, "PHOTOS", 256)
+    monkeypatch.setattr(distil, "POOL", 2000)
     monkeypatch.setattr(distil, "LEARNING_RATE", 0.02)
 
 
@@ -131,6 +132,26 @@ def test_every_touch_is_judged_with_every_photo(matcher, halves):
         torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)
 
 
+def test_what_is_taught_after_the_start_lies_nearer_to_the_touches_than_what_is_drawn(matcher, halves):
+    taught(matcher, halves)
+    crowd = distil._Crowd(matcher.pruner, halves[1], lambda rows: rows, torch.Generator().manual_seed(2))
+    drawn_alone = crowd.photos(-1, halves[0][:16])
+    chosen = crowd.photos(0, halves[0][:16])
+    assert drawn_alone.shape == chosen.shape == (256, HIDDEN)
+    touches = matcher.pruner.touch(halves[0][:16])
+    best = [
+        (touches @ matcher.pruner.photo(photos).T).topk(12).values.mean().item() for photos in (drawn_alone, chosen)
+    ]
+    assert best[1] > best[0]
+    pool = crowd._pool.of(halves[1], torch.arange(distil.POOL))
+    nearest = (touches @ matcher.pruner.photo(pool).T).topk(12).values
+    assert best[1] >= nearest.mean().item() - 1e-6  # those of the pool are all there
+    crowd.photos(1, halves[0][:16])
+    assert torch.equal(crowd._pool.of(halves[1], torch.arange(distil.POOL)), pool)
+    crowd.photos(distil.RENEWED, halves[0][:16])
+    assert not torch.equal(crowd._pool.of(halves[1], torch.arange(distil.POOL)), pool)
+
+
 # What is taught --------------------------------------------------------------------------------------------
 
 
@@ -172,6 +193,25 @@ def test_nothing_but_the_pruner_changes(matcher, halves):
     assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"pruner"}
     assert matcher.config == dataclasses.replace(UNPRUNED, pruner_width=32)
     assert all(parameter.grad is None for name, parameter in matcher.named_parameters() if "pruner" not in name)
+
+
+def test_with_a_cosine_in_the_logit_linear_numbers_find_winners_deeper_in_the_order_than_a_network_alone(halves):
+    """A logit that is the cosine alone, of embeddings that vary in two directions."""
+    torch.manual_seed(3)
+    config = dataclasses.replace(UNPRUNED, cosine=True)
+    matcher = Matcher(config).eval()
+    with torch.no_grad():
+        matcher.head.out.weight.zero_()
+    touches, photos = (
+        torch.cat([part, sign * 2 * torch.nn.functional.normalize(part[:, :8])], dim=1)
+        for part, sign in zip(halves, (1, -1), strict=True)
+    )
+    found = []
+    for linear in (0, 2):
+        distil.distil(matcher, touches, photos, width=32, linear=linear, steps=3, seed=0, quiet=True)
+        assert matcher.config == dataclasses.replace(config, pruner_width=32, pruner_linear=linear)
+        found.append(distil.winner_ranks(matcher, touches, photos).mean())
+    assert found[1] < found[0] / 2
 
 
 def test_a_stop_leaves_the_matcher_as_it_was(matcher, halves):
@@ -236,6 +276,17 @@ def test_queries_are_as_many_as_are_kept_and_only_what_float16_holds():
     np.testing.assert_array_equal(queries, distil.kept_queries(halves, seed=0))
     assert halves.half()[7, 1].isinf()
     assert distil.kept_queries(halves[7:8], seed=0) is None
+
+
+def test_a_checkpoint_from_before_pruners_had_linear_numbers_opens_and_searches_as_it_did(checkpoint, halves):
+    store_checkpoint(distil.with_pruner(checkpoint, wanted(2), halves, quiet=True), checkpoint.path)
+    state, header = read_tensors(checkpoint.path)
+    del header["config"]["matcher"]["pruner_linear"]
+    before = checkpoint.matcher.pruner.photo(halves[1])
+    write_tensors(checkpoint.path, state, {name: header[name] for name in header if name not in ("format", "software")})
+    opened = load_checkpoint(checkpoint.path)
+    assert opened.config.matcher.pruner_linear == 0
+    assert torch.equal(opened.matcher.pruner.photo(halves[1]), before)
 
 
 def test_an_older_checkpoint_without_a_word_of_pruners_searches_by_its_contrastive_embeddings():

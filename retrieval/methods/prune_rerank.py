@@ -1,7 +1,5 @@
 """What users run: candidates by the embedding, judged by the match logit; shares late fusion's training."""
 
-import dataclasses
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -30,10 +28,8 @@ class PruneRerank(LateFusion):
 
     def _fit(self, train: Features, validation: Features) -> None:
         made = trained_checkpoint(self.setting, train, validation)
-        if width := self.setting.config.matcher.pruner_width:
-            config = dataclasses.replace(
-                made.config, matcher=dataclasses.replace(made.config.matcher, pruner_width=width)
-            )
+        if self.setting.config.matcher.pruner_width:
+            config = made.config.with_pruner_of(self.setting.config)
             halves = (feature_halves(made.matcher, part) for part in (train, validation))
             made = with_pruner(made, config, *halves, quiet=self.setting.quiet)
         self._take(made)

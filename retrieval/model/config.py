@@ -29,6 +29,7 @@ class MatcherConfig:
     training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
     embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the networks that
     make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the contrastive ones.
+    pruner_linear: how many of the embedding_dim numbers are linear in the contrastive embedding, which needs cosine.
     cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does not.
     """
 
@@ -40,6 +41,7 @@ class MatcherConfig:
     standardise: bool = False
     embedding_dim: int = 128
     pruner_width: int = 0
+    pruner_linear: int = 0
     cosine: bool = False
 
     @property
@@ -49,6 +51,12 @@ class MatcherConfig:
 
     def __post_init__(self) -> None:
         _require(self.pruner_width >= 0, f"pruner_width must be at least 0; got {self.pruner_width}")
+        most = self.embedding_dim - 1 if self.cosine else 0
+        _require(
+            0 <= self.pruner_linear <= most,
+            f"pruner_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine); got "
+            f"{self.pruner_linear}",
+        )
         for name in ("fingers", "hidden", "embedding_dim"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
         _require(0 <= self.dropout < 1, f"dropout must be in [0, 1); got {self.dropout}")
@@ -180,7 +188,14 @@ class Config:
 
     def without_pruner(self) -> "Config":
         """The same with no pruner to be taught."""
-        return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0))
+        return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0, pruner_linear=0))
+
+    def with_pruner_of(self, other: "Config") -> "Config":
+        """The same with a pruner as `other` has it, as far as this logit has a cosine to be linear in."""
+        wanted = other.matcher
+        linear = min(wanted.pruner_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
+        matcher = dataclasses.replace(self.matcher, pruner_width=wanted.pruner_width, pruner_linear=linear)
+        return dataclasses.replace(self, matcher=matcher)
 
     def without_paths(self) -> dict[str, Any]:
         """As `to_dict`, of files and folders the names alone: where they lay on this machine concerns nobody."""

@@ -117,7 +117,7 @@ class Matcher(nn.Module):
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
-        self.pruner = Pruner(config.half, config.pruner_width, config.embedding_dim) if config.pruner_width else None
+        self.pruner = pruner_of(config) if config.pruner_width else None
         self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.judgement`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
@@ -181,6 +181,11 @@ class Matcher(nn.Module):
     def clamp_scale(self) -> None:
         """Hold the scale of the contrastive scores at 100 at most; on the parameter, so that it can come back."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
+
+
+def pruner_of(config: MatcherConfig) -> Pruner:
+    """An untaught pruner of a matcher."""
+    return Pruner(config.half, config.pruner_width, config.embedding_dim, config.pruner_linear)
 
 
 def _unit(x: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """What a checkpoint's file says of itself, read without PyTorch: enough for a query whose towers run elsewhere."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,22 @@ class Stored:
 def fingerprint(checkpoint: Stored) -> dict[str, str]:
     """What must be the same for an index to be searched with a checkpoint."""
     return {"checkpoint": checkpoint.digest, "preprocessing": checkpoint.config.preprocessing.digest()}
+
+
+HALVES_OF = "halves_of"
+"""In the provenance: digests of checkpoints with the same towers, head and preprocessing, whose halves these are."""
+
+
+def halves_kept(checkpoint: Stored, made_by: Mapping[str, str]) -> bool:
+    """Whether the halves of an index with that fingerprint are those that this checkpoint would make again, and its
+    embeddings alone are others, which a pruner makes of these."""
+    before = checkpoint.provenance.get(HALVES_OF)
+    same = isinstance(before, list) and made_by.get("checkpoint") in before
+    return (
+        same
+        and checkpoint.config.matcher.pruner_width > 0
+        and made_by.get("preprocessing") == fingerprint(checkpoint)["preprocessing"]
+    )
 
 
 def read_stored(path: Path) -> Stored:

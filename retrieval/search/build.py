@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from indexes import load_kind
-from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
@@ -21,7 +21,7 @@ from retrieval.data.naming import FOLDER, Naming, doubts, per_object
 from retrieval.data.sources import Fetched, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.stored import fingerprint
+from retrieval.model.stored import fingerprint, halves_kept
 from retrieval.search.build_report import BuildReport
 from retrieval.search.embed import Embedder, Part, layouts
 from retrieval.search.looks import Looked
@@ -82,6 +82,17 @@ UNNOTED = (
 )
 
 
+TAUGHT_AGAIN = (
+    "The model names candidates otherwise and judges as before, so the halves of unchanged photos were kept, and their "
+    "embeddings made again from these; no such photo was decoded or encoded."
+)
+CHANGED = {
+    "checkpoint": "another model makes what is stored of it",
+    "preprocessing": "photos are prepared otherwise for the model",
+}
+"""By what of the fingerprint is another one: why a photo is embedded again."""
+
+
 @dataclass(frozen=True)
 class Wanted:
     """What is wanted of a build. verify: as `build_index` takes it. note: to be said of it first. about: more for the
@@ -104,7 +115,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         chosen = load_kind(asked.kind)
         chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock():
-        parent, why = _parent(store, checkpoint)
+        parent, halves, why = _before(store, checkpoint)
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
@@ -115,7 +126,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         start = time.perf_counter()
         looked = Looked(catalogue, out, wanted.verify)
         with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
-            made = Embedder(checkpoint, parent, unfinished, looked, wanted.donors)
+            made = Embedder(checkpoint, parent, unfinished, looked, wanted.donors, halves)
             with closing(made.parts(catalogue, wanted.quiet)) as parts:
                 changed = _unless_same(parent, parts, about)
                 job = _Job(store, made, about, asked, wanted.quiet, wanted.keep)
@@ -140,6 +151,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         embedded=made.embedded,
         reused=made.photos - made.embedded,
         renamed=made.renamed,
+        remade=made.remade,
         resumed=made.resumed,
         removed=made.removed,
         unread=made.unread,
@@ -254,16 +266,24 @@ class _Job:
         return Chosen(settled.kind, settled.parameters, about)
 
 
-def _parent(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, str]:
-    """The generation to take unchanged photos over from, and why not where there is one that cannot serve."""
+def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
+    """The generation to take unchanged photos over from, or one to take halves alone from; and where there is one that
+    cannot serve as a whole, what is made again and why."""
     try:
-        return store.open(expect=fingerprint(checkpoint)), ""
+        there = store.open()
     except NoIndex:
-        return None, ""
-    except MismatchedIndex:
-        return None, "The model or its preprocessing changed, so every photo was embedded again."
+        return None, None, ""
     except (CorruptIndex, UnsupportedFormat) as error:
-        return None, f"The index there was not usable, so every photo was embedded again ({error})."
+        return None, None, f"The index there was not usable, so every photo was embedded again ({error})."
+    before, now = there.manifest.fingerprint, fingerprint(checkpoint)
+    if {name: before.get(name) for name in now} == now:
+        return there, None, ""
+    half = (checkpoint.config.matcher.half,)
+    if halves_kept(checkpoint, before) and there.arrays["halves"].shape[1:] == half:
+        return None, there, TAUGHT_AGAIN
+    changed = [said for name, said in CHANGED.items() if before.get(name) != now[name]]
+    written = f"; the index there is of version {there.manifest.software}" if there.manifest.software else ""
+    return None, None, f"Every photo was embedded again: {' and '.join(changed)}{written}."
 
 
 def _settled(made: Embedder, tables: Tables, asked: Asked, quiet: bool) -> Settled:

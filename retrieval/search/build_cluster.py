@@ -244,6 +244,7 @@ def _report(
         reused=sum(report.reused for report in reports),
         renamed=sum(report.renamed for report in reports),
         resumed=sum(report.resumed for report in reports),
+        remade=sum(report.remade for report in reports),
         removed=sum(report.removed for report in reports),
         unread=sum(report.unread for report in reports),
         skipped=skipped,

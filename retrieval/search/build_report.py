@@ -16,17 +16,18 @@ SHOWN, FEW = 20, 5
 class BuildReport:
     """What a build did.
 
-    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that names
-    objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects, each with a
-    photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew, `renamed` of
-    which had another name in the index before, and `resumed` of which stood in no index yet, but had been embedded by a
-    build that was cut off. removed: names that are gone. unread: of how many the files were not read, as they look as
-    they did when an earlier build read them (`retrieval.search.looks`). skipped: pictures that could not be read;
-    ignored: files that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all
-    of whose pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
+    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that
+    names objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects,
+    each with a photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew,
+    `renamed` of which had another name in the index before, `remade` of which have a new embedding made of their
+    old half, and `resumed` of which stood in no index yet, but had been embedded by a build that was cut off.
+    removed: names that are gone. unread: of how many the files were not read, as they look as they did when an
+    earlier build read them (`retrieval.search.looks`). skipped: pictures that could not be read; ignored: files
+    that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all of whose
+    pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
     (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
-    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a cluster,
-    as its manifest names them (`indexes.store.cluster`); None for an index folder.
+    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a
+    cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -49,6 +50,7 @@ class BuildReport:
     reused: int
     renamed: int
     resumed: int
+    remade: int
     removed: int
     unread: int
     skipped: list[SkippedPhoto]
@@ -80,10 +82,11 @@ class BuildReport:
         rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
         renamed = f" ({self.renamed} under another name)" if self.renamed else ""
         resumed = f", {self.resumed} from a build that was cut off" if self.resumed else ""
-        unchanged = self.reused - self.resumed
+        remade = f", {self.remade} with new embeddings of their old halves" if self.remade else ""
+        unchanged = self.reused - self.resumed - self.remade
         yield (
             f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
-            f"{self.embedded} embedded{resumed}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
+            f"{self.embedded} embedded{resumed}{remade}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
         )
         if not self.written:
             yield "nothing changed: the index stays as it is"

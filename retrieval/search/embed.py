@@ -42,12 +42,14 @@ HELD = 256
 @dataclass(frozen=True)
 class _Code:
     """An embedding (d,) and a half (half,), and the largest rounding of the half where this index has none yet.
-    resumed: left by a build that was cut off; else the parent has it under another name."""
+    resumed: left by a build that was cut off; remade: the embedding is a new one of an older half; neither: the parent
+    has it under another name."""
 
     embedding: NDArray[np.float32]
     half: NDArray[np.float16]
     half_error: float
-    resumed: bool
+    resumed: bool = False
+    remade: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class Part:
 
     kept: the parent's rows of these numbers, as they are, and nothing else. rows: of all that could be read;
     embeddings (F, d) and halves (F, half): of those that the parent does not have
-    under their names, of which `embedded` were encoded now, and `resumed` by a build that was cut off.
+    under their names, of which `embedded` were encoded now, `resumed` by a build that was cut off, and `remade` have a
+    new embedding of an older half.
     """
 
     rows: list[dict[str, Any]]
@@ -87,6 +90,7 @@ class Part:
     half_error: float = 0.0
     embedded: int = 0
     resumed: int = 0
+    remade: int = 0
     kept: range = range(0)
     objects: Mapping[str, int] = field(default_factory=dict)
     """How many photos each object has; of `kept` alone, where no row tells."""
@@ -96,11 +100,13 @@ class Embedder:
     """Makes parts of a catalogue's photos, and counts what became of them. What it encodes is kept in `unfinished`.
 
     looked: how the files look, and so which need not be read. donors: other generations of the same model, whose codes
-    are taken for photos of the same content.
+    are taken for photos of the same content. halves: a generation of a model with other embeddings of the same halves
+    (`retrieval.model.stored.halves_kept`).
 
-    photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `renamed` had
-    another name in the parent, and `known` are the parent's own by id, with the same content or another. objects: how
-    many rows each has. unread: how many files need not be read. half_error: largest rounding of a stored half.
+    photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `remade` were
+    given a new embedding of an older half, `renamed` had another name in the parent, and `known` are the parent's
+    own by id, with the same content or another. objects: how many rows each has. unread: how many files need not be
+    read. half_error: largest rounding of a stored half.
     """
 
     def __init__(
@@ -110,12 +116,14 @@ class Embedder:
         unfinished: Unfinished,
         looked: Looked,
         donors: Sequence[Generation] = (),
+        halves: Generation | None = None,
     ) -> None:
         self.checkpoint, self.parent, self.unfinished, self.looked = checkpoint, parent, unfinished, looked
-        self._holders = [*([] if parent is None else [parent]), *donors]
+        self._halves = halves
+        self._holders = [holder for holder in (parent, *donors, halves) if holder is not None]
         self.skipped: list[SkippedPhoto] = []
         self.objects: Counter[str] = Counter()
-        self.photos, self.embedded, self.resumed, self.renamed, self.known, self.unread = 0, 0, 0, 0, 0, 0
+        self.photos, self.embedded, self.resumed, self.remade, self.renamed, self.known, self.unread = (0,) * 7
         self.half_error = 0.0
         self._encode_photos = on_torch(checkpoint)
 
@@ -198,14 +206,23 @@ class Embedder:
             numbers = holder.rows.holding(wanted)
             having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            embeddings = holder.embeddings[holder.slots[rows]]
-            halves = holder.arrays["halves"][rows]
-            codes = (_Code(*code, 0.0, resumed=False) for code in zip(embeddings, halves, strict=True))
+            halves, remade = holder.arrays["halves"][rows], holder is self._halves
+            embeddings = self._embeddings(halves) if remade else holder.embeddings[holder.slots[rows]]
+            codes = (_Code(*code, 0.0, remade=remade) for code in zip(embeddings, halves, strict=True))
             found.update(zip(having, codes, strict=True))
         left = self.unfinished.find(digest for digest in digests if digest not in found)
         for digest, record in left.items():
             found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), resumed=True)
         return found
+
+    @torch.inference_mode()
+    def _embeddings(self, halves: NDArray[np.float16]) -> NDArray[np.float32]:
+        """Embeddings (n, d) that the pruner makes of stored halves (n, half)."""
+        pruner = self.checkpoint.matcher.pruner
+        assert pruner is not None
+        read = torch.from_numpy(halves.astype(np.float32)).to(next(pruner.parameters()).device)
+        made: NDArray[np.float32] = pruner.photo(read).cpu().numpy()
+        return made
 
     def _encode(self, found: Sequence[_Item]) -> Part:
         """Decode and encode those that must be. Called on threads."""
@@ -228,6 +245,7 @@ class Embedder:
             elif item.code is not None:
                 codes[item.row["id"]] = item.code
         resumed = sum(code.resumed for code in codes.values())
+        remade = sum(code.remade for code in codes.values())
         codes |= self._encoded(new, images)
         if not codes:
             return part
@@ -239,6 +257,7 @@ class Embedder:
             half_error=max(code.half_error for code in ordered),
             embedded=len(new),
             resumed=resumed,
+            remade=remade,
         )
 
     def _encoded(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> dict[str, _Code]:
@@ -259,7 +278,7 @@ class Embedder:
             [row["digest"] for row in rows], {"embedding": embeddings, "halves": stored, "half_error": errors}
         )
         made = zip(embeddings, stored, errors.tolist(), strict=True)
-        return {name: _Code(*of, resumed=False) for name, of in zip(names, made, strict=True)}
+        return {name: _Code(*of) for name, of in zip(names, made, strict=True)}
 
     def _count(self, part: Part) -> None:
         self.skipped += part.skipped
@@ -268,7 +287,8 @@ class Embedder:
         self.photos += len(part.kept) + len(part.rows)
         self.embedded += part.embedded
         self.resumed += part.resumed
-        self.renamed += 0 if part.halves is None else len(part.halves) - part.embedded - part.resumed
+        self.remade += part.remade
+        self.renamed += 0 if part.halves is None else len(part.halves) - part.embedded - part.resumed - part.remade
         self.half_error = max(self.half_error, part.half_error)
         self.known += len(part.kept)
         if self.parent is not None and part.rows:

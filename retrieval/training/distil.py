@@ -3,11 +3,14 @@
 The classifier judges every pair of a batch of touches and photos; the student's scores learn its softmax over the
 photos. That asks for the top of the order above all, which is what candidates are taken from. Both are drawn afresh
 each step as blends of two recorded ones: halves are affine in features, so that a blend of halves is the half of a
-blend of features, and a few thousand recorded photos stand for the crowd that a large catalogue is.
+blend of features, and a few thousand recorded photos stand for the crowd that a large catalogue is. In such a crowd a
+winner stands among others that are nearly as good, and a few thousand photos have few of these: so most of a batch are
+the nearest of a pool of many, by the student as it is so far.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -20,7 +23,7 @@ from retrieval.data.dataset import Grasp
 from retrieval.errors import Interrupted
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
-from retrieval.model.fusion import FusionHead, Matcher
+from retrieval.model.fusion import FusionHead, Matcher, pruner_of
 from retrieval.model.pruner import Pruner, Spread
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.features import Features
@@ -33,6 +36,12 @@ SPREAD_WEIGHT = 0.3
 """Of the squared error of all scores, beside the divergence at the top: it steadies the start."""
 LEAST_SHARE = 0.5
 """Of the nearer one of two blended ones."""
+POOL, RENEWED = 50_000, 100
+"""Blended photos of which the nearest are taught, and after how many steps they are others."""
+NEAR = 0.75
+"""Of a batch, at most: the nearest of the pool."""
+ALONE = 6
+"""The first of so many parts of the steps is without a pool: a student that knows nothing finds nothing."""
 SHARE = 0.01
 """Of the photos that are candidates when a pruner is measured."""
 MOST = 8192
@@ -49,24 +58,28 @@ def distil(
     width: int,
     steps: int,
     seed: int,
+    linear: int = 0,
     quiet: bool = False,
     stopped: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Give `matcher` a pruner of `width` hidden units, taught by `matcher.head`; nothing else of it changes.
+    """Give `matcher` a pruner of `width` hidden units and `linear` numbers that are linear in the contrastive
+    embedding (`retrieval.model.config.MatcherConfig`), taught by `matcher.head`; nothing else of it changes.
 
     touch_halves, photo_halves (N, half): of training objects. The same seed gives the same pruner. Raises
     Interrupted once `stopped()`, NumericalError for a loss that is not finite; the matcher is then as it was.
     """
-    config = dataclasses.replace(matcher.config, pruner_width=width)
+    config = dataclasses.replace(matcher.config, pruner_width=width, pruner_linear=linear)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        pruner = Pruner(config.half, width, config.embedding_dim).to(touch_halves.device)
-    touch_spread, photo_spread = Spread.of(touch_halves), Spread.of(photo_halves)
+        pruner = pruner_of(config).to(touch_halves.device)
+    touch_spread, photo_spread = (Spread.of(part, config.half - config.hidden) for part in (touch_halves, photo_halves))
+    pruner.begin_with_axes(photo_halves, touch_spread, photo_spread)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
+    crowd = _Crowd(pruner, photo_halves, photo_spread, generator)
 
-    def loss(_: int) -> Tensor:
+    def loss(step: int) -> Tensor:
         touches = blend(touch_halves, TOUCHES, generator)
-        photos = blend(photo_halves, PHOTOS, generator)
+        photos = crowd.photos(step - steps // ALONE, touch_spread(touches))
         scores = pruner.scores(touch_spread(touches), photo_spread(photos))
         return order_loss(scores, all_logits(head, touches, photos))
 
@@ -76,6 +89,31 @@ def distil(
             raise Interrupted("stopped before the pruner was taught")
     pruner.absorb(touch_spread, photo_spread)
     matcher.config, matcher.pruner = config, pruner.eval()
+
+
+class _Crowd:
+    """Photos to teach with: blends drawn for a step, and of a pool of blends those nearest to its touches."""
+
+    def __init__(self, pruner: Pruner, halves: Tensor, spread: Spread, generator: torch.Generator) -> None:
+        self._pruner, self._halves, self._spread, self._generator = pruner, halves, spread, generator
+        self._pool, self._embeddings = Blends.drawn(halves, 0, generator), halves[:0]
+
+    @torch.no_grad()
+    def photos(self, step: int, touches: Tensor) -> Tensor:
+        """Halves (PHOTOS, half) for a step and its touches (T, half), centred and scaled; before step 0 of drawn
+        blends alone."""
+        if step < 0:
+            return blend(self._halves, PHOTOS, self._generator)
+        if step % RENEWED == 0:
+            self._pool = Blends.drawn(self._halves, POOL, self._generator)
+            rows = torch.arange(POOL, device=self._halves.device)
+            halves = (self._pool.of(self._halves, rows[start : start + PHOTOS]) for start in range(0, POOL, PHOTOS))
+            self._embeddings = torch.cat([self._pruner.photo(self._spread(part)) for part in halves])
+        each = max(1, round(NEAR * PHOTOS / len(touches)))
+        near = (self._pruner.touch(touches) @ self._embeddings.T).topk(each).indices
+        near = torch.tensor(sorted(set(near.flatten().tolist())), device=near.device)
+        others = blend(self._halves, PHOTOS - len(near), self._generator)
+        return torch.cat([self._pool.of(self._halves, near), others])
 
 
 def order_loss(scores: Tensor, logits: Tensor) -> Tensor:
@@ -91,11 +129,28 @@ def order_loss(scores: Tensor, logits: Tensor) -> Tensor:
     return divergence + SPREAD_WEIGHT * error
 
 
+class Blends(NamedTuple):
+    """Which rows are blended: pairs (2, n) of them, and the share (n, 1) of the first of each."""
+
+    pairs: Tensor
+    share: Tensor
+
+    @classmethod
+    def drawn(cls, halves: Tensor, count: int, generator: torch.Generator) -> Self:
+        """`count` blends of rows of `halves` (N, half)."""
+        pairs = torch.randint(len(halves), (2, count), generator=generator).to(halves.device)
+        share = LEAST_SHARE + (1 - LEAST_SHARE) * torch.rand(count, 1, generator=generator).to(halves.device)
+        return cls(pairs, share)
+
+    def of(self, halves: Tensor, rows: Tensor) -> Tensor:
+        """(len(rows), half): those blends, each between two of `halves` and nearer to the first."""
+        nearer, other = self.pairs[:, rows]
+        return torch.lerp(halves[other], halves[nearer], self.share[rows])
+
+
 def blend(halves: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count, hidden) halves, each between two of `halves` (N, half) and nearer to the first."""
-    pairs = torch.randint(len(halves), (2, count), generator=generator).to(halves.device)
-    share = LEAST_SHARE + (1 - LEAST_SHARE) * torch.rand(count, 1, generator=generator).to(halves.device)
-    return torch.lerp(halves[pairs[1]], halves[pairs[0]], share)
+    """(count, half) blends of `halves` (N, half), drawn for themselves."""
+    return Blends.drawn(halves, count, generator).of(halves, torch.arange(count, device=halves.device))
 
 
 @torch.no_grad()
@@ -170,8 +225,9 @@ def with_pruner(
     over. Raises as `distil`.
     """
     settings, matcher, metrics = config.training, made.matcher, made.provenance["metrics"]
-    width, steps = config.matcher.pruner_width, settings.distil_steps
-    distil(matcher, *train, width=width, steps=steps, seed=settings.seed, quiet=quiet, stopped=stopped)
+    width, linear, steps = config.matcher.pruner_width, config.matcher.pruner_linear, settings.distil_steps
+    seed = settings.seed
+    distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet, stopped=stopped)
     queries = None if validation is None else kept_queries(validation[0], settings.seed)
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()

@@ -61,9 +61,10 @@ MOST_CANDIDATES = 16_000
 TARGET, MARGIN = 0.99, 4
 ADDED = 1000
 TIMED = 40
-QUERIES = 200
+QUERIES, HELD_OUT = 200, 1000
+"""Touches that choose how many candidates there are, and others that judge it."""
 JUDGED = 3e13
-"""Most flops to spend on finding winners: fewer touches are asked of larger catalogues, but never below 40."""
+"""Most flops to spend on finding winners: fewer touches are asked of larger catalogues, but never below 60."""
 
 PROBE = """
 import sys, time
@@ -87,13 +88,15 @@ class Size:
 
     photos: int
     queries: int = 0
+    held_out: int = 0
     figures: dict[str, float] = field(default_factory=dict)
     kinds: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Crowd:
-    """A model, halves (n, h) of recorded photos to blend catalogues from, and halves (Q, h) of touches to ask with.
+    """A model, halves (n, h) of recorded photos to blend catalogues from, halves (Q, h) of touches to choose candidates
+    with, and (J, h) of others.
 
     by: which embeddings name the candidates, "pruner" or, where their cosine is in the halves, "contrastive".
     """
@@ -102,6 +105,7 @@ class Crowd:
     judge: Judge
     photos: np.ndarray
     touches: np.ndarray
+    held_out: np.ndarray
     by: str = "pruner"
 
     @torch.inference_mode()
@@ -134,17 +138,23 @@ def crowd_of(model: Path, recording: Path, features: Path | None, by: str = "pru
     found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
     with torch.inference_mode():
         photos = checkpoint.matcher.photo_code(torch.from_numpy(found.photo)).half.numpy()
+        felt = checkpoint.matcher.touch_code(torch.from_numpy(found.touch).flatten(1)).half.numpy()
+    rng, queries = np.random.default_rng(0), checkpoint.queries.astype(np.float32)
+    half = len(queries) // 2
+    held_out = rng.permutation(np.concatenate([queries[half:], felt]))
     judge = judge_of(checkpoint.matcher.head)
-    return Crowd(checkpoint, judge, np.unique(photos, axis=0), checkpoint.queries.astype(np.float32), by)
+    return Crowd(checkpoint, judge, np.unique(photos, axis=0), queries[:half], held_out, by)
 
 
 def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
     """Build, search and grow an index of so many photos of each kind in `folder`."""
-    hidden = crowd.photos.shape[1]
-    asked = int(min(queries, len(crowd.touches), max(40, JUDGED / (2 * hidden**2 * photos))))
-    size, store = Size(photos, asked), IndexStore(folder)
+    most = max(60, int(JUDGED / (2 * crowd.photos.shape[1] ** 2 * photos)))
+    asked = min(queries, len(crowd.touches), most // 3)
+    judged = min(HELD_OUT, len(crowd.held_out), most - asked)
+    size, store = Size(photos, asked, judged), IndexStore(folder)
     generation = _build(crowd, store, size)
-    halves, touches = generation.arrays["halves"], crowd.touches[:asked]
+    halves = generation.arrays["halves"]
+    touches = np.concatenate([crowd.touches[:asked], crowd.held_out[:judged]])
     winners, size.figures["exhaustive_s"] = _winners(crowd.judge, touches, halves)
     for kind in kinds:
         start = time.perf_counter()
@@ -161,7 +171,7 @@ def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queri
             size.kinds[kind] = {"refused": str(error)}
             continue
         figures = {"structure_s": time.perf_counter() - start} | _opened(folder) | _disk(made)
-        size.kinds[kind] = figures | _operating_point(crowd, made, touches, winners)
+        size.kinds[kind] = figures | _operating_point(crowd, made, touches, winners, asked)
         size.kinds[kind] |= _growth(crowd, store, made, size.photos)
         point = size.kinds[kind]
         point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
@@ -211,27 +221,29 @@ def _winners(judge: Judge, touches: np.ndarray, halves: Any) -> tuple[np.ndarray
     return np.array(winners), float(np.median(seconds))
 
 
-def _operating_point(crowd: Crowd, made: Generation, touches: np.ndarray, winners: np.ndarray) -> dict[str, Any]:
+def _operating_point(
+    crowd: Crowd, made: Generation, touches: np.ndarray, winners: np.ndarray, asked: int
+) -> dict[str, Any]:
     """The fastest setting whose candidates hold the target share of winners; where none does, the most complete.
 
-    Chosen with the even touches, judged by the odd ones.
+    Chosen with the first `asked` touches, judged by the others.
     """
     queries, halves, points = crowd.embeddings(touches, "touch"), made.arrays["halves"], []
     timed, built = range(min(TIMED, len(touches))), made.index
     for index in built.along_ladder():
         made.index = index
-        k = _candidates(made, queries[::2], winners[::2])
+        k = _candidates(made, queries[:asked], winners[:asked])
         held = np.array(
             [winner in made.search(query[None], k)[0][0] for query, winner in zip(queries, winners, strict=True)]
         )
-        judged = held[1::2]
+        judged = held[asked:]
         search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
         found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
         rerank = _median(lambda n, found=found: crowd.judge.logits(touches[n : n + 1], halves, found[n]), timed)
         low, high = binomial_interval(int(judged.sum()), len(judged))
         point = {"k": k, "recall": float(judged.mean()), "low": low, "high": high}
         point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
-        points.append((float(held[::2].mean()), point))
+        points.append((float(held[:asked].mean()), point))
     made.index = built
     good = [point for chosen, point in points if chosen >= TARGET]
     if good:
@@ -299,7 +311,7 @@ def lines(size: Size) -> Iterator[str]:
     written, judged = duration(f["build_s"]), duration(f["exhaustive_s"])
     yield (
         f"{size.photos:,} photos: written in {written} with {f['build_mb']:.0f} MB of memory; judging all of them "
-        f"takes {judged} ({size.queries} touches)"
+        f"takes {judged} ({size.queries} touches choose, {size.held_out} judge)"
     )
     for kind, p in size.kinds.items():
         if "refused" in p:
