@@ -54,7 +54,7 @@ VERDICT_GRASPS = 4
 """Of each object on which the posterior and the gel check are fitted."""
 FOREIGN = 8000
 """Pictures that are no gels, from which its check of touches learns: more than a training's own."""
-DISTIL_STEPS = 1500
+DISTIL_STEPS = 4000
 """Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
 FITTED = 10
 """Scored objects on which calibration and, as training objects, whatever else is fitted; the others are judged."""

@@ -19,6 +19,7 @@ from tests.benchmarks import (
     cylinder,
     gpu,
     gripper,
+    large,
     peers,
     query,
     rerank,
@@ -47,6 +48,16 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
     for line in lines:
         assert str(line).startswith(f"{name}, small: ")
         assert all(value > 0 for value in line.figures.values())
+        json.dumps(line.figures, allow_nan=False)
+
+
+def test_large_photos_are_compared_with_themselves_reduced_and_saved_again():
+    lines = list(large.measure(photos=2, side=64, sizes=((64, 64), (1600, 1600))))
+    small, big, again = (line.figures for line in lines)
+    assert (small["grey_levels"], small["same_winner"]) == (0, 1)
+    assert 0 < big["grey_levels"] < 5
+    assert 0 < again["logit"] <= again["most_logit"]
+    for line in lines:
         json.dumps(line.figures, allow_nan=False)
 
 

@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
@@ -167,10 +167,10 @@ def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | Skip
     return PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())
 
 
-def decode_photo(file: PhotoBytes) -> RgbImage | SkippedPhoto:
-    """Decode what `read_photo` gave to (H, W, 3) float32 in 0..1, or say why it is left out."""
+def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = decode_rgb) -> RgbImage | SkippedPhoto:
+    """Decode what `read_photo` gave, to (H, W, 3) float32 in 0..1 where not told how, or say why it is left out."""
     try:
-        return decode_rgb(file.data, file.photo.path)
+        return decode(file.data, file.photo.path)
     except ImageError as error:
         return SkippedPhoto(file.photo.path, error.reason)
 

@@ -66,6 +66,9 @@ class _Quiet:
 _quiet = _Quiet()
 
 
+_SMALLER = (8, 4, 2)
+
+
 def read_rgb(path: str | Path) -> RgbImage:
     """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright. Raises ImageError."""
     return decode_rgb(read_bytes(path), path)
@@ -83,14 +86,17 @@ def read_bytes(path: str | Path) -> bytes:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 
 
-def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
+def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbImage:
     """Decode one picture to (H, W, 3) float32 RGB in 0..1; `name` stands for it in messages.
+
+    least: a JPEG file is decoded at 1/8, 1/4 or 1/2 of its size, by its own cosine transform, where the shorter side
+    keeps so many pixels; a pixel is then nearly the mean of those that it stands for. None: only where it is too large.
 
     Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
     several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
     """
     with _opened(data, name) as image:
-        _reduce(image)
+        _reduce(image, least)
         check_pixels(image.size, name)
         image.load()
         orientation = _orientation(image)
@@ -167,13 +173,18 @@ def _other_decoder(data: bytes, name: str | Path) -> str | None:
     return "HEIF"
 
 
-def _reduce(image: Image.Image) -> None:
-    """Have a large JPEG file decoded smaller, which takes the memory of what comes out. A progressive one is not: its
-    decoder holds the whole."""
+def _reduce(image: Image.Image, least: int | None) -> None:
+    """Have a large JPEG file decoded smaller, which takes the memory of what comes out, and as few pixels as `least`
+    asks for. A progressive one keeps its size where nothing is asked: its decoder holds the whole."""
     width, height = image.size
-    if image.format != "JPEG" or width * height > MOST_REDUCED or image.info.get("progressive"):
+    if image.format != "JPEG" or width * height > MOST_REDUCED:
         return
-    if scale := next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None):
+    progressive = bool(image.info.get("progressive"))
+    if progressive and width * height > MAX_PIXELS:
+        return
+    wanted = next((each for each in _SMALLER if least is not None and min(width, height) >= each * least), 1)
+    enough = next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None)
+    if enough and (scale := max(wanted, enough)) > 1:
         image.draft(None, (width // scale, height // scale))
 
 

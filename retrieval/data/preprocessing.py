@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.data.images import read_rgb
+from retrieval.data.images import decode_rgb, picture_size, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
-from retrieval.data.views import VIEWS, strip
+from retrieval.data.views import VIEWS, least_side, least_side_for, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -61,13 +61,15 @@ def _missing_reference(policy: str) -> ConfigError:
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, and which views of a
-    photo stand side by side (`retrieval.data.views.VIEWS`)."""
+    """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, which views of a
+    photo stand side by side (`retrieval.data.views.VIEWS`), and whether a JPEG photo is decoded no larger than these
+    need (`reduced`)."""
 
     touch_px: int = 128
     photo_px: int = 256
     background: str = "none"
     views: tuple[str, ...] = ("whole",)
+    reduced: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -96,12 +98,24 @@ class Preprocessing:
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
         if self.views == ("whole",):  # what there was before views
             del content["views"]
+        if not self.reduced:  # what there was before
+            del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def photo(self, image: RgbImage) -> RgbImage:
         """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
         check_rgb(image, "photo")
         return strip(_finite(image, "photo"), self.views, self.photo_px)
+
+    def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
+        """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
+        if not self.reduced:
+            return self.photo(decode_rgb(data, name))
+        image = decode_rgb(data, name, least_side(self.views, self.photo_px))
+        if (short := min(image.shape[:2])) < min(picture_size(data, name)):
+            more = least_side_for(image, self.views, self.photo_px)
+            image = decode_rgb(data, name, more) if more > short else image
+        return self.photo(image)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
@@ -117,7 +131,7 @@ class Preprocessing:
 
     def load_photo(self, path: str | Path) -> RgbImage:
         """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
-        return self.photo(read_rgb(path))
+        return self.photo_of(read_bytes(path), path)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.

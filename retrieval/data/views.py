@@ -9,6 +9,7 @@ In a photo at the towers' resolution the relief that a gel feels is a few pixels
 own resolution; `grey` because colour says nothing about what can be felt.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -134,6 +135,27 @@ VIEWS: dict[str, Callable[[RgbImage, Box], RgbImage]] = {
     "grey": _grey,
 }
 """Name of a view -> what cuts it out of a photo (H, W, 3), given the object's box."""
+
+
+OVERSAMPLED = 2
+"""Pixels of a reduced photo, along a side, for each that a tower sees."""
+_SHARES = {"whole": 1.0, "zoom": _ZOOM_SHARE, "grey": _ZOOM_SHARE}
+
+
+def least_side(names: Sequence[str], px: int) -> int:
+    """How many pixels the shorter side of a photo must have so that these views of it hold OVERSAMPLED of its pixels
+    for each of theirs, whatever it shows, and its object can be looked for."""
+    wanted = [OVERSAMPLED * px / _SHARES[name] for name in names if name in _SHARES]
+    return math.ceil(max([_SIDE, OVERSAMPLED * px, *wanted]))
+
+
+def least_side_for(image: RgbImage, names: Sequence[str], px: int) -> int:
+    """The same of a photo (H, W, 3) as it was decoded, for the views that are cut to its object."""
+    if "crop" not in names:
+        return 0
+    box = find_object(image)
+    share = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / min(image.shape[:2])
+    return math.ceil(OVERSAMPLED * px / float(share))
 
 
 def strip(image: RgbImage, names: Sequence[str], px: int) -> RgbImage:

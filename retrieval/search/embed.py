@@ -230,18 +230,19 @@ class Embedder:
             return Part([], kept=found[0].rows, objects=Counter(photo.object_id for photo in found[0].photos))
         part, new, images = Part([]), list[dict[str, Any]](), list[Image]()
         codes = dict[str, _Code]()
+        see = self.checkpoint.config.preprocessing.photo_of
         for item in found:
             if not isinstance(item, _Found):
                 part.skipped.extend([item] if isinstance(item, SkippedPhoto) else [])
                 continue
-            image = None if item.file is None else decode_photo(item.file)
+            image = None if item.file is None else decode_photo(item.file, see)
             if isinstance(image, SkippedPhoto):
                 part.skipped.append(image)
                 continue
             part.rows.append(item.row)
             if image is not None:
                 new.append(item.row)
-                images.append(self.checkpoint.config.preprocessing.photo(image))
+                images.append(image)
             elif item.code is not None:
                 codes[item.row["id"]] = item.code
         resumed = sum(code.resumed for code in codes.values())

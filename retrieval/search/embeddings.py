@@ -1,8 +1,11 @@
 """Photos to embeddings, for those who bring an index of their own."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
@@ -31,7 +34,16 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
         raise BadInput("give at least one photo to embed")
     if not isinstance(model, Checkpoint):
         model = load_checkpoint(find_model(None)[0] if model is None else Path(model))
-    view = model.config.preprocessing.photo
-    images = (view(read_image(photo, f"photo {number}")) for number, photo in enumerate(photos, start=1))
+    settings = model.config.preprocessing
+    images = (_seen(photo, f"photo {number}", settings) for number, photo in enumerate(photos, start=1))
     code = encode_photos(model.matcher, images)
     return Encoded(code.embedding.numpy(), code.half.numpy())
+
+
+def _seen(photo: AnyImage, name: str, settings: Preprocessing) -> RgbImage:
+    """What the tower sees of a photo, which a file or its bytes say how to decode."""
+    if isinstance(photo, str | os.PathLike):
+        return settings.load_photo(os.fspath(photo))
+    if isinstance(photo, bytes | bytearray | memoryview):
+        return settings.photo_of(bytes(photo), name)
+    return settings.photo(read_image(photo, name))
