@@ -9,6 +9,7 @@ from retrieval.lab.contact.closed_forms import Grid, hertz
 from retrieval.lab.contact.closing_jaws import Jaws
 from retrieval.lab.frontier.contact import closing_panel, contact_panels, spring_closing
 from retrieval.lab.frontier.optics import optics_panel
+from retrieval.lab.frontier.simulation import products_panel, rays_panel, sky_panel
 
 
 @pytest.fixture(scope="module")
@@ -74,3 +75,24 @@ def test_the_optics_have_a_point_for_each_degree_and_error_falls():
     first, second, third, _ = panel.points
     assert first.error > second.error > third.error > 1
     assert all(point.seconds > 0 for point in panel.points)
+
+
+def test_shorter_steps_are_nearer_to_equal_ones_and_the_gel_s_is_within_what_it_shows():
+    panel = rays_panel(1, rows=12, steps_mm=(0.8, 0.2, 0.1))
+    long, middle, gels = errors(panel, "")
+    assert long > middle > gels > 0
+    assert gels < panel.tolerance
+    assert panel.default.setting == "0.1 mm"
+
+
+def test_the_sky_on_a_finer_grid_is_nearer_to_the_full_one():
+    found = errors(sky_panel(1, px=128), "")
+    assert found == sorted(found, reverse=True)
+    assert found[2] < 1.0
+
+
+def test_float32_changes_less_of_a_contact_than_its_tolerance():
+    panel = products_panel(1, rows=60, tolerances=(1e-2,))
+    double, single = errors(panel, "")
+    assert double == pytest.approx(single, rel=0.02)
+    assert panel.default.name == "float32, tolerance 0.01"

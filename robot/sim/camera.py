@@ -24,7 +24,9 @@ _NOISE = 1.5
 """Grey levels of the sensor's noise."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
-_SKY_STEPS = 4
+SKY_STEPS, _SKY_WIDTH = 4, 0.03
+"""The object hides the sky from the table beside it: standard deviation of that as a share of the picture's side."""
+
 _TABLE_GLOSS = 0.03
 _TABLE_PX_PER_MM = 0.8
 _TABLE_PX = (400, 560)
@@ -159,7 +161,8 @@ def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = 
     normals = np.tile([0.0, 0.0, 1.0], (px * px, 1))
     normals[view.is_object] = _object_normals(view)
     seen = _lamp_seen(view, normals, light) if shadow else np.ones(px * px, np.float32)
-    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, _hidden_sky(view), _colour(view, lighting))
+    hidden = hidden_sky(view.is_object.reshape(px, px))
+    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), _colour(view, lighting))
     linear = radiance(surfaces, _lamps(lighting, view.obj.material))
     linear = cv2.GaussianBlur(linear.reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
     noise = np.random.default_rng([72, noise_seed]).normal(0.0, _NOISE, linear.shape)
@@ -192,15 +195,17 @@ def _lamp_seen(view: CameraView, normals: Array, light: Array) -> Floats:
     return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
 
 
-def _hidden_sky(view: CameraView) -> Floats:
-    """0..1: how much of the sky the object hides from the table beside it, on a grid finer than the blur."""
-    px, width = view.camera.px, 0.03 * view.camera.px
-    coarse = max(1, round(px * _SKY_STEPS / width))
-    shares = cv2.resize(
-        view.is_object.reshape(px, px).astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA
-    )
+def hidden_sky(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
+    """0..1, (px, px): how much of the sky the object hides from the table beside it.
+
+    It is the object's mask (px, px), blurred on a grid of `steps` points over the blur's width.
+    """
+    px = len(is_object)
+    width = _SKY_WIDTH * px
+    coarse = min(px, max(1, round(px * steps / width)))
+    shares = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(shares, (0, 0), width * coarse / px)
-    return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC)).ravel()
+    return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))
 
 
 def _colour(view: CameraView, lighting: Lighting) -> Floats:

@@ -22,13 +22,16 @@ APPROXIMATIONS = {
     "grasps": "retrieval.lab.frontier.grasps:grasps",
     "cca_solver": "retrieval.lab.frontier.correlation:cca_solver",
     "cca_components": "retrieval.lab.frontier.correlation:cca_components",
+    "rays": "retrieval.lab.frontier.simulation:rays",
+    "hidden_sky": "retrieval.lab.frontier.simulation:sky",
     "contact": "retrieval.lab.frontier.contact:contact",
+    "contact_products": "retrieval.lab.frontier.simulation:contact_products",
     "closing": "retrieval.lab.frontier.contact:closing",
     "gel_optics": "retrieval.lab.frontier.optics:gel_optics",
 }
 """Name -> the function that measures it, imported when it is used."""
 
-NEED_NOTHING = frozenset({"cca_solver", "contact", "closing", "gel_optics"})
+NEED_NOTHING = frozenset({"cca_solver", "rays", "hidden_sky", "contact", "contact_products", "closing", "gel_optics"})
 """Measured without a model and without a recording."""
 
 
