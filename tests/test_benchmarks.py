@@ -23,6 +23,7 @@ from tests.benchmarks import (
     peers,
     query,
     rerank,
+    simulation,
     step,
 )
 from tests.conftest import TINY
@@ -85,6 +86,14 @@ def test_every_engine_is_asked_at_the_least_width_that_finds_enough():
     width_of = peers.Built(lambda query, width: np.arange(width), (1, 10, 20))
     vectors = np.eye(30, peers.DIM, dtype=np.float32)
     assert peers.least_width(width_of, vectors, vectors[:1]) == 10
+
+
+@pytest.mark.slow
+def test_the_parts_of_a_simulated_grasp_are_timed_beside_another_checkout():
+    made = simulation.beside({"ours": simulation.ROOT, "before": simulation.ROOT}, rounds=1, objects=1, grasps=1)
+    assert set(made["ours"]) == set(made["before"]) >= {"photo of 256 px", "two contacts", "attempt with its files"}
+    said = [simulation.line(part, ours, made["before"][part]) for part, ours in made["ours"].items()]
+    assert all(" ms, " in each and " times (" in each for each in said)
 
 
 OF_DEVICES = {

@@ -95,7 +95,7 @@ def sky(sample: Sample) -> Row:
     """The grid on which the sky is blurred that an object hides from the table."""
     text = (
         "Beside an object the table sees less of the sky: the object's mask, blurred, on a coarse grid of so many "
-        "points over the blur's width, in a photo of 512 px. The error is that of the table's light where it is largest."
+        "points over the blur's width, in a photo of 512 px. The error is the largest of the table's light."
     )
     return Row("Sky that an object hides: grid", text, (sky_panel(sample.scale.repeats),))
 
