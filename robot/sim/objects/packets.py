@@ -12,7 +12,7 @@ from robot.sim.compiled import compiled
 Floats = NDArray[np.float32]
 Vectors = NDArray[np.float64]
 
-LANES = 64
+LANES = 256
 """Points in a packet."""
 
 MOST_STEPS = 600
