@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from importlib.util import find_spec
@@ -26,6 +27,7 @@ from retrieval.search.build_cluster import build_cluster
 from retrieval.search.opening import stored_for
 from retrieval.search.searcher import Searcher
 from tests import on_ray, serving, synthetic
+from tests.waiting import first_line, running
 
 pytestmark = [
     pytest.mark.slow,
@@ -126,6 +128,36 @@ def test_one_that_ends_leaves_the_shards_of_another(ray, cluster, held, grasps):
         time.sleep(0.1)
     assert len(before) == 8
     assert len(ray.serve.status().applications) == 4
+    assert held.query(grasps[0]).index["searched"] == 1.0
+
+
+HOLDING = """
+import sys, time
+from retrieval.cluster.serving import Deployments, Held
+from retrieval.cluster.session import connected
+from retrieval.search.searcher import Searcher
+with connected() as ray:
+    searcher = Searcher.open(sys.argv[1], shards=Deployments(ray, Held(cpus=0.1)).open)
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_shards_of_a_process_that_was_killed_are_deleted_by_the_next(ray, cluster, held, grasps, monkeypatch):
+    before = set(ray.serve.status().applications)
+    monkeypatch.setenv("RAY_ADDRESS", ray.get_runtime_context().gcs_address)
+    with running([sys.executable, "-W", "ignore", "-c", HOLDING, str(cluster)]) as process:
+        assert first_line(process, 240) == "held\n"
+        left = set(ray.serve.status().applications) - before
+        process.kill()
+        process.wait(60)
+    assert len(left) == 4
+    until = time.monotonic() + 120  # until Ray has noticed
+    while left & set(ray.serve.status().applications) and time.monotonic() < until:
+        deployments(ray).close()
+        time.sleep(0.5)
+    assert not left & set(ray.serve.status().applications)
+    assert before <= set(ray.serve.status().applications)
     assert held.query(grasps[0]).index["searched"] == 1.0
 
 

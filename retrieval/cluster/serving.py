@@ -7,6 +7,7 @@ A shard that does not answer in time is left out. The answer then says which sha
 its objects keep the probability that they had, on average; where more of the catalogue was asked for, there is none.
 """
 
+import re
 import secrets
 import threading
 import time
@@ -20,6 +21,7 @@ from typing import Any, TypeVar
 from indexes.errors import IndexesError
 from indexes.store.cluster import ClusterManifest, ShardEntry, open_shard
 from indexes.store.generation import require_made_by
+from retrieval.console.output import say
 from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError, Unanswered
 from retrieval.model.posterior import Posterior
@@ -29,6 +31,8 @@ from retrieval.search.opening import described_cluster, folder_shard
 from retrieval.search.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
 
 T = TypeVar("T")
+HOLDERS = "touch-retrieval"
+APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
 AGAIN_S, AT_HAND_S = 0.05, 0.005
 """Before a shard whose replica was lost is asked again; to take an answer that is there."""
 
@@ -57,6 +61,10 @@ class Held:
             raise BadInput(f"the least share must lie above 0 and be 1 at most; got {self.least_share}")
         if not self.wait_s > 0:
             raise BadInput(f"the wait for a shard must be above 0 seconds; got {self.wait_s}")
+
+
+class Holder:
+    """Says by being there that a process holds shards."""
 
 
 class ShardReplica:
@@ -173,14 +181,18 @@ class Deployments:
     """The shards that Ray Serve holds for this process, by the digest of what they hold.
 
     Their names are this object's own: whoever else holds the same shards on the same Ray keeps its own when this ends.
+    An actor of this process, which Ray ends with it however it ends, says that they are held: those of a process that
+    was killed are deleted by the next.
     """
 
     def __init__(self, ray: Any, held: Held, verify: bool = True) -> None:
         self._ray, self._held, self._verify = ray, held, verify
         self._own = secrets.token_hex(4)
+        self._holder = ray.remote(num_cpus=0)(Holder).options(name=self._own, namespace=HOLDERS).remote()
         self._users: Counter[str] = Counter()
         self._lock = threading.Lock()
         ray.serve.start(proxy_location="Disabled")
+        self._delete_of_killed()
 
     def open(self, cluster: str | Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
         """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
@@ -198,6 +210,13 @@ class Deployments:
     def close(self) -> None:
         """End all that was opened."""
         self._let_go(list(self._users.elements()))
+
+    def _delete_of_killed(self) -> None:
+        held = {one["name"] for one in self._ray.util.list_named_actors(all_namespaces=True)}
+        for name in self._ray.serve.status().applications:
+            made = APPLICATION.fullmatch(name)
+            if made and made[1] not in held:
+                self._ray.serve.delete(name, _blocking=False)
 
     def _deploy(
         self,
@@ -238,6 +257,9 @@ class Deployments:
             for entry in wanted
         ]
         if targets:
+            needed, free = held.cpus * held.replicas * len(targets), self._ray.available_resources().get("CPU", 0.0)
+            if needed > free:
+                say(f"{len(targets)} shards take {needed:g} processors, and Ray has {free:g} free: they wait for more")
             try:
                 serve.run_many(targets)
             except RuntimeError as error:
