@@ -230,6 +230,7 @@ def _operating_point(
     """
     queries, halves, points = crowd.embeddings(touches, "touch"), made.arrays["halves"], []
     timed, built = range(min(TIMED, len(touches))), made.index
+    needed = _needed(made, queries, winners)
     for index in built.along_ladder():
         made.index = index
         k = _candidates(made, queries[:asked], winners[:asked])
@@ -245,6 +246,8 @@ def _operating_point(
         point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
         points.append((float(held[:asked].mean()), point))
     made.index = built
+    for _, point in points:
+        point["needed"] = needed
     good = [point for chosen, point in points if chosen >= TARGET]
     if good:
         return min(good, key=lambda point: point["search_s"] + point["rerank_s"])
@@ -252,13 +255,17 @@ def _operating_point(
 
 
 def _candidates(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
-    """`MARGIN` times the least number of candidates that hold the target share of winners, as far as the index names
-    them at all."""
+    """`MARGIN` times as many as these touches need."""
+    return min(MARGIN * _needed(made, queries, winners), MOST_CANDIDATES, made.count)
+
+
+def _needed(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
+    """The least number of candidates that hold the target share of winners, as far as the index names them at all."""
     most = min(MOST_CANDIDATES, made.count)
     found = (made.search(query[None], most)[0][0] for query in queries)
     places = [np.flatnonzero(rows == winner) for rows, winner in zip(found, winners, strict=True)]
     needed = np.sort([int(place[0]) + 1 if len(place) else most for place in places])
-    return min(MARGIN * int(needed[int(np.ceil(TARGET * len(needed))) - 1]), most)
+    return int(needed[int(np.ceil(TARGET * len(needed))) - 1])
 
 
 def _growth(crowd: Crowd, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
@@ -320,8 +327,8 @@ def lines(size: Size) -> Iterator[str]:
         times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
         yield (
             f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than judging all, winner found {p['recall']:.1%} "
-            f"({p['low']:.1%} to {p['high']:.1%}) among {p['k']}; search {times['search_s']}, "
-            f"rerank {times['rerank_s']}; structure made in {times['structure_s']}, {p['structure_mb']:.0f} of "
+            f"({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} hold 99 % of all); "
+            f"search {times['search_s']}, rerank {times['rerank_s']}; structure made in {times['structure_s']}, {p['structure_mb']:.0f} of "
             f"{p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, opened in {times['open_s']}; "
             f"{ADDED} more in {times['add_s']}"
         )
@@ -333,7 +340,7 @@ def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
     for size in sizes:
         flat = size.figures | {f"{kind} {name}": value for kind, p in size.kinds.items() for name, value in p.items()}
         for name, value in flat.items():
-            if name.endswith(("_s", "_mb", " k")) and size.photos >= 10_000 and value > 0:
+            if name.endswith(("_s", "_mb", " k", " needed")) and size.photos >= 10_000 and value > 0:
                 tables.setdefault(name, []).append((size.photos, value))
     for name, table in tables.items():
         if len(table) > 1:
