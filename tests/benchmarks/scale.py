@@ -328,8 +328,9 @@ def lines(size: Size) -> Iterator[str]:
         yield (
             f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than judging all, winner found {p['recall']:.1%} "
             f"({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} hold 99 % of all); "
-            f"search {times['search_s']}, rerank {times['rerank_s']}; structure made in {times['structure_s']}, {p['structure_mb']:.0f} of "
-            f"{p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, opened in {times['open_s']}; "
+            f"search {times['search_s']}, rerank {times['rerank_s']}; structure made in {times['structure_s']}, "
+            f"{p['structure_mb']:.0f} of {p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, "
+            f"opened in {times['open_s']}; "
             f"{ADDED} more in {times['add_s']}"
         )
 
