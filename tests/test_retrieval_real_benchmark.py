@@ -100,6 +100,26 @@ def test_the_report_says_the_verdict_in_words_and_shows_tables_and_queries(out, 
         assert f"figures/{name}" in text
 
 
+def test_a_catalogue_of_reference_touches_is_asked_blurred_on_both_sides_and_its_clock_knows_all(data, out, tmp_path):
+    again = tmp_path / "again"
+    shutil.copytree(out, again)
+    assert benchmark(data, again, "--protocols", "vt60-references,vt60-references-photos", "--seeds", "1") == 0
+    for entry in json.loads((again / "results.json").read_text())["protocols"].values():
+        assert set(entry["rows"]) == {"cca_pca", "chance"}
+        assert entry["rows"]["cca_pca"]["blurred"]
+        assert entry["controls"]["background"]["why_not"] == "an object is shown by touches"
+        assert entry["controls"]["order"]["measures"]["guesses_k9"]["value"][0] > 0.5
+    assert "reference touch of each object" in (again / "report.md").read_text()
+
+
+def test_methods_that_are_heads_for_photos_cannot_ask_reference_touches(data, tmp_path, capsys):
+    asked = ["--protocols", "vt60-references", "--methods", "late_fusion"]
+    assert benchmark(data, tmp_path / "out", *asked) == 2
+    assert (
+        "vt60-references shows objects by touches, which these methods can take: cca_towers" in capsys.readouterr().err
+    )
+
+
 def test_what_is_made_is_not_made_again_and_comes_out_the_same_to_the_byte(data, out, tmp_path, monkeypatch):
     again = tmp_path / "again"
     shutil.copytree(out, again)
@@ -213,8 +233,9 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
     assert entries["feeling-of-success"]["controls"]["untouched"]["measures"]
     assert "pair_accuracy" in entries["feeling-of-success"]["rows"]["cca_pca"]["measures"]
     assert any("64.3" in anchor for anchor in entries["feeling-of-success"]["anchors"])
-    for entry in entries.values():
-        assert set(entry["rows"]) == set(methods.split(","))
+    for name, entry in entries.items():
+        heads = set() if "references" in name else {"late_fusion", "set_fusion"}
+        assert set(entry["rows"]) == {"cca_towers", "cca_pca", "chance"} | heads
 
 
 @pytest.mark.slow

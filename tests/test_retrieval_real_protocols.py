@@ -11,6 +11,7 @@ from retrieval.errors import ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS, load_protocol
 from retrieval.evaluation.real.controls import by_clock, clock, why_not_untouched
 from retrieval.evaluation.real.protocol import Facts
+from retrieval.evaluation.real.references import ASKED, references_of, shown_by_references, with_references
 from retrieval.evaluation.real.verdict import verdict
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features
@@ -40,6 +41,9 @@ MADE = {
     "vt60-seen-classes": vt60(),
     "vt60-random": vt60(),
     "vt60-classes": vt60(),
+    "vt60-references": vt60(),
+    "vt60-references-random": vt60(),
+    "vt60-references-photos": vt60(),
     "billets-unseen": billets(),
     "billets-places": billets(),
     "objectfolder": facts(
@@ -148,6 +152,64 @@ def test_objectfolder_takes_the_published_split_and_asks_for_it_where_there_is_n
 def test_an_unknown_protocol_lists_the_known_ones():
     with pytest.raises(ConfigError, match=r"vt60-seen-classes, .*; got 'ycb'"):
         load_protocol("ycb")
+
+
+# Reference touches -----------------------------------------------------------------------------------
+
+
+def touched(counts):
+    return [
+        Grasp(f"{name}-{turn}", name, name, Path(f"{name}-photo-{turn}"), (Path(f"{name}-gel-{turn}"),), ())
+        for turn in range(max(counts.values()))
+        for name, count in counts.items()
+        if turn < count
+    ]
+
+
+def test_the_first_quarter_of_an_objects_touches_are_references_and_the_last_half_asks():
+    found = references_of(touched({"mug": 8, "tin": 5}))
+    assert {asked: reference.grasp_id for asked, reference in found.items()} == {
+        "mug-4": "mug-0",
+        "mug-5": "mug-1",
+        "mug-6": "mug-0",
+        "mug-7": "mug-1",
+        "tin-2": "tin-0",
+        "tin-3": "tin-0",
+        "tin-4": "tin-0",
+    }
+    shown = with_references(touched({"mug": 8}))
+    assert [(one.grasp_id, one.photo.name) for one in shown][:2] == [("mug-4", "mug-gel-0"), ("mug-5", "mug-gel-1")]
+
+
+def test_of_many_touches_some_ask_evenly_spaced_from_the_first_to_the_last():
+    found = list(references_of(touched({"mug": 400})))
+    assert len(found) == ASKED
+    assert (found[0], found[-1]) == ("mug-200", "mug-399")
+
+
+def test_an_object_of_three_touches_has_no_references():
+    with pytest.raises(DatasetError, match="four touches of it; tin has 3"):
+        references_of(touched({"mug": 8, "tin": 3}))
+
+
+def test_entries_are_the_references_own_features_and_never_those_of_the_query():
+    grasps = touched({"mug": 8, "tin": 4})
+    rows = np.arange(len(grasps), dtype=np.float32)
+    features = Features(
+        tuple(one.grasp_id for one in grasps),
+        tuple(one.object_id for one in grasps),
+        rows[:, None, None].repeat(2, 2),
+        -rows[:, None],
+    )
+    row_of = {name: row for row, name in enumerate(features.grasp_ids)}
+    references = references_of(grasps)
+    touches, both = (shown_by_references(features, references, entry) for entry in ("reference", "both"))
+    assert touches.grasp_ids == both.grasp_ids == tuple(references)
+    for row, name in enumerate(touches.grasp_ids):
+        reference = row_of[references[name].grasp_id]
+        assert touches.touch[row].tolist() == [[row_of[name]] * 2]
+        assert touches.photo[row].tolist() == [reference] * 2
+        assert both.photo[row].tolist() == [-reference, reference, reference]
 
 
 # Controls and verdicts -------------------------------------------------------------------------------

@@ -155,16 +155,18 @@ def _rows(features: "Features") -> Rows:
 
 
 def blocks_of(config: Config, features: "Features") -> Blocks:
-    """Of features of the towers of `config`. Raises BadInput for features of others."""
+    """Of features of the towers of `config`; in place of photos there may be touches, or touches beside them. Raises
+    BadInput for features of others."""
     import torch
 
     with torch.device("meta"):
         widths = widths_of(build_tower(config.matcher.tower, config.matcher.tower_output))
-    blocks = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
-    wanted, got = (sum(blocks[0]), sum(blocks[1])), (_rows(features).shape[1], features.photo.shape[1])
-    if wanted != got:
+    felt, seen = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
+    wanted, got = (sum(felt), sum(seen)), (_rows(features).shape[1], features.photo.shape[1])
+    shown = {sum(blocks): blocks for blocks in (seen + felt, felt, seen)}
+    if wanted[0] != got[0] or got[1] not in shown:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
             f"{wanted[0]} of a touch and {wanted[1]} of a photo; got {got[0]} and {got[1]}; encode with these"
         )
-    return blocks
+    return felt, shown[got[1]]

@@ -30,7 +30,7 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
     figure, panel = _sheet(columns, 1.4 * len(queries) - 0.1)
     for column in range(fingers):
         panel.text(column + 0.46, -0.12, f"finger {ascii_lowercase[column]}", ha="center", fontsize=8)
-    panel.text(fingers + 0.35, -0.12, "photos, most likely first", fontsize=8)
+    panel.text(fingers + 0.35, -0.12, "of the catalogue, most likely first", fontsize=8)
     for row, query in enumerate(queries):
         top, own = 1.4 * row, grasps.get(query["grasp_id"])
         for column in range(fingers):

@@ -8,9 +8,11 @@ from typing import Any
 from indexes.store.regular import read_json
 from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.console.output import show
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
+from retrieval.evaluation.real.protocol import PHOTO
+from retrieval.evaluation.real.references import with_references
 from retrieval.evaluation.real.verdict import RULE
 from retrieval.report import galleries
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
@@ -62,7 +64,7 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     sections = []
     for name, entry in entries.items():
         recording = recordings.get(entry["recording"]["data_set"])
-        grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}
+        grasps = {grasp.grasp_id: grasp for grasp in _grasps(recording, entry["entry"])} if recording else {}
         sections.append(Section(entry["title"], tuple(_section(name, entry, grasps, out, figures))))
     lead: tuple[Block, ...] = (
         Text(RULE),
@@ -75,6 +77,12 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
     write_output(page, text_bytes(to_html(document, out)), PAGE)
     return [text, page, *figures]
+
+
+def _grasps(recording: Path, entry: str) -> list[Grasp]:
+    """Those that a protocol asked, with what showed their objects."""
+    grasps = load_grasps(recording)
+    return grasps if entry == PHOTO else with_references(grasps)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -132,11 +140,12 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
             file = f"{file_name(name)}-{kind}.jpg"
             figures.append(out / "figures" / file)
             draw(figures[-1], galleries.examples, queries, grasps)
+            entries = "photo" if entry["entry"] == PHOTO else "reference touch"
             yield Picture(
                 f"figures/{file}",
                 f"{kind.capitalize()} queries: {', '.join(one['object_id'] for one in queries)}.",
                 f"The {kind} queries of {method_label(entry['examples']['row'])}, first seed: the touch, then the best "
-                "photo of each object, most likely first; the true object framed green.",
+                f"{entries} of each object, most likely first; the true object framed green.",
             )
 
 

@@ -12,6 +12,8 @@ from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.metrics.registry import METRICS, Metric, guesses
 
+PHOTO, REFERENCE, BOTH = "photo", "reference", "both"
+"""What an entry of the catalogue shows: a photo, a reference touch, or the one with the other."""
 CHOOSING = 5
 """Objects, of those that do not test, by which methods choose their settings."""
 
@@ -66,7 +68,8 @@ class Protocol:
     whether a result counts as touch. own_photos: a touch may be shown the photo of its own grasp (its data set pairs
     them by lot, or has one photo of an object). by_sequence: a gallery holds the objects of one sequence, and sequences
     are what intervals resample. counted: a measure of right and wrong answers alone, which are counted too, with an
-    exact binomial interval. anchors: what others reached, a sentence each.
+    exact binomial interval. anchors: what others reached, a sentence each. entry: what an object's entries in the
+    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.references`).
     """
 
     data_set: str
@@ -78,6 +81,7 @@ class Protocol:
     by_sequence: bool = False
     counted: str | None = None
     anchors: tuple[str, ...] = ()
+    entry: str = PHOTO
 
     @property
     def main(self) -> str:
@@ -113,12 +117,13 @@ def registered(*names: str) -> dict[str, Metric]:
     return {name: METRICS[name] for name in names}
 
 
-def first_guess(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
-    """The first guess among k objects, after so many touches, each object shown by so many photos."""
+def first_guess(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "photos") -> dict[str, Metric]:
+    """The first guess among k objects, after so many touches, each object shown by so many photos, or what `entries`
+    calls them."""
     name = f"guesses_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
     label = f"first guess of {k}"
     label += f", {grasps} touches" if grasps > 1 else ""
-    label += f", {photos} photos" if photos > 1 else ""
+    label += f", {photos} {entries}" if photos > 1 else ""
     return {
         name: Metric(
             label,

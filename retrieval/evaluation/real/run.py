@@ -5,19 +5,21 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from indexes.store.files import write_atomically
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Split, data_digest
+from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.real import SCHEMA_VERSION, load_protocol
 from retrieval.evaluation.real.controls import CONTROL_METHOD, CONTROLS, by_clock, why_not_untouched
 from retrieval.evaluation.real.measuring import Measured, Units, digest, joined, measure, read_measured, write_measured
-from retrieval.evaluation.real.protocol import Facts, Protocol, read_facts
+from retrieval.evaluation.real.protocol import PHOTO, Facts, Protocol, read_facts
+from retrieval.evaluation.real.references import FITTED, referenced, references_of, shown_by_references
 from retrieval.evaluation.real.towers import Row, Towers
 from retrieval.evaluation.real.verdict import control_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
@@ -95,7 +97,8 @@ def benchmark(
             of = protocol.data_set
             if of not in rows:
                 rows[of] = _rows(facts[of], config, methods, models, cache / "features", quiet)
-            tables[name] = _Asked(name, protocol, facts[of], rows[of], list(range(seeds)), cache, quiet).entry()
+            taken = _taken(name, protocol, rows[of])
+            tables[name] = _Asked(name, protocol, facts[of], taken, list(range(seeds)), cache, quiet).entry()
     except Interrupted as error:
         raise Interrupted(f"stopped; what was made is kept in {cache}, and the same command goes on with it") from error
     results = {
@@ -127,17 +130,42 @@ def _rows(
     return rows
 
 
+def _taken(name: str, protocol: Protocol, rows: list[Row]) -> list[Row]:
+    """The rows that a protocol can ask. Raises BadInput where that is none."""
+    if protocol.entry == PHOTO:
+        return rows
+    taken = [row for row in rows if row.method in FITTED]
+    if not taken:
+        raise BadInput(f"{name} shows objects by touches, which these methods can take: {', '.join(FITTED)}")
+    return taken
+
+
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """One protocol on one recording."""
+    """One protocol on one recording. all_facts: of the recording, also the grasps that the protocol does not ask."""
 
     name: str
     protocol: Protocol
-    facts: Facts
+    all_facts: Facts
     rows: list[Row]
     seeds: list[int]
     cache: Path
     quiet: bool
+
+    @cached_property
+    def facts(self) -> Facts:
+        """Of the grasps that ask."""
+        return self.all_facts if self.protocol.entry == PHOTO else referenced(self.all_facts)
+
+    @cached_property
+    def _references(self) -> dict[str, Grasp]:
+        return references_of(self.all_facts.grasps)
+
+    def _features(self, line: Line) -> Features:
+        features = line.features()
+        if self.protocol.entry == PHOTO:
+            return features
+        return shown_by_references(features, self._references, self.protocol.entry)
 
     def entry(self) -> dict[str, Any]:
         """The protocol's entry of results.json."""
@@ -159,6 +187,7 @@ class _Asked:
             "anchors": list(self.protocol.anchors),
             "main": self.protocol.main,
             "labels": [[name, metric.label] for name, metric in self.protocol.measures.items()],
+            "entry": self.protocol.entry,
             "unit": "sequence" if self.protocol.by_sequence else "object",
             "recording": {
                 "data_set": self.protocol.data_set,
@@ -186,6 +215,8 @@ class _Asked:
         return self.rows[0].towers
 
     def _why_not(self, kind: str) -> str | None:
+        if kind == "background" and self.protocol.entry != PHOTO:
+            return "an object is shown by touches"
         return why_not_untouched(self.facts.grasps) if kind == "untouched" else None
 
     def _row(self, row: Row, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
@@ -222,7 +253,7 @@ class _Asked:
         """Of one line in one fold: what is kept, else fitted and asked, and then kept. Scores are not kept: those of
         all folds fill gigabytes."""
         self._require_unseen(line, split)
-        features, towers = line.features(), line.row.towers
+        features, towers = self._features(line), line.row.towers
         made_by = digest(
             {
                 "protocol": self.name,

@@ -7,7 +7,7 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import Facts, Protocol, first_guess, folds, registered
+from retrieval.evaluation.real.protocol import BOTH, REFERENCE, Facts, Protocol, first_guess, folds, registered
 
 LEFT_OUT = "bottlefull"
 GALLERY = 9
@@ -19,6 +19,16 @@ _MEASURES = {
     **registered("pair_auc"),
 }
 _SHARED = "08_bottlefull is left out, which is 02_bottleempty filled. Five of the other objects choose settings."
+_OF_REFERENCES = {
+    **first_guess(GALLERY),
+    **first_guess(GALLERY, photos=3, entries="references"),
+    **first_guess(GALLERY, grasps=5, photos=3, entries="references"),
+    **registered("pair_auc"),
+}
+_PARTED = (
+    "Of each object the first quarter of its touches are references, the last half asks. References and queries are of "
+    "one sitting and one finger, so that the control of the order knows all: only what the blur loses is touch."
+)
 
 
 def by_class(facts: Facts) -> dict[str, list[str]]:
@@ -84,4 +94,31 @@ CLASSES = Protocol(
     _classes,
     _MEASURES,
     own_photos=True,
+)
+REFERENCE_SEEN_CLASSES = Protocol(
+    "vt60",
+    "VT60, reference touches: an unseen instance of each seen class",
+    f"As vt60-seen-classes, the catalogue holding touches in place of photos. {_PARTED} {_SHARED}",
+    _seen_classes,
+    _OF_REFERENCES,
+    own_photos=True,
+    entry=REFERENCE,
+)
+REFERENCE_RANDOM = Protocol(
+    "vt60",
+    "VT60, reference touches: nine random unseen objects",
+    f"As vt60-random, the catalogue holding touches in place of photos. {_PARTED} {_SHARED}",
+    _random,
+    _OF_REFERENCES,
+    own_photos=True,
+    entry=REFERENCE,
+)
+REFERENCE_AND_PHOTO = Protocol(
+    "vt60",
+    "VT60, reference touches with photos: an unseen instance of each seen class",
+    f"As vt60-seen-classes, the catalogue holding a touch with each photo. {_PARTED} {_SHARED}",
+    _seen_classes,
+    _OF_REFERENCES,
+    own_photos=True,
+    entry=BOTH,
 )
