@@ -1,5 +1,6 @@
 """What every method owes the harness: one behaviour suite over the table of methods."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +10,7 @@ from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.cca_towers import blocks_of, fit_codes
-from retrieval.methods.selection import Validator, judged_rows, ranking_auc
+from retrieval.methods.selection import Validator, judged_rows, neighbours, ranking_auc
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training.features import Features
@@ -273,6 +274,33 @@ def test_once_its_ridge_is_chosen_towers_side_by_side_are_fitted_on_validation_o
     codes_of = dict(fit_codes(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, ridges=(ridge,)))
     wanted = codes_of[ridge].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
     np.testing.assert_array_equal(method.score(*codes(method)), wanted)
+
+
+def with_references(features):
+    """Each photo with the touch of the next grasp of its object behind it."""
+    beside = neighbours(features.owner, 2)[:, 1]
+    touches = features.touch[beside].reshape(len(features), -1)
+    return replace(features, photo=np.concatenate([features.photo, touches], axis=1))
+
+
+def test_a_reference_touch_behind_a_photo_is_encoded_as_a_touch_and_weighed_by_validation_objects():
+    train, validation, test = (with_references(part) for part in (TRAIN, VALIDATION, TEST))
+    method = build_method("cca_towers", Setting(CONFIG))
+    method.fit(train, validation)
+    alone = fitted("cca_towers")
+    assert method.chosen["ridge"] == alone.chosen["ridge"]
+    weights = method.chosen["photo_weight"], method.chosen["reference_weight"]
+    assert min(weights) >= 0 < max(weights)
+    felt = alone.encode_touch(test.touch)
+    references = alone.encode_touch(test.photo[:, TEST.photo.shape[1] :].reshape(test.touch.shape))
+    wanted = weights[0] * alone.score(*codes(alone)) + weights[1] * (felt @ references.T)
+    found = method.score(method.encode_touch(test.touch), method.encode_photo(test.photo))
+    np.testing.assert_allclose(found, wanted, atol=1e-4)  # float32 sums of some hundred terms
+
+
+def test_touches_in_place_of_photos_are_taken_too():
+    touches = replace(TRAIN, photo=TRAIN.touch.reshape(len(TRAIN), -1))
+    assert blocks_of(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES])
 
 
 def test_towers_side_by_side_take_features_of_their_own_alone():

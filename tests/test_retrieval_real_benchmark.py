@@ -116,7 +116,8 @@ def test_methods_that_are_heads_for_photos_cannot_ask_reference_touches(data, tm
     asked = ["--protocols", "vt60-references", "--methods", "late_fusion"]
     assert benchmark(data, tmp_path / "out", *asked) == 2
     assert (
-        "vt60-references shows objects by touches, which these methods can take: cca_towers" in capsys.readouterr().err
+        "vt60-references: it shows objects by touches, which of the methods only cca_towers, "
+        in capsys.readouterr().err
     )
 
 

@@ -125,26 +125,42 @@ def fit_codes(
 
 
 class CcaTowers(Method):
-    """Cosine of such codes; the ridge by ranking on validation objects."""
+    """Cosine of such codes; the ridge by ranking on validation objects.
+
+    Where features of a reference touch stand behind those of each photo, the catalogue's entry is both: the touch's
+    cosine with the photo and its cosine with the reference, which is a touch and encoded as one, are weighed as the
+    log-odds of one object say on validation objects.
+    """
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = blocks_of(self.setting.config, train)
+        self._width = sum(blocks[1])
         judged = Validator.of(validation)
         shown = judged.features
-        fits = dict(fit_codes(_rows(train), train.photo, train.owner, blocks))
-        aucs = {ridge: judged.touches(codes.cosines(_rows(shown), shown.photo)) for ridge, codes in fits.items()}
+        fits = dict(fit_codes(_rows(train), train.photo[:, : self._width], train.owner, blocks))
+        photo = shown.photo[:, : self._width]
+        aucs = {ridge: judged.touches(codes.cosines(_rows(shown), photo)) for ridge, codes in fits.items()}
         best = max(aucs, key=lambda ridge: (aucs[ridge], ridge))
+        self.chosen = {"ridge": best, "validation_auc": aucs[best]}
+        self._weights: list[float] | None = None
+        if self._width < train.photo.shape[1]:
+            self._weights = _weights(fits[best], shown, self._width)
+            self.chosen |= dict(zip(("photo_weight", "reference_weight"), self._weights, strict=True))
         if self.setting.all_teach:
             known = train.joined(validation)
-            fits = dict(fit_codes(_rows(known), known.photo, known.owner, blocks, ridges=(best,)))
+            fits = dict(fit_codes(_rows(known), known.photo[:, : self._width], known.owner, blocks, ridges=(best,)))
         self._codes = fits[best]
-        self.chosen = {"ridge": best, "validation_auc": aucs[best]}
 
     def _encode_touch(self, touch: Array) -> Array:
-        return unit_rows(self._codes.touch(touch.reshape(len(touch), -1)))
+        code = unit_rows(self._codes.touch(touch.reshape(len(touch), -1)))
+        return code if self._weights is None else np.tile(code, 2)
 
     def _encode_photo(self, photo: Array) -> Array:
-        return unit_rows(self._codes.photo(photo))
+        code = unit_rows(self._codes.photo(photo[:, : self._width]))
+        if self._weights is None:
+            return code
+        reference = unit_rows(self._codes.touch(photo[:, self._width :]))
+        return np.concatenate([weight * one for weight, one in zip(self._weights, (code, reference), strict=True)], 1)
 
     def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
         return cosine(touch_codes, photo_codes)
@@ -154,16 +170,29 @@ def _rows(features: "Features") -> Rows:
     return features.touch.reshape(len(features), -1)
 
 
+def _weights(codes: Codes, shown: "Features", width: int) -> list[float]:
+    """Of the cosine with a photo and of that with a reference touch, in log-odds: logistic regression over all pairs of
+    a touch and an entry, pairs of one object weighing as much as the others; evidence never counts against itself."""
+    from sklearn.linear_model import LogisticRegression  # slow to import
+
+    touch, entries = _rows(shown), shown.photo
+    felt = unit_rows(codes.touch(touch))
+    cosines = codes.cosines(touch, entries[:, :width]), felt @ unit_rows(codes.touch(entries[:, width:])).T
+    same = shown.owner[:, None] == shown.owner
+    found = LogisticRegression(C=1e4, class_weight="balanced").fit(np.stack(cosines, -1).reshape(-1, 2), same.ravel())
+    return [max(0.0, float(weight)) for weight in found.coef_[0]]
+
+
 def blocks_of(config: Config, features: "Features") -> Blocks:
-    """Of features of the towers of `config`; in place of photos there may be touches, or touches beside them. Raises
-    BadInput for features of others."""
+    """Of features of the towers of `config`, a reference touch behind a photo not counted; touches alone may stand in
+    place of photos. Raises BadInput for features of others."""
     import torch
 
     with torch.device("meta"):
         widths = widths_of(build_tower(config.matcher.tower, config.matcher.tower_output))
     felt, seen = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
     wanted, got = (sum(felt), sum(seen)), (_rows(features).shape[1], features.photo.shape[1])
-    shown = {sum(blocks): blocks for blocks in (seen + felt, felt, seen)}
+    shown = {sum(seen) + sum(felt): seen, sum(felt): felt, sum(seen): seen}
     if wanted[0] != got[0] or got[1] not in shown:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "

@@ -2,7 +2,8 @@
 
 An object's touches are taken in the order of capture: its first quarter are references, its last half asks, what lies
 between is left out, so that no query is the neighbour of a reference. A catalogue's entry is a reference touch, or that
-touch with its grasp's photo.
+touch with its grasp's photo. With photos `cca_towers` weighs both by what validation objects say; alone they are
+matched with touches as photos otherwise are, so that no photo is needed to learn from.
 """
 
 import dataclasses

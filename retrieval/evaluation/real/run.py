@@ -90,6 +90,7 @@ def benchmark(
         raise BadInput("give one method or model and one seed at least")
     facts = {name: read_facts(folder) for name, folder in recordings.items()}
     tables: dict[str, Any] = {}
+    left_out = dict(skipped)
     rows: dict[str, list[Row]] = {}
     try:
         for name in protocols:
@@ -97,10 +98,15 @@ def benchmark(
             of = protocol.data_set
             if of not in rows:
                 rows[of] = _rows(facts[of], config, methods, models, cache / "features", quiet)
-            taken = _taken(name, protocol, rows[of])
+            taken = [row for row in rows[of] if protocol.entry == PHOTO or row.method in FITTED]
+            if not taken:
+                left_out[name] = f"it shows objects by touches, which of the methods only {', '.join(FITTED)} can take"
+                continue
             tables[name] = _Asked(name, protocol, facts[of], taken, list(range(seeds)), cache, quiet).entry()
     except Interrupted as error:
         raise Interrupted(f"stopped; what was made is kept in {cache}, and the same command goes on with it") from error
+    if not tables:
+        raise BadInput(f"no protocol could be asked; {'; '.join(f'{name}: {why}' for name, why in left_out.items())}")
     results = {
         "schema_version": SCHEMA_VERSION,
         "software": __version__,
@@ -112,7 +118,7 @@ def benchmark(
             "judged_grasps": MOST,
         },
         "protocols": tables,
-        "skipped": dict(skipped),
+        "skipped": left_out,
     }
     out.mkdir(parents=True, exist_ok=True)
     text = f"{json.dumps(results, sort_keys=True, indent=1, allow_nan=False)}\n"
@@ -128,16 +134,6 @@ def _rows(
     for name, path in models.items():
         rows.append(Row(name, "late_fusion", Towers.of_model(facts.grasps, path, cache, quiet)))
     return rows
-
-
-def _taken(name: str, protocol: Protocol, rows: list[Row]) -> list[Row]:
-    """The rows that a protocol can ask. Raises BadInput where that is none."""
-    if protocol.entry == PHOTO:
-        return rows
-    taken = [row for row in rows if row.method in FITTED]
-    if not taken:
-        raise BadInput(f"{name} shows objects by touches, which these methods can take: {', '.join(FITTED)}")
-    return taken
 
 
 @dataclass(frozen=True, eq=False)
