@@ -5,6 +5,7 @@ The store is fsspec's in this process; `tests.faults` and one slow test ask a se
 
 import dataclasses
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -404,3 +405,29 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(serve
             assert [match.photo for match in ours.results] == [match.photo for match in theirs.results]
     again = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
     assert (again.written, again.embedded) == (False, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Ray's own warnings
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
+def test_ray_builds_into_and_holds_a_cluster_on_s3(server, catalogue, model, searcher, grasps):
+    """Whoever holds a shard fetches it."""
+    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.session import connected
+
+    server.refuse = server.tear = None
+    s3.put(catalogue, "photos/catalog")
+    with connected(2) as ray:
+        url, checkpoint = "s3://photos/by-ray", load_checkpoint(model)
+        report = build_cluster("s3://photos/catalog", checkpoint, url, 2, quiet=True, run=by_ray(workers=1))
+        assert (report.photos, report.embedded) == (24, 24)
+        another_machine()
+        held = Deployments(ray, Held(cpus=0.1, wait_s=120.0))
+        with Searcher.open(url, shards=held.open) as opened:
+            for own in grasps:
+                ours, theirs = opened.query(own), searcher.query(own)
+                assert [match.object_id for match in ours.results] == [match.object_id for match in theirs.results]
+                assert ours.index["searched"] == 1.0
+        held.close()
+    assert len(list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))) == 2
