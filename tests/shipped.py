@@ -6,7 +6,8 @@
                                                          FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one
                                                          for touches of one gel image, of the same grasps
     python -m tests.shipped distil FOLDER                teach the pruner of the shipped checkpoint again, from the
-                                                         recording, pictures and features that `make` left in FOLDER
+                                                         recording, pictures and features that `make` left in
+                                                         FOLDER; with --fingers 1 that of the one for one finger
     python -m tests.shipped verdicts FOLDER              fit the posterior and the gel check of the shipped checkpoint
                                                          again, on its validation objects and as many training ones,
                                                          collected into FOLDER/verdicts
@@ -83,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, score):
+    for job in (make, pruner, score):
         job.add_argument(
             "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
         )
@@ -191,8 +192,10 @@ def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkp
 
 def distil_shipped(arguments: argparse.Namespace) -> int:
     """Towers, head, calibration and split stay; the pruner reads the weights that are shipped, rounded as they are."""
-    shipped = load_checkpoint(defaults.shipped_model())
+    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
     grasps = load_grasps(arguments.folder / "recording")
+    if arguments.fingers == 1:
+        grasps = [part for grasp in grasps for part in each_finger(grasp)]
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
     assert shipped.split is not None
     train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
@@ -204,7 +207,7 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     # An index of the one before is given new embeddings from its halves.
     halves_of = [*shipped.provenance.get(HALVES_OF, []), shipped.digest]
     made = dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
-    store(made, arguments.folder / defaults.SHIPPED[2])
+    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
