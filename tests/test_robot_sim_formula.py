@@ -131,17 +131,15 @@ def test_heights_lie_between_pixels_and_end_at_the_border():
     assert heights(grid, u[:0], v[:0]).shape == (0,)
 
 
-def test_what_lies_beyond_is_left_out_whatever_the_order_of_the_rays():
+def test_rays_meet_the_same_whatever_their_order():
     body = draw_object(0, 14).body
     width = np.linspace(*body.lower[[0]], *body.upper[[0]], 400)
     origins = np.stack([width, np.full(400, -300.0), np.full(400, 0.5 * body.upper[2])], axis=1)
     directions = np.broadcast_to([0.0, 1.0, 0.0], origins.shape)
     order = np.random.default_rng(0).permutation(400)
-    near = body.cast(origins, directions, beyond_mm=6.0)
-    np.testing.assert_array_equal(body.cast(origins[order], directions, beyond_mm=6.0), near[order])
-    every = body.cast(origins, directions)
-    np.testing.assert_array_equal(np.isfinite(near), every <= every.min() + 6.0)
-    assert np.isfinite(every).sum() > np.isfinite(near).sum() > 0
+    found = body.cast(origins, directions)
+    np.testing.assert_array_equal(body.cast(origins[order], directions), found[order])
+    assert np.isfinite(found).sum() > 100
 
 
 def test_code_that_cannot_be_kept_is_compiled_for_the_process():

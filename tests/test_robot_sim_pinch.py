@@ -82,6 +82,13 @@ def test_the_jaws_end_at_the_width_less_both_approaches():
     assert made.closed_mm == pytest.approx(width - approach, abs=0.02)
 
 
+def test_a_finger_meets_what_lies_far_behind_the_first_touch():
+    gap = pinch(thing(Slanted(math.radians(50)))).gap("a")
+    assert gap.max() > 12
+    for steps in (np.diff(gap, axis=0), np.diff(gap, axis=1)):  # no edge on the way, which soft foam would show
+        np.testing.assert_allclose(steps, steps.mean(), atol=1e-6)
+
+
 def test_a_bare_finger_does_not_give_way():
     made = pinch(thing(Slanted()), sensors={"a": SENSORS["a"]})
     assert made.closed_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)

@@ -37,9 +37,6 @@ _REST_RAD = math.radians(0.2)
 _SQUEEZED = 0.2
 """A soft object stands at this share of its width at least, as foam does that has no more room to give."""
 
-_DEEPEST_MM = 8.0
-"""What lies further behind the first touch is out of a gel's reach."""
-
 PAD_MM = (15.2, 20.3)
 """Height and width of a bare finger's pad."""
 
@@ -160,7 +157,7 @@ class Pinch:
             grid = self.hand.grid if finger in self.sensors else _FEELERS
             self.passes["wall" if finger in self.sensors else "feel"] += 1
             (starts,), (directions,) = self._rays(side, grid, [self.turned])
-            walls[finger] = self.obj.body.cast(starts, directions, beyond_mm=_DEEPEST_MM).reshape(grid)
+            walls[finger] = self.obj.body.cast(starts, directions).reshape(grid)
         return walls
 
     # What the fingers feel ----------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robot.errors import SceneError
 from robot.sim.objects.boxes import clipped
 from robot.sim.objects.formula import record
-from robot.sim.objects.packets import Formula, March, Worn, first_hits, gradients
+from robot.sim.objects.packets import Formula, Worn, first_hits, gradients
 from robot.sim.objects.relief import Relief
 from robot.sim.objects.shapes.base import Floats, Points, Shape
 from robot.sim.objects.wall import Level, Wall, bake
@@ -26,13 +26,14 @@ GEL_STEP_MM = 0.1
 
 @dataclass(frozen=True)
 class ClippedRays:
-    """Rays (N, 3) and where they enter and leave the bounding box; one that passes it by enters after it leaves."""
+    """Rays (N, 3) and where they enter and leave the bounding box; one that passes it by enters after it leaves.
+    `step_mm` is the finest detail that matters."""
 
     origins: Vectors
     directions: Vectors
     near_mm: Vectors
     far_mm: Vectors
-    march: March
+    step_mm: float
 
 
 class Body(ABC):
@@ -41,21 +42,18 @@ class Body(ABC):
     lower: Vectors
     upper: Vectors
 
-    def cast(
-        self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM, beyond_mm: float = math.inf
-    ) -> Vectors:
+    def cast(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Distance in mm along each ray to the first hit, (N,) float64, inf for a miss.
 
         `origins`, `directions`: (N, 3), directions of unit length; a ray that starts inside hits at 0.
         `step_mm`: the finest detail that matters; a camera gives the size of its pixel on the object, and is served
-        faster. `beyond_mm`: hits further than this behind the nearest one may be given as misses; a gel that is
-        pressed a few mm deep never meets them. Raises SceneError.
+        faster. Raises SceneError.
         """
         start, along = _plain(origins), _plain(directions)
         if start.ndim != 2 or start.shape[1] != 3 or start.shape != along.shape:
             raise SceneError(f"rays must be two arrays of shape (N, 3), got {start.shape} and {along.shape}")
         near, far = clipped(start, along, self.lower, self.upper)
-        return self._cast(ClippedRays(start, along, near, far, March(step_mm, beyond_mm)))
+        return self._cast(ClippedRays(start, along, near, far, step_mm))
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Outward unit normals (N, 3) at points (N, 3) on the surface, relief included, smoothed over `step_mm`."""
@@ -144,8 +142,8 @@ class SdfBody(Body):
         return gradients(self._worn(step_mm), points, step_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
-        march = rays.march
-        return first_hits(self._worn(march.step_mm), rays.origins, rays.directions, rays.near_mm, rays.far_mm, march)
+        worn = self._worn(rays.step_mm)
+        return first_hits(worn, rays.origins, rays.directions, rays.near_mm, rays.far_mm, rays.step_mm)
 
 
 _BARE = Level(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)

@@ -22,7 +22,6 @@ from robot.sim.objects.body import Body, ClippedRays, Vectors
 from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.objects.looks import draw_looks
 from robot.sim.objects.materials import draw_material
-from robot.sim.objects.packets import March
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes.base import Cylindrical, Floats, relief_limit
 from robot.sim.objects.wall import Wall, bake_plain, ends_weight, smoothstep
@@ -151,7 +150,8 @@ class MeshBody(Body):
         cosine = -np.einsum("ij,ij->i", directions[hit], self.mesh.face_normals[face[hit]])
         outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (start[hit] == near[hit])]
         result[inside] = near[inside]
-        result[outside] -= self._lift(face[outside], origins[outside], directions[outside], result[outside], rays.march)
+        lift = self._lift(face[outside], origins[outside], directions[outside], result[outside], rays.step_mm)
+        result[outside] -= lift
         distances = np.full(len(rays.near_mm), np.inf)
         distances[ahead] = np.maximum(result, near)
         return distances
@@ -165,7 +165,7 @@ class MeshBody(Body):
         offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
 
-    def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, march: March) -> Vectors:
+    def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, step_mm: float) -> Vectors:
         """How much earlier (or, engraved, later) rays meet the relief than the mesh."""
         if self.wall is None:
             return np.zeros(len(face))
@@ -175,7 +175,7 @@ class MeshBody(Body):
         # Twice, as where the ray meets the relief is not above where it meets the mesh.
         for _ in range(2):
             points = origins + (distance - lift)[:, None] * directions
-            lift = self._height(points, normals, march.step_mm) / cosine
+            lift = self._height(points, normals, step_mm) / cosine
         return lift
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:

@@ -56,14 +56,6 @@ class Worn(NamedTuple):
     slope: float
 
 
-class March(NamedTuple):
-    """How fine rays look: step_mm is the finest detail that matters, beyond_mm what lies how far behind the nearest
-    hit may be missed."""
-
-    step_mm: float
-    beyond_mm: float
-
-
 def run(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
     """What the function of the formula returns for arrays (n,) of float32."""
     given = np.stack(operands)
@@ -168,15 +160,16 @@ def gradients(worn: Worn, points: Vectors, step_mm: float) -> Vectors:
     return out
 
 
-def first_hits(worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, march: March) -> Vectors:
-    """Distance (n,) along rays (n, 3) to the first place where f is 0, looked for from `near` to `far`; inf: none."""
+def first_hits(
+    worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, step_mm: float
+) -> Vectors:
+    """Distance (n,) along rays (n, 3) to the first place where f is 0, looked for from `near` to `far`; inf: none.
+    `step_mm` is the finest detail that matters."""
     found = np.full((4, len(near)), np.inf, np.float32)
     rows = _rows_of(worn)
-    _march(worn, rows, origins, directions, near, far, march, found)
+    _march(worn, rows, origins, directions, near, far, np.float32(0.5 * step_mm), found)
     out = np.full(len(near), np.inf)
     _refine(worn, rows, origins, directions, near, found, out)
-    if np.isfinite(march.beyond_mm):  # the same ones whatever the order in which rays were cast
-        out[out > out.min(initial=np.inf) + march.beyond_mm] = np.inf
     return out
 
 
@@ -253,22 +246,21 @@ _ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _LANE_ROWS = 0, 3, 6, 7, 8, 9
 
 
 @compiled
-def _march(worn, rows, origins, directions, near, far, march, found):  # type: ignore[no-untyped-def]
+def _march(worn, rows, origins, directions, near, far, finest, found):  # type: ignore[no-untyped-def]
     """Sphere tracing until f changes sign: `found` is t and f just inside (inf: a miss), t and f just outside.
 
     Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the
-    slope of f), and no step is shorter than a stride: half the finest detail, and up to four times that for rays that
-    graze for long. A lane whose ray has ended takes the next ray, so that packets stay full.
+    slope of f), and no step is shorter than a stride: `finest`, and up to four times that for rays that graze for
+    long. A lane whose ray has ended takes the next ray, so that packets stay full.
     """
     base, wear = rows
     result, worn_out = worn.distance.results[0], worn.height_mm.size > 0
     highest = np.float32(worn.highest_mm)
     bound = np.float32(1 + worn.slope) if worn_out else np.float32(1)
-    finest, beyond = np.float32(0.5 * march.step_mm), march.beyond_mm
     lanes = np.empty((_LANE_ROWS, LANES), np.float32)
     gaps = np.empty(LANES, np.float32)
     ray, step, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    nearest, upcoming, count = np.inf, 0, 0
+    upcoming, count = 0, 0
     while True:
         while count < LANES and upcoming < len(near):
             if near[upcoming] <= far[upcoming]:
@@ -315,7 +307,6 @@ def _march(worn, rows, origins, directions, near, far, march, found):  # type: i
             if f <= 0:
                 found[0, number], found[1, number] = t, f
                 found[2, number], found[3, number] = lanes[_BEFORE, i], lanes[_F_BEFORE, i]
-                nearest = min(nearest, near[number] + t)
                 over = True
             else:
                 stride = finest * np.float32(min(max(step[i] / 40, 1.0), 4.0))
@@ -328,8 +319,7 @@ def _march(worn, rows, origins, directions, near, far, march, found):  # type: i
                     lanes[_BEFORE, i], lanes[_F_BEFORE, i] = t, f
                 lanes[_T, i] = t + max(stride, forward)
                 step[i] += 1
-                last = min(far[number], nearest + beyond) - near[number]
-                over = lanes[_BEFORE, i] > last or step[i] >= MOST_STEPS
+                over = lanes[_BEFORE, i] > far[number] - near[number] or step[i] >= MOST_STEPS
             if over:
                 # The last lane comes here, with what was worked out for it.
                 end -= 1
