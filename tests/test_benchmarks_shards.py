@@ -1,12 +1,13 @@
-"""The queues of many shards, against what can be reckoned by hand."""
+"""Shards beside one folder, and the queues of many shards, against what can be reckoned by hand."""
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
 
-from tests.benchmarks import queueing
+from tests.benchmarks import queueing, shards
 from tests.benchmarks.queueing import ENCODE_S, HOP_S, Service, answers, service_of, tables
 
 MEASURED = [
@@ -67,3 +68,14 @@ def test_the_tables_have_a_row_for_every_plan(monkeypatch):
     assert sum(line.startswith("| 1e+06") for line in lines) == 3
     assert sum(line.startswith("| 1e+07") for line in lines) == 2
     assert "| 1e+06 | 1 GB | 768 MB | 14 h | 0.1 h |" in lines
+
+
+@pytest.mark.slow
+def test_shards_answer_as_one_folder_does(monkeypatch, capsys):
+    options = ["--sizes", "1e3", "--shards", "2", "--touches", "4", "--judged", "2", "--json"]
+    monkeypatch.setattr(sys, "argv", ["shards", *options])
+    shards.main()
+    measured, opened = map(json.loads, capsys.readouterr().out.splitlines())
+    assert (measured["photos"], measured["shards"]) == (1000, 2)
+    assert measured["all_judged_same"] == measured["winner_no_worse"] == 1
+    assert list(opened) == ["client_open_1e+03_s"]

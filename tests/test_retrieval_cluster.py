@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 
 import httpx
@@ -27,7 +28,7 @@ from retrieval.search.build_cluster import build_cluster
 from retrieval.search.opening import stored_for
 from retrieval.search.searcher import Searcher
 from tests import on_ray, serving, synthetic
-from tests.waiting import first_line, running
+from tests.waiting import first_line, running, until
 
 pytestmark = [
     pytest.mark.slow,
@@ -200,7 +201,15 @@ def test_a_shard_that_hangs_is_told_and_never_passed_over_in_silence(ray, cluste
     stopped()
     with pytest.raises(Unanswered, match=r"no answer within 2 s from shard-0\d-of-04: 0\.\d+ of the catalogue"):
         strict.query(grasps[0])
-    answer = lenient.query(grasps[0], top=8)
+    found = []
+
+    def answered():  # of a busy machine the other shards may be late too
+        with suppress(Unanswered):
+            found.append(lenient.query(grasps[0], top=8))
+        return found
+
+    until(answered, 60)
+    [answer] = found
     if answer.index["searched"] == 1.0:  # Ray has replaced it already
         return
     assert 0.1 <= answer.index["searched"] < 1

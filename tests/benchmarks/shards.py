@@ -89,7 +89,8 @@ def drawn_crowd(checkpoint: Checkpoint, objects: int = 60) -> Crowd:
     with tempfile.TemporaryDirectory() as name:
         folder = synthetic.write_catalogue(Path(name) / "catalog", synthetic.make_objects(objects))
         codes = embed_photos(sorted(folder.rglob("*.jpg")), model=checkpoint)
-    return Crowd(checkpoint, judge_of(checkpoint.matcher.head), codes.halves, checkpoint.queries.astype(np.float32))
+    touches = checkpoint.queries.astype(np.float32)
+    return Crowd(checkpoint, judge_of(checkpoint.matcher.head), codes.halves, touches, held_out=touches[:0])
 
 
 def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]:
