@@ -87,6 +87,12 @@ def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
+@pytest.fixture
+def own(catalogue: Path, tmp_path: Path) -> Path:
+    """A copy of the catalogue, to change."""
+    return shutil.copytree(catalogue, tmp_path / "catalog")
+
+
 @pytest.fixture(scope="session")
 def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
     """The gel images (a, b) of one grasp of the catalogue's first object."""
@@ -102,6 +108,14 @@ def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
     train(recording, out, TINY, quiet=True)
     return out
+
+
+@pytest.fixture
+def checkpoint(model: Path) -> Any:
+    """That checkpoint, loaded."""
+    from retrieval.model.checkpoint import load_checkpoint
+
+    return load_checkpoint(model)
 
 
 @pytest.fixture(scope="session")

@@ -28,19 +28,8 @@ from tests import synthetic
 
 
 @pytest.fixture
-def own(catalogue, tmp_path):
-    """A catalogue to change: 8 objects, 3 photos each."""
-    return shutil.copytree(catalogue, tmp_path / "catalog")
-
-
-@pytest.fixture
 def index(tmp_path):
     return tmp_path / "index"
-
-
-@pytest.fixture
-def checkpoint(model):
-    return load_checkpoint(model)
 
 
 def first_photo(own):

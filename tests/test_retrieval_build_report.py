@@ -8,13 +8,7 @@ import pytest
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
-
-
-@pytest.fixture
-def checkpoint(model):
-    return load_checkpoint(model)
 
 
 @pytest.fixture

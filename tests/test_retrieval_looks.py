@@ -2,7 +2,6 @@
 
 import os
 import random
-import shutil
 import time
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from indexes.store.folder import IndexStore
 from indexes.store.seen import NAME, Seen
 from retrieval.data.catalogue import list_catalogue, read_photo
-from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search import embed, looks
 from retrieval.search.build import UNNOTED, build_index
 from retrieval.search.build_cluster import build_cluster
@@ -21,19 +19,8 @@ HOUR_NS = 3600 * 10**9
 
 
 @pytest.fixture
-def own(catalogue, tmp_path):
-    """A catalogue to change: 8 objects, 3 photos each."""
-    return shutil.copytree(catalogue, tmp_path / "catalog")
-
-
-@pytest.fixture
 def index(tmp_path):
     return tmp_path / "index"
-
-
-@pytest.fixture
-def checkpoint(model):
-    return load_checkpoint(model)
 
 
 @pytest.fixture

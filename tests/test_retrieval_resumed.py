@@ -49,11 +49,6 @@ def killed(catalogue, model, index, call):
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
-@pytest.fixture
-def own(catalogue, tmp_path):
-    return shutil.copytree(catalogue, tmp_path / "catalog")
-
-
 def same(one, other):
     """Both generations hold the same rows, and what is made of them; another batch sums in another order."""
     assert one.rows == other.rows

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import shutil
 
 import numpy as np
 import pytest
@@ -17,19 +16,8 @@ from retrieval.search.build import TAUGHT_AGAIN, build_index
 
 
 @pytest.fixture
-def own(catalogue, tmp_path):
-    """A catalogue to change: 8 objects, 3 photos each."""
-    return shutil.copytree(catalogue, tmp_path / "catalog")
-
-
-@pytest.fixture
 def index(tmp_path):
     return tmp_path / "index"
-
-
-@pytest.fixture
-def checkpoint(model):
-    return load_checkpoint(model)
 
 
 def test_photos_that_are_prepared_otherwise_are_embedded_again_and_it_is_said(own, checkpoint, index, monkeypatch):
