@@ -14,7 +14,7 @@ import numpy as np
 
 from retrieval.data.images import decode_rgb, picture_size, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
-from retrieval.data.views import VIEWS, least_side, least_side_for, strip
+from retrieval.data.views import VIEWS, Box, find_object, least_side, least_side_of_crop, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -102,20 +102,25 @@ class Preprocessing:
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def photo(self, image: RgbImage) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
+    def photo(self, image: RgbImage, box: Box | None = None) -> RgbImage:
+        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError.
+
+        box: where its object lies, where that is known.
+        """
         check_rgb(image, "photo")
-        return strip(_finite(image, "photo"), self.views, self.photo_px)
+        return strip(_finite(image, "photo"), self.views, self.photo_px, box)
 
     def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
         """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
         if not self.reduced:
             return self.photo(decode_rgb(data, name))
         image = decode_rgb(data, name, least_side(self.views, self.photo_px))
-        if (short := min(image.shape[:2])) < min(picture_size(data, name)):
-            more = least_side_for(image, self.views, self.photo_px)
-            image = decode_rgb(data, name, more) if more > short else image
-        return self.photo(image)
+        short, box = min(image.shape[:2]), None
+        if "crop" in self.views and short < min(picture_size(data, name)):
+            box = find_object(image)
+            if (more := least_side_of_crop(box, short, self.photo_px)) > short:
+                image, box = decode_rgb(data, name, more), None
+        return self.photo(image, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.

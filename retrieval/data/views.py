@@ -149,16 +149,14 @@ def least_side(names: Sequence[str], px: int) -> int:
     return math.ceil(max([_SIDE, OVERSAMPLED * px, *wanted]))
 
 
-def least_side_for(image: RgbImage, names: Sequence[str], px: int) -> int:
-    """The same of a photo (H, W, 3) as it was decoded, for the views that are cut to its object."""
-    if "crop" not in names:
-        return 0
-    box = find_object(image)
-    share = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / min(image.shape[:2])
+def least_side_of_crop(box: Box, short: int, px: int) -> int:
+    """The same for the view that is cut to the object in `box`, of a photo whose shorter side has `short` pixels."""
+    share = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short
     return math.ceil(OVERSAMPLED * px / float(share))
 
 
-def strip(image: RgbImage, names: Sequence[str], px: int) -> RgbImage:
-    """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side."""
-    box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
+def strip(image: RgbImage, names: Sequence[str], px: int, box: Box | None = None) -> RgbImage:
+    """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
+    if box is None:
+        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
     return np.concatenate([resize(VIEWS[name](image, box), (px, px)) for name in names], axis=1)
