@@ -20,6 +20,11 @@ def is_url(where: str | Path) -> bool:
     return isinstance(where, str) and "://" in where
 
 
+def place_of(where: str | Path) -> str | Path:
+    """A URL as it is, anything else as a path."""
+    return where if is_url(where) else Path(where)
+
+
 def file_system(url: str) -> tuple[Any, str]:
     """The `fsspec` file system of a URL, and the path in it. Raises BadInput for one that nothing opens."""
     try:

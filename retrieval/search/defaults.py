@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from indexes.store.files import file_digest, write_atomically
 from indexes.store.regular import read_json
-from retrieval.data.storage import is_url
+from retrieval.data.storage import is_url, place_of
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
@@ -106,11 +106,11 @@ def find_index(given: str | None) -> tuple[str | Path, str]:
     """The index to use, a folder or a URL, and why: the one given, else ./index, else the last one built from this
     folder."""
     if given is not None:
-        return given if is_url(given) else Path(given), "given"
+        return place_of(given), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
     if (last := _noted().get("index")) and (is_url(last) or _is_index(Path(last))):
-        return last if is_url(last) else Path(last), "the last one built from this folder"
+        return place_of(last), "the last one built from this folder"
     raise BadInput(
         "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
         "or name one with --index"

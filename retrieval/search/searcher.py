@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from indexes.errors import UnsupportedFormat
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
-from retrieval.data.storage import is_url
+from retrieval.data.storage import place_of
 from retrieval.errors import BadInput
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
 from retrieval.model.onnx_encoder import exported
@@ -108,7 +108,7 @@ class Searcher:
             stored = stored_for(generation.manifest, model)
             shard = folder_shard(generation, stored)
         encoder = exported(stored, threads) or torch_encoder(stored, threads)
-        return cls(index if is_url(index) else Path(index), shard, stored, encoder, read_judge(stored.path))
+        return cls(place_of(index), shard, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
         """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""

@@ -79,8 +79,9 @@ def distil(
 
     def loss(step: int) -> Tensor:
         touches = blend(touch_halves, TOUCHES, generator)
-        photos = crowd.photos(step - steps // ALONE, touch_spread(touches))
-        scores = pruner.scores(touch_spread(touches), photo_spread(photos))
+        read = touch_spread(touches)
+        photos = crowd.photos(step - steps // ALONE, read)
+        scores = pruner.scores(read, photo_spread(photos))
         return order_loss(scores, all_logits(head, touches, photos))
 
     optimizer, plan = torch.optim.Adam(pruner.parameters()), Plan(steps, LEARNING_RATE)

@@ -40,7 +40,7 @@ def rays(sample: Sample) -> Row:
 
 def rays_panel(repeats: int, rows: int = 48, steps_mm: Sequence[float] = (1.6, 0.8, 0.4, 0.2, 0.1, 0.05)) -> Panel:
     """A point for each step: the rms error of depth over the walls of three objects, `rows` by 4/3 `rows` rays each."""
-    walls = [(_wall(name), *_rays_onto(_wall(name), rows)) for name in _FAMILIES]
+    walls = [(body, *_rays_onto(body, rows)) for body in map(_wall, _FAMILIES)]
     exact = np.concatenate([_by_equal_steps(*wall) for wall in walls])
     met = np.isfinite(exact)
     points, works = list[Tradeoff](), [partial(_cast, walls, step) for step in steps_mm]
