@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -105,6 +106,28 @@ def test_everything_listens_on_this_machine_alone(held, touch):
     found = on_ray.listening()
     assert found
     assert found <= LOOPBACK
+
+
+REPLICA = """
+import sys
+from pathlib import Path
+from indexes.store.cluster import read_cluster
+from retrieval.cluster.serving import ShardReplica
+from threadpoolctl import threadpool_info
+manifest = read_cluster(Path(sys.argv[1]))
+replica = ShardReplica(sys.argv[1], manifest.shards[0], dict(manifest.fingerprint), sys.argv[2], False)
+print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+"""
+
+
+def test_a_shard_leaves_the_processors_to_others_between_two_queries(cluster):
+    """Idle threads of OpenBLAS spin on for a while: a query over Ray took 40 ms where it takes 6."""
+    model = read_cluster(cluster).about["checkpoint"]
+    environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", REPLICA, str(cluster), str(model)]
+    said = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
+    assert said
+    assert set(said) == {"1"}
 
 
 def test_many_threads_ask_at_once(held, grasps):

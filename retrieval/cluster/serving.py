@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from indexes.errors import IndexesError
 from indexes.store.cluster import ClusterManifest, ShardEntry, open_shard
 from indexes.store.generation import require_made_by
@@ -74,6 +76,7 @@ class ShardReplica:
         stored = read_stored(Path(model))
         generation = open_shard(folder_with(cluster, entry), entry, made_by, verify=verify, threads=1)
         self._shard = folder_shard(generation, stored)
+        threadpool_limits(1, "blas")  # as long as this process lives: idle ones spin, and take others' processors
 
     def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged | Exception:
         """As `Shard.ask`. What is wrong is given back: raised, it would come with the tracebacks of all processes."""

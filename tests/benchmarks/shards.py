@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from indexes.store.cluster import (
     ClusterManifest,
@@ -220,7 +221,7 @@ def on_ray(crowd: Crowd, photos: int, touches: int, out: Path) -> dict[str, floa
     halves = crowd.touches[:touches]
     embeddings, posterior = crowd.embeddings(halves, "touch"), crowd.checkpoint.posterior
     times: dict[str, list[float]] = {"folder": [], "ray": []}
-    with connected(2) as ray:
+    with connected(2) as ray, threadpool_limits(1, "blas"):  # as the service: its threads spin between two queries
         far = Deployments(ray, Held(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
         arms = {"folder": folder, "ray": far}
         for turn in range(-5, len(halves)):
