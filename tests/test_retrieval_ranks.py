@@ -2,7 +2,8 @@
 
 Their gradients and statistics are compared in tests/test_retrieval_train.py. Weights drift apart from the second step
 on as those of two single processes do whose first weights differ in the eighth digit: Adam's first steps are as long
-where a gradient is next to nothing as where it is large. So figures are compared where the towers stand still.
+where a gradient is next to nothing as where it is large. So figures are compared where the towers stand still, and in
+double precision where they are trained.
 """
 
 import os
@@ -24,9 +25,9 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 
 
-def command(recording, out, config, ranks=2):
+def command(recording, out, config, ranks=2, program="retrieval"):
     start = TORCHRUN if ranks == 2 else [sys.executable]
-    return [*start, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
+    return [*start, "-m", program, "train", str(recording), "--out", str(out), "--config", str(config)]
 
 
 @pytest.fixture
@@ -47,12 +48,23 @@ def settings(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_ranks_reach_the_figures_of_one_process(recording, settings, tmp_path):
-    config, made = settings(freeze_towers="true", validate_every=20), []
+@pytest.mark.parametrize(
+    ("program", "instead"),
+    [
+        ("retrieval", {"freeze_towers": "true", "validate_every": 20}),
+        ("tests.in_double", {"iterations": 40, "validate_every": 40}),
+    ],
+)
+def test_two_ranks_reach_the_figures_of_one_process(program, instead, recording, settings, tmp_path):
+    config, made = settings(**instead), []
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}.safetensors"
         done = subprocess.run(
-            command(recording, out, config, ranks), env=ENVIRONMENT, capture_output=True, text=True, check=False
+            command(recording, out, config, ranks, program),
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         made.append(load_checkpoint(out).provenance)
