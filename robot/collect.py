@@ -16,7 +16,7 @@ import re
 import time
 import zlib
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ RigMaker = Callable[[], Rig]
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]")
-_TOUCH = re.compile(r"touch_([a-z])(_before|_after)?")
+_TOUCH = re.compile(r"touch_([a-z])")
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ class _Collection:
         )
         if attempt.outcome == "no_plan":
             return logged(accepted=False, reason=attempt.reason)
-        accepted, score = judge(self.gate, frames_of(attempt.images))
+        accepted, score = judge(self.gate, RecordedTouches(attempt.images))
         grasp_id = name_of(attempt.object_id, attempt.number)
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
@@ -308,14 +308,28 @@ def name_of(object_id: str, number: int) -> str:
     return f"{plain}-{number:04}"
 
 
-def frames_of(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
-    """Each finger's frames, decoded from what is recorded: the gate judges what training will see."""
-    moments: dict[str, dict[str, npt.NDArray[np.uint8]]] = defaultdict(dict)
-    for column, data in images.items():
-        if match := _TOUCH.fullmatch(column):
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            assert pixels is not None, "it was encoded by robot.grasping.attempt"
-            moments[match[1]][(match[2] or "_during")[1:]] = np.ascontiguousarray(pixels[..., ::-1])
-    return {
-        finger: GraspFrames(each.get("before"), each["during"], each.get("after")) for finger, each in moments.items()
-    }
+class RecordedTouches(Mapping[str, GraspFrames]):
+    """Each finger's frames as they are recorded, for the gate judges what training will see; decoded when it looks."""
+
+    def __init__(self, images: Mapping[str, bytes]) -> None:
+        self._images = images
+        self._fingers = [match[1] for column in images if (match := _TOUCH.fullmatch(column))]
+
+    def __getitem__(self, finger: str) -> GraspFrames:
+        before, during, after = (self._decoded(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
+        if during is None:
+            raise KeyError(finger)
+        return GraspFrames(before, during, after)
+
+    def _decoded(self, column: str) -> npt.NDArray[np.uint8] | None:
+        if column not in self._images:
+            return None
+        pixels = cv2.imdecode(np.frombuffer(self._images[column], np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None, "it was encoded by robot.grasping.attempt"
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fingers)
+
+    def __len__(self) -> int:
+        return len(self._fingers)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collect import CollectSettings, Progress, collect, name_of
+from robot.collect import CollectSettings, Progress, RecordedTouches, collect, name_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
 from robot.grasping.attempt import Attempter, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
@@ -18,6 +18,7 @@ from robot.recording.attempt_log import read_attempts
 from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import Rig
 from robot.sight.cylinder import CylinderFit
+from robot.storage import file_content
 from tests.fake_rig import FakeArm, FakeRig
 
 NAMES = ("round-0", "thin-1", "round-2")
@@ -47,6 +48,20 @@ def rows(folder):
 
 
 # What is recorded -------------------------------------------------------------------------------------------
+
+
+def test_a_gate_sees_the_recorded_frames_in_their_colours_and_what_it_leaves_alone_is_not_decoded():
+    red, blue = np.full((4, 6, 3), (200, 10, 0), np.uint8), np.full((4, 6, 3), (0, 20, 190), np.uint8)
+    files = {"touch_a": red, "touch_a_before": blue}
+    images = {column: file_content(column, pixels)[0] for column, pixels in files.items()}
+    touches = RecordedTouches({"photo": b"no picture", **images, "touch_b": b"no picture", "touch_b_before": b""})
+    assert list(touches) == ["a", "b"]
+    frames = touches["a"]
+    np.testing.assert_array_equal(frames.during, red)
+    np.testing.assert_array_equal(frames.before, blue)
+    assert frames.after is None
+    with pytest.raises(KeyError):
+        touches["c"]
 
 
 def test_every_object_gets_its_accepted_grasps_and_the_rest_is_recorded_too(tmp_path):
@@ -544,15 +559,16 @@ def test_a_real_rig_cannot_be_doubled(tmp_path, monkeypatch):
 def test_a_full_disk_is_told_and_what_was_recorded_is_whole(tmp_path, monkeypatch):
     from robot.recording import folder as module
 
-    real, count = module.write_file, []
+    real, count = module.write_files, []
 
-    def full(path, data):
-        count.append(path)
-        if len(count) > 12:
+    def full(contents):
+        count.append(contents)
+        if len(count) > 1:
+            real(dict(list(contents.items())[:3]))
             raise OSError(28, "No space left on device")
-        real(path, data)
+        real(contents)
 
-    monkeypatch.setattr(module, "write_file", full)
+    monkeypatch.setattr(module, "write_files", full)
     with pytest.raises(StorageError, match="No space left on device; what was appended before is whole"):
         run(tmp_path / "r")
     monkeypatch.undo()

@@ -58,6 +58,19 @@ def test_any_finger_is_enough_unless_every_one_is_asked_for():
     assert ContactAreaGate(every_finger=True)({"b": one["b"]})
 
 
+def test_no_finger_is_looked_at_after_the_answer_is_known():
+    class Never:
+        @property
+        def before(self):
+            raise AssertionError("it was looked at")
+
+    held, empty = GraspFrames(gel(0), pressed(1)), GraspFrames(gel(0), gel(1))
+    assert GATE({"a": held, "b": Never()})
+    assert not ContactAreaGate(every_finger=True)({"a": empty, "b": Never()})
+    with pytest.raises(AssertionError, match="looked at"):
+        GATE({"a": empty, "b": Never()})
+
+
 def test_what_slipped_after_the_lift_is_no_grasp():
     slipped = {"a": GraspFrames(gel(0), pressed(1), gel(2))}
     assert not GATE(slipped)

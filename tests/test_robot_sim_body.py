@@ -92,6 +92,15 @@ def test_a_ray_that_starts_inside_hits_at_once():
         np.testing.assert_array_equal(found, 0)
 
 
+@pytest.mark.parametrize("relief", [Relief("smooth", 0.0, 5.0), Relief("ribs", 1.0, 5.0)])
+def test_a_ray_hits_where_its_distance_is_finite(relief):
+    body = can(relief)
+    origins, directions = wall_rays(body, pitch=2.0)
+    found = body.hit(origins, directions)
+    np.testing.assert_array_equal(found, np.isfinite(body.cast(origins, directions)))
+    assert 0.1 < found.mean() < 1
+
+
 def test_a_ray_along_an_axis_has_no_nan():
     with np.errstate(all="raise"):
         found = can().cast(np.array([[20.0, -60, 40], [0, -60, 0], [0, -60, 80.0]]), np.tile([0.0, 1, 0], (3, 1)))

@@ -48,6 +48,39 @@ def test_the_object_is_seen_where_it_stands():
     assert not mask[above[1], above[0]]
 
 
+@pytest.mark.parametrize("index", range(4))
+def test_casting_only_the_rays_near_the_object_leaves_nothing_of_it_out(index):
+    obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
+    view, rays = look(obj, place, CAMERA), CAMERA.rays
+    origins = np.broadcast_to(place.to_object(np.array([CAMERA.position_mm])), rays.shape)
+    every = obj.body.cast(origins, rays @ place.rotation(), view.detail_mm)
+    table = -CAMERA.position_mm[2] / rays[:, 2]
+    np.testing.assert_array_equal(view.is_object, every < table)
+    np.testing.assert_allclose(view.distance_mm, np.minimum(every, table), rtol=1e-12)
+    np.testing.assert_allclose(view.points, CAMERA.position_mm + view.distance_mm[:, None] * rays, atol=1e-9)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_casting_only_the_shadow_rays_near_the_object_leaves_no_shadow_out(index):
+    obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
+    light = np.asarray(Lighting.draw(np.random.default_rng(index)).direction)
+    view = look(obj, place, CAMERA)
+    near = cameras.near_shadow(view, light)
+    table = np.flatnonzero(~view.is_object)
+    starts = place.to_object(view.points[table] + [0, 0, 0.4])
+    dark = table[obj.body.hit(starts, np.broadcast_to(light @ place.rotation(), starts.shape))]
+    assert len(dark) > 50
+    assert set(dark) <= set(near)
+    assert len(near) < 0.7 * len(table)
+    assert not len(cameras.near_shadow(view, np.array([0.6, 0.8, 0.0])))  # nor does a lamp on the horizon light it
+
+
+def test_a_thing_that_reaches_behind_the_camera_may_be_anywhere_in_the_picture():
+    pixels = CAMERA.pixels_round(np.array([[0.0, 0, 0], [0, -900, 800]]))
+    np.testing.assert_array_equal(pixels, np.arange(CAMERA.px**2))
+    assert len(CAMERA.pixels_round(np.array([[5e3, 0, 80.0], [6e3, 0, 80]]))) == 0  # beside the picture
+
+
 def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
     view = look(POST, Placement(), CAMERA)
     depth = cameras.depth(view, 1)

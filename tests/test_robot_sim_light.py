@@ -16,7 +16,7 @@ def surfaces_and_lamps(count=5000, seed=0):
     shares = rng.uniform(size=(2, count)).astype(np.float32)
     is_object, colour = rng.uniform(size=count) < 0.5, rng.uniform(size=(count, 3)).astype(np.float32)
     colour[:7] = 0
-    surfaces = Surfaces(unit[0], unit[1], is_object, *shares, colour)
+    surfaces = Surfaces(unit[0], unit[1].astype(np.float32), is_object, *shares, colour)
     return surfaces, Lamps(unit[2, 0], np.array([0.9, 0.8, 0.7]), np.array([0.2, 0.25, 0.3]), (1.1, 0.04), 60.0)
 
 
@@ -25,12 +25,11 @@ def shaded_array_by_array(surfaces, lamps):
     is_object = is_object > 0
     lit = np.maximum(normals @ lamps.direction, 0) * seen
     sky = (0.6 + 0.4 * normals[:, 2]) * np.where(is_object, 1, 1 - 0.45 * hidden)
-    albedo = np.where(is_object[:, None], colour, colour**GAMMA)
     half = lamps.direction - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     cosine = np.maximum(np.einsum("ij,ij->i", normals, half), 0)
     shine = np.where(is_object, *lamps.gloss) * cosine**lamps.sharpness * (lit > 0)
-    return albedo * (lit[:, None] * lamps.lamp + sky[:, None] * lamps.sky) + shine[:, None] * lamps.lamp
+    return colour * (lit[:, None] * lamps.lamp + sky[:, None] * lamps.sky) + shine[:, None] * lamps.lamp
 
 
 def test_radiance_is_that_of_lambert_blinn_and_the_sky():

@@ -47,7 +47,7 @@ def test_a_whole_scene_does_each_thing_once_for_each_finger():
         "turn": 2,
         "wall": 2,
         "contact": 2,
-        "gel": 4,
+        "gel": 2,
         "background": 2,
     }
 

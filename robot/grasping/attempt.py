@@ -197,7 +197,7 @@ class Attempter:
 
     def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
-        done, data = cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), quality)
+        done, data = cv2.imencode(".jpg", cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2BGR), quality)
         if not done:
             raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as JPG")
         return bytes(data.tobytes())

@@ -41,6 +41,7 @@ from robot.storage import (
     storage_errors,
     sync_folder,
     write_file,
+    write_files,
 )
 
 SCHEMA_VERSION = 1
@@ -266,8 +267,7 @@ class RecordingWriter:
             raise RecordingError(f"unknown key {unknown[0]!r}; see robot.recording.folder for the known ones")
         grasp = RecordedGrasp.from_row(row)
         with storage_errors(self.folder):
-            for path, data in contents.items():
-                write_file(self.folder / path, data)
+            write_files({self.folder / path: data for path, data in contents.items()})
             sync_folder(self.folder / IMAGES_FOLDER)
             self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
         self._grasp_ids[grasp_id] = None

@@ -95,7 +95,7 @@ def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
     for _ in range(3):
         off = near[:, 2] - _heights(plane, near)
         inside = near[np.abs(off) < _TABLE_TOLERANCE_MM]
-        design = np.c_[inside[:, :2], np.ones(len(inside))]
+        design = np.column_stack([inside[:, :2], np.ones(len(inside))])
         plane = np.asarray(np.linalg.lstsq(design, inside[:, 2], rcond=None)[0], np.float64)
     off = near[:, 2] - _heights(plane, near)
     noise = 1.4826 * float(np.median(np.abs(off))) / max(abs(_steepness(rays)), 0.1)
@@ -188,22 +188,28 @@ class Patch:
 
 def largest_patch(candidates: npt.NDArray[np.uint8], least_px: int) -> Patch | None:
     """The largest connected part of what is not 0; None where none has `least_px` pixels."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates, connectivity=8)
+    first_column, first_row, columns, rows = cv2.boundingRect(candidates)
+    around = candidates[first_row : first_row + rows, first_column : first_column + columns]
+    if around.size == 0:
+        return None
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(around), connectivity=8)
     sizes = stats[1:, cv2.CC_STAT_AREA]
-    if count < 2 or sizes.max() < least_px:
+    if sizes.max() < least_px:
         return None
     best = 1 + int(sizes.argmax())
+    mask = labels == best
     left, top, width, height = (int(value) for value in stats[best, :4])
-    window = slice(top, top + height), slice(left, left + width)
-    rows, columns = candidates.shape
+    mask = mask[top : top + height, left : left + width]
+    left, top, (rows, columns) = left + first_column, top + first_row, candidates.shape
     cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
-    return Patch(window, labels[window] == best, cut_off)
+    return Patch((slice(top, top + height), slice(left, left + width)), mask, cut_off)
 
 
 def _missing(depth_mm: Depth, mask: Mask) -> float:
     """Share of unknown pixels in the convex outline of the mask."""
-    ys, xs = np.nonzero(mask)
-    hull = cv2.convexHull(np.stack([xs, ys], axis=1).astype(np.int32))
+    ys = np.flatnonzero(mask.any(axis=1))
+    first, last = mask[ys].argmax(axis=1), mask.shape[1] - 1 - mask[ys, ::-1].argmax(axis=1)  # of each row
+    hull = cv2.convexHull(np.stack([np.concatenate([first, last]), np.tile(ys, 2)], axis=1).astype(np.int32))
     outline = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1).astype(bool)
     return float(np.isnan(depth_mm[outline]).mean())
 
@@ -214,8 +220,8 @@ def _without_strays(points: Array, level: float, cell_mm: float = 6.0) -> Array:
     Outliers lie along their ray, far from the thing's footprint and from each other.
     """
     cells = np.floor((points[:, :2] - points[:, :2].min(0)) / cell_mm).astype(np.intp) + 1
-    grid = np.zeros(tuple(cells.max(0) + 2), np.float32)
-    np.add.at(grid, (cells[:, 0], cells[:, 1]), 1.0)
-    around = cv2.boxFilter(grid, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    rows, columns = cells.max(0) + 2
+    grid = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns).reshape(rows, columns)
+    around = cv2.boxFilter(grid.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
     kept = around[cells[:, 0], cells[:, 1]] >= max(3.0, 0.3 * level * 9 * cell_mm**2)
     return points[kept] if kept.any() else points

@@ -236,7 +236,7 @@ def refine_circle(
         weight = _tukey(error / noise_mm) * (edge | (arms @ away < _NEAR_SIDE * radius))
         if below is not None:
             weight = weight * (-error < np.maximum(below, 0.0))
-        design = np.c_[-arms / rho[:, None], -np.ones(len(plan))]
+        design = np.column_stack([-arms / rho[:, None], -np.ones(len(plan))])
         normal = design.T @ (design * weight[:, None]) + 1e-9 * np.eye(3)
         move = -np.linalg.solve(normal, design.T @ (weight * error))
         centre, radius = centre + move[:2], radius + float(move[2])
@@ -244,7 +244,7 @@ def refine_circle(
             return None
         if np.abs(move).max() < 1e-2 and step > 1:
             break
-    return Circle(float(centre[0]), float(centre[1]), radius, np.linalg.inv(normal), weight > 0)
+    return Circle(float(centre[0]), float(centre[1]), radius, np.asarray(np.linalg.inv(normal), np.float64), weight > 0)
 
 
 def _tukey(scaled: Array) -> Array:
@@ -263,7 +263,7 @@ def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: fl
     if not good.any():
         return None
     centres, radii = centres[good], radii[good]
-    gap = np.hypot(some[:, 0] - centres[:, :1], some[:, 1] - centres[:, 1:]) - radii[:, None]
+    gap = np.sqrt((some[:, 0] - centres[:, :1]) ** 2 + (some[:, 1] - centres[:, 1:]) ** 2) - radii[:, None]
     behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
     cost = np.where(behind, CUT**2, np.minimum((gap / noise_mm) ** 2, CUT**2))
     best = int(cost.sum(1).argmin())
@@ -309,7 +309,7 @@ def _seen_faces(local: Array, below: Array, low: Array, high: Array, eye: Array)
     faces = np.concatenate([low, high])
     for _ in range(2):
         gaps = np.abs(np.concatenate([local, local], axis=1) - faces)
-        nearest = np.c_[gaps, np.abs(below)].argmin(1)
+        nearest = np.column_stack([gaps, np.abs(below)]).argmin(1)
         top = local[nearest == 4]
         for face, seen in enumerate((*(eye < low), *(eye > high))):
             own = local[nearest == face, face % 2]
@@ -357,7 +357,7 @@ def fit_lying(points: Array, box: Cuboid, along_length: bool, eye: Array) -> Lyi
         rho = np.maximum(np.hypot(arms[:, 0], arms[:, 1]), 1e-9)
         error = rho - radius
         weight = _tukey(error / max(2.0, 1.4826 * float(np.median(np.abs(error)))))
-        design = np.c_[-along * arms[:, 0] / rho, -arms[:, 0] / rho, -arms[:, 1] / rho - 1.0]
+        design = np.column_stack([-along * arms[:, 0] / rho, -arms[:, 0] / rho, -arms[:, 1] / rho - 1.0])
         normal = design.T @ (design * weight[:, None]) + 1e-6 * np.eye(3)
         move = -np.linalg.solve(normal, design.T @ (weight * error))
         yaw, offset, radius = yaw + float(move[0]), offset + float(move[1]), radius + float(move[2])

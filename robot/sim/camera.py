@@ -7,19 +7,23 @@ structured-light or time-of-flight sensor. Camera frame: x right, y down, z forw
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from robot.errors import SceneError
-from robot.sim.light import Floats, Lamps, Surfaces, developed, radiance
+from robot.sim.light import GAMMA, Floats, Lamps, Surfaces, developed, radiance
+from robot.sim.objects.body import Body
 from robot.sim.objects.draw import SimObject
 from robot.sim.objects.materials import ObjectMaterial
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
+Pixels = npt.NDArray[np.intp]
+"""Places of pixels in a picture, row by row."""
+
 _NOISE = 1.5
 """Grey levels of the sensor's noise."""
 _LENS_BLUR_PX = 0.45
@@ -53,6 +57,11 @@ class Placement:
     def to_object(self, points: Array) -> Array:
         """(N, 3) points of the rig frame in the object's."""
         return (points - [self.x_mm, self.y_mm, 0.0]) @ self.rotation()
+
+    def corners(self, body: Body) -> Array:
+        """(8, 3): of the body's bounding box, in the rig frame."""
+        box = np.stack(np.meshgrid(*zip(body.lower, body.upper, strict=True)), axis=-1).reshape(-1, 3)
+        return np.asarray(box @ self.rotation().T + [self.x_mm, self.y_mm, 0.0])
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,29 @@ class PinholeCamera:
         local /= np.linalg.norm(local, axis=1, keepdims=True)
         return np.asarray(local @ self.to_rig[:3, :3].T)
 
+    @cached_property
+    def table_mm(self) -> Array:
+        """(px * px,): how far along each ray the table is. Raises SceneError where a ray never meets it."""
+        if not self.rays[:, 2].max() < 0:
+            raise SceneError(f"the camera must see nothing but the table behind the object, got {self}")
+        return -self.position_mm[2] / self.rays[:, 2]
+
+    @cached_property
+    def table(self) -> Array:
+        """(px * px, 3): where each ray meets the table, in the rig frame."""
+        return self.position_mm + self.table_mm[:, None] * self.rays
+
+    def pixels_round(self, corners: Array) -> Pixels:
+        """The pixels, in order, of the upright rectangle that holds a convex thing with these corners (N, 3)."""
+        x, y, forward = ((corners - self.position_mm) @ self.to_rig[:3, :3]).T
+        if forward.min() <= 0:  # it reaches behind the camera
+            return np.arange(self.px * self.px)
+        spans = []
+        for along in (y, x):
+            place = along / forward * self.focal_px + self.px / 2
+            spans.append(np.arange(max(0, math.floor(place.min())), min(self.px, math.ceil(place.max()))))
+        return np.asarray((spans[0][:, None] * self.px + spans[1]).ravel())
+
 
 @dataclass(frozen=True)
 class Lighting:
@@ -123,9 +155,9 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What the camera meets: `distance_mm` along each ray, and which pixels are the object's; both (px * px,).
+    """What the camera meets: `distance_mm` along each ray, (px * px,), and `points` (px * px, 3) of the rig frame.
 
-    `detail_mm`: the size of a pixel on the object.
+    `pixels`: those of the object. `detail_mm`: the size of a pixel on the object.
     """
 
     obj: SimObject
@@ -133,22 +165,34 @@ class CameraView:
     camera: PinholeCamera
     detail_mm: float
     distance_mm: Array
-    is_object: npt.NDArray[np.bool_]
     points: Array = field(repr=False)
+    pixels: Pixels
+
+    @cached_property
+    def is_object(self) -> npt.NDArray[np.bool_]:
+        """(px * px,): which pixels are the object's."""
+        mask = np.zeros(len(self.points), bool)
+        mask[self.pixels] = True
+        return mask
+
+    @cached_property
+    def on_object(self) -> Array:
+        """Points of the object's pixels in its own frame."""
+        return self.placement.to_object(self.points[self.pixels])
 
 
 def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraView:
-    """The geometry pass: the nearest of object and table along each ray."""
-    origin, rays = np.asarray(camera.position_mm), camera.rays
-    if not rays[:, 2].max() < 0:
-        raise SceneError(f"the camera must see nothing but the table behind the object, got {camera}")
-    table = -origin[2] / rays[:, 2]
+    """The geometry pass: the nearest of object and table along each ray. Only rays near the object are cast."""
+    distance, points = camera.table_mm.copy(), camera.table.copy()
+    pixels = camera.pixels_round(placement.corners(obj.body))
+    origin, rays = np.asarray(camera.position_mm), camera.rays[pixels]
     origins = np.broadcast_to(placement.to_object(origin[None]), rays.shape)
     detail_mm = float(np.linalg.norm(np.subtract(camera.target_mm, camera.position_mm))) / camera.focal_px
     hit = obj.body.cast(origins, rays @ placement.rotation(), detail_mm)
-    is_object = hit < table
-    distance = np.where(is_object, hit, table)
-    return CameraView(obj, placement, camera, detail_mm, distance, is_object, origin + distance[:, None] * rays)
+    seen = hit < distance[pixels]
+    pixels, hit = pixels[seen], hit[seen]
+    distance[pixels], points[pixels] = hit, origin + hit[:, None] * rays[seen]
+    return CameraView(obj, placement, camera, detail_mm, distance, points, pixels)
 
 
 # Photo ------------------------------------------------------------------------------------------------------
@@ -157,15 +201,15 @@ def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraV
 def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
     """(px, px, 3) RGB."""
     px = view.camera.px
-    light = np.asarray(lighting.direction)
-    normals = np.tile([0.0, 0.0, 1.0], (px * px, 1))
-    normals[view.is_object] = _object_normals(view)
-    seen = _lamp_seen(view, normals, light) if shadow else np.ones(px * px, np.float32)
+    light, own = np.asarray(lighting.direction), _object_normals(view)
+    normals = np.zeros((px * px, 3), np.float32)
+    normals[:, 2], normals[view.pixels] = 1, own
+    seen = _lamp_seen(view, own, light) if shadow else np.ones(px * px, np.float32)
     hidden = hidden_sky(view.is_object.reshape(px, px))
-    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), _colour(view, lighting))
+    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), _reflectance(view, lighting))
     linear = radiance(surfaces, _lamps(lighting, view.obj.material))
     linear = cv2.GaussianBlur(linear.reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
-    noise = np.random.default_rng([72, noise_seed]).normal(0.0, _NOISE, linear.shape)
+    noise = _NOISE * np.random.default_rng([72, noise_seed]).standard_normal(linear.shape)
     return developed(linear, noise)
 
 
@@ -180,19 +224,33 @@ def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
 
 def _object_normals(view: CameraView) -> Array:
     """Normals of the object's pixels, taken across about one pixel so that finer relief does not flicker."""
-    points = view.placement.to_object(view.points[view.is_object])
-    return view.obj.body.normals(points, 0.4 * view.detail_mm) @ view.placement.rotation().T
+    return view.obj.body.normals(view.on_object, 0.4 * view.detail_mm) @ view.placement.rotation().T
 
 
-def _lamp_seen(view: CameraView, normals: Array, light: Array) -> Floats:
-    """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size."""
-    px = view.camera.px
-    starts = view.placement.to_object(view.points + _OFF_SURFACE_MM * normals)
-    facing = normals @ light > 0
+def _lamp_seen(view: CameraView, own: Array, light: Array) -> Floats:
+    """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size.
+
+    own: (n, 3), the normals at the object's pixels.
+    """
+    px, facing, table = view.camera.px, own @ light > 0, near_shadow(view, light)
+    pixels, up = np.concatenate([view.pixels[facing], table]), np.broadcast_to([0.0, 0.0, 1.0], (len(table), 3))
+    starts = view.placement.to_object(view.points[pixels] + _OFF_SURFACE_MM * np.concatenate([own[facing], up]))
+    towards = np.broadcast_to(light @ view.placement.rotation(), starts.shape)
     seen = np.ones(px * px, np.float32)
-    towards = np.broadcast_to(light @ view.placement.rotation(), starts[facing].shape)
-    seen[facing] = ~np.isfinite(view.obj.body.cast(starts[facing], towards, _SHADOW_DETAIL * view.detail_mm))
+    seen[pixels] = ~view.obj.body.hit(starts, towards, _SHADOW_DETAIL * view.detail_mm)
     return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
+
+
+def near_shadow(view: CameraView, light: Array) -> Pixels:
+    """The table's pixels in the upright rectangle that holds the shadow of the object's bounding box."""
+    if not light[2] > 0:
+        return np.zeros(0, np.intp)
+    corners, table = view.placement.corners(view.obj.body), view.camera.table
+    fallen = corners - light * ((corners[:, 2:] - _OFF_SURFACE_MM) / light[2])
+    inside = ~view.is_object
+    for axis in (0, 1):
+        inside &= (table[:, axis] >= fallen[:, axis].min()) & (table[:, axis] <= fallen[:, axis].max())
+    return np.flatnonzero(inside)
 
 
 def hidden_sky(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
@@ -208,25 +266,32 @@ def hidden_sky(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floa
     return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))
 
 
-def _colour(view: CameraView, lighting: Lighting) -> Floats:
-    """(px * px, 3): of the object its linear reflectance, of the table its grey levels, 0..1."""
-    colour = _table(lighting.table_seed, view.points)
-    colour[view.is_object] = view.obj.looks.albedo(view.placement.to_object(view.points[view.is_object]))
+def _reflectance(view: CameraView, lighting: Lighting) -> Floats:
+    """(px * px, 3) linear, 0..1."""
+    colour = _table(lighting.table_seed, view.camera)
+    colour[view.pixels] = view.obj.looks.albedo(view.on_object)
     return colour
 
 
-def _table(seed: int, points: Array) -> Floats:
-    """Colour (px * px, 3) of the table top under points of the rig frame: weakly streaked like wood, or speckled."""
+def _table(seed: int, camera: PinholeCamera) -> Floats:
+    """Reflectance (px * px, 3) of the table top at the camera's pixels: weakly streaked like wood, or speckled."""
     rng = np.random.default_rng([71, seed])
     colour = np.clip(rng.uniform(0.35, 0.85) + rng.uniform(-0.08, 0.08, 3), 0, 1)
     streaks, strength = int(rng.choice([24, 64, 160])), rng.uniform(0.02, 0.09)
     grain = cv2.resize(rng.uniform(-1, 1, (160, streaks)).astype(np.float32), _TABLE_PX, interpolation=cv2.INTER_CUBIC)
     grain += 0.5 * cv2.resize(rng.uniform(-1, 1, (9, 9)).astype(np.float32), _TABLE_PX)
-    at = (points[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
-    at = at.reshape(math.isqrt(len(points)), -1, 2)  # OpenCV wants pictures, and no side of more than 32,767
-    shade = cv2.remap(grain, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    tone = 1 + np.float32(strength) * shade.reshape(-1, 1)
-    return np.asarray(np.clip(colour.astype(np.float32) * tone, 0, 1))
+    shade = cv2.remap(grain, *_grain_places(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    # Colour and grain are grey levels: of their product each has its own power, of which the grain's serves three.
+    tone = cv2.pow(1 + np.float32(strength) * shade, GAMMA).reshape(-1, 1)
+    return np.asarray(np.minimum(tone * (colour**GAMMA).astype(np.float32), 1))
+
+
+@lru_cache(maxsize=4)
+def _grain_places(camera: PinholeCamera) -> tuple[Floats, Floats]:
+    """Column and row of the table's grain at each pixel, both (px, px)."""
+    at = (camera.table[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
+    column, row = np.ascontiguousarray(at.T).reshape(2, camera.px, camera.px)
+    return column, row
 
 
 # Depth ------------------------------------------------------------------------------------------------------
@@ -242,7 +307,7 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     rng = np.random.default_rng([73, noise_seed])
     forward = view.camera.to_rig[:3, 2]
     exact = (view.distance_mm * (view.camera.rays @ forward)).reshape(px, px)
-    noisy = _flying(exact, rng) + rng.normal(0.0, 1.5, exact.shape) * (exact / 700.0) ** 2
+    noisy = _flying(exact, rng) + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
     noisy[_holes(view, exact, rng)] = np.nan
     return (np.round(noisy) / 1000.0).astype(np.float32)
 
@@ -251,8 +316,8 @@ def _flying(exact: Array, rng: np.random.Generator) -> Array:
     """Beside an edge a pixel may mix the near and the far surface."""
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(exact, window), cv2.dilate(exact, window)
-    mixed = near + rng.uniform(0.0, 1.0, exact.shape) * (far - near)
-    return np.where((far - near > 12.0) & (rng.uniform(size=exact.shape) < 0.35), mixed, exact)
+    mixed = near + rng.random(exact.shape) * (far - near)
+    return np.where((far - near > 12.0) & (rng.random(exact.shape) < 0.35), mixed, exact)
 
 
 def _holes(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -261,4 +326,4 @@ def _holes(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDAr
     steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))
     gloss = np.where(view.is_object, view.obj.material.gloss, 0.0).reshape(px, px)
     chance = 0.003 + 0.5 * (steep > 6.0) + 0.06 * gloss
-    return np.asarray(rng.uniform(size=exact.shape) < chance)
+    return np.asarray(rng.random(exact.shape) < chance)

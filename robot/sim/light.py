@@ -16,11 +16,10 @@ GAMMA = 2.2
 
 class Surfaces(NamedTuple):
     """Of each pixel, (n,) or (n, 3): its ray and outward normal, whether it is the object's, how much of the lamp it
-    sees and how much of the sky around is hidden by the object (0..1), and the colour there before any light: of the
-    object its reflectance, of the table its grey levels from 0 to 1."""
+    sees and how much of the sky around is hidden by the object (0..1), and the linear reflectance there."""
 
     rays: Array
-    normals: Array
+    normals: Floats
     is_object: NDArray[np.bool_]
     lamp_seen: Floats
     hidden: Floats
@@ -55,10 +54,10 @@ def developed(linear: Floats, noise: Array) -> Picture:
 @compiled
 def _shade(surfaces, lamps, out):  # type: ignore[no-untyped-def]
     x, y, z = np.float32(lamps.direction[0]), np.float32(lamps.direction[1]), np.float32(lamps.direction[2])
-    sharpness, gamma = np.float32(lamps.sharpness), np.float32(GAMMA)
+    sharpness = np.float32(lamps.sharpness)
     for i in range(len(out)):
-        n_x, n_y = np.float32(surfaces.normals[i, 0]), np.float32(surfaces.normals[i, 1])
-        n_z, is_object = np.float32(surfaces.normals[i, 2]), surfaces.is_object[i]
+        n_x, n_y, n_z = surfaces.normals[i, 0], surfaces.normals[i, 1], surfaces.normals[i, 2]
+        is_object = surfaces.is_object[i]
         lit = max(n_x * x + n_y * y + n_z * z, np.float32(0)) * surfaces.lamp_seen[i]
         above = np.float32(0.6) + np.float32(0.4) * n_z
         if not is_object:
@@ -74,8 +73,6 @@ def _shade(surfaces, lamps, out):  # type: ignore[no-untyped-def]
                 shine = gloss * np.exp(sharpness * np.log(cosine))
         for channel in range(3):
             colour = surfaces.colour[i, channel]
-            if not is_object:
-                colour = np.exp(gamma * np.log(colour)) if colour > 0 else np.float32(0)
             lamp, sky = np.float32(lamps.lamp[channel]), np.float32(lamps.sky[channel])
             out[i, channel] = colour * (lit * lamp + above * sky) + shine * lamp
 

@@ -24,7 +24,16 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, content_of, file_content, object_of, storage_errors, sync_folder, write_file
+from robot.storage import (
+    append_line,
+    content_of,
+    file_content,
+    object_of,
+    storage_errors,
+    sync_folder,
+    write_file,
+    write_files,
+)
 from robot.workers import Jobs, Work
 
 INFO_FILE = "pictures.json"
@@ -138,11 +147,12 @@ def _done(path: Path) -> dict[str, int]:
 
 def _write(folder: Path, kind: str, object_id: str, pictures: Pictures, labels: Mapping[str, Any]) -> int:
     """Write an object's pictures, then its lines at once; returns how many pictures it has."""
-    files = {}
+    files, contents = {}, {}
     for name, pixels in pictures.items():
         data, suffix = file_content(name, pixels)
         files[name] = f"{IMAGES_FOLDER}/{object_id}-{name}{suffix}"
-        write_file(folder / files[name], data)
+        contents[folder / files[name]] = data
+    write_files(contents)
     rows = []
     for name in files:
         if name.endswith("_before"):

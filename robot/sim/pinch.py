@@ -82,6 +82,7 @@ class Pinch:
     seed: int
     passes: Counter[str]
     _solved: dict[str, Contact] = field(default_factory=dict, init=False, repr=False)
+    _lit: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Raises SceneError for a force that no gripper has."""
@@ -185,8 +186,10 @@ class Pinch:
         """The gel image while the object is held."""
         if self.missed:
             return self.sensors[finger].background(noise_seed)
-        self.passes["gel"] += 1
-        return self.sensors[finger].render(self.contact(finger).displacement_mm, noise_seed)
+        if finger not in self._lit:
+            self.passes["gel"] += 1
+            self._lit[finger] = self.sensors[finger].lit(self.contact(finger).displacement_mm)
+        return self.sensors[finger].taken(self._lit[finger], noise_seed)
 
     # What comes of it ---------------------------------------------------------------------------------------
 

@@ -85,7 +85,7 @@ class GelSensor:
 
     def background(self, seed: int) -> Picture:
         """The untouched gel: (rows, cols, 3) uint8 RGB; the same as render() of no displacement."""
-        return self._exposed(_untouched(self), seed)
+        return self.taken(_untouched(self), seed)
 
     def render(self, displacement_mm: NDArray[Any], seed: int) -> Picture:
         """The picture of a pressed gel: (rows, cols, 3) uint8 RGB.
@@ -93,13 +93,14 @@ class GelSensor:
         `displacement_mm`: (r, c), inwards, on any grid that covers the field. `seed` makes the noise alone.
         Raises SceneError for a map that is empty, has another number of axes, or is not finite.
         """
+        return self.taken(self.lit(displacement_mm), seed)
+
+    def lit(self, displacement_mm: NDArray[Any]) -> Array:
+        """Grey levels (rows, cols, 3) before noise and clipping, with which all pictures of one press begin."""
         surface = Surface(displacement_mm, self.field)
-        if not surface.displacement_mm.any():
-            return self._exposed(_untouched(self), seed)
-        return self._exposed(self._clean(surface), seed)
+        return self._clean(surface) if surface.displacement_mm.any() else _untouched(self)
 
     def _clean(self, surface: Surface) -> Array:
-        """Grey levels (rows, cols, 3) before noise and clipping."""
         slope_x, slope_y = surface.slopes
         dark: Array | None = None
         if self.flaws is not None:
@@ -114,8 +115,8 @@ class GelSensor:
         image *= np.array(self.tint, np.float32) * np.float32(self.exposure)
         return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
 
-    def _exposed(self, clean: Array, seed: int) -> Picture:
-        """With noise, rounded and clipped to 0..255."""
+    def taken(self, clean: Array, seed: int) -> Picture:
+        """The picture that the camera takes of what `lit` gives: with noise, rounded and clipped to 0..255."""
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         out = np.empty(clean.shape, np.uint8)

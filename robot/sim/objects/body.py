@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robot.errors import SceneError
 from robot.sim.objects.boxes import clipped
 from robot.sim.objects.formula import record
-from robot.sim.objects.packets import Formula, Worn, first_hits, gradients
+from robot.sim.objects.packets import Formula, Worn, first_hits, gradients, hits
 from robot.sim.objects.relief import Relief
 from robot.sim.objects.shapes.base import Floats, Points, Shape
 from robot.sim.objects.wall import Level, Wall, bake
@@ -49,11 +49,18 @@ class Body(ABC):
         `step_mm`: the finest detail that matters; a camera gives the size of its pixel on the object, and is served
         faster. Raises SceneError.
         """
+        return self._cast(self._clipped(origins, directions, step_mm))
+
+    def hit(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> NDArray[np.bool_]:
+        """Which rays hit, (N,), as by `cast`; where they do is left out. Raises SceneError."""
+        return self._hit(self._clipped(origins, directions, step_mm))
+
+    def _clipped(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
         start, along = _plain(origins), _plain(directions)
         if start.ndim != 2 or start.shape[1] != 3 or start.shape != along.shape:
             raise SceneError(f"rays must be two arrays of shape (N, 3), got {start.shape} and {along.shape}")
         near, far = clipped(start, along, self.lower, self.upper)
-        return self._cast(ClippedRays(start, along, near, far, step_mm))
+        return ClippedRays(start, along, near, far, step_mm)
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Outward unit normals (N, 3) at points (N, 3) on the surface, relief included, smoothed over `step_mm`."""
@@ -71,6 +78,10 @@ class Body(ABC):
     @abstractmethod
     def _cast(self, rays: ClippedRays) -> Vectors:
         """Distances from the rays' origins, (N,); inf for a miss."""
+
+    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
+        """Whether there is a hit, (N,); a subclass may know without the distance."""
+        return np.isfinite(self._cast(rays))
 
     @abstractmethod
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
@@ -144,6 +155,10 @@ class SdfBody(Body):
     def _cast(self, rays: ClippedRays) -> Vectors:
         worn = self._worn(rays.step_mm)
         return first_hits(worn, rays.origins, rays.directions, rays.near_mm, rays.far_mm, rays.step_mm)
+
+    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
+        worn = self._worn(rays.step_mm)
+        return hits(worn, rays.origins, rays.directions, rays.near_mm, rays.far_mm, rays.step_mm)
 
 
 _BARE = Level(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)

@@ -165,12 +165,33 @@ def first_hits(
 ) -> Vectors:
     """Distance (n,) along rays (n, 3) to the first place where f is 0, looked for from `near` to `far`; inf: none.
     `step_mm` is the finest detail that matters."""
-    found = np.full((4, len(near)), np.inf, np.float32)
     rows = _rows_of(worn)
-    _march(worn, rows, origins, directions, near, far, np.float32(0.5 * step_mm), found)
+    found = _crossed(worn, rows, origins, directions, near, far, step_mm)
     out = np.full(len(near), np.inf)
     _refine(worn, rows, origins, directions, near, found, out)
     return out
+
+
+def hits(
+    worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, step_mm: float
+) -> NDArray[np.bool_]:
+    """Which rays have such a first hit, (n,)."""
+    return np.asarray(np.isfinite(_crossed(worn, _rows_of(worn), origins, directions, near, far, step_mm)[0]))
+
+
+def _crossed(
+    worn: Worn,
+    rows: tuple[Floats, Floats],
+    origins: Vectors,
+    directions: Vectors,
+    near: Vectors,
+    far: Vectors,
+    step_mm: float,
+) -> Floats:
+    """What `_march` finds, (4, n)."""
+    found = np.full((4, len(near)), np.inf, np.float32)
+    _march(worn, rows, origins, directions, near, far, np.float32(0.5 * step_mm), found)
+    return found
 
 
 def _rows_of(worn: Worn) -> tuple[Floats, Floats]:
@@ -242,7 +263,7 @@ def _gradients(worn, rows, points, half, out):  # type: ignore[no-untyped-def]
 
 # Rays --------------------------------------------------------------------------------------------------------
 
-_ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _LANE_ROWS = 0, 3, 6, 7, 8, 9
+_ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _ROOM, _STEPS, _LANE_ROWS = 0, 3, 6, 7, 8, 9, 10, 11
 
 
 @compiled
@@ -257,19 +278,20 @@ def _march(worn, rows, origins, directions, near, far, finest, found):  # type: 
     result, worn_out = worn.distance.results[0], worn.height_mm.size > 0
     highest = np.float32(worn.highest_mm)
     bound = np.float32(1 + worn.slope) if worn_out else np.float32(1)
-    lanes = np.empty((_LANE_ROWS, LANES), np.float32)
+    lanes = np.zeros((_LANE_ROWS, LANES), np.float32)
     gaps = np.empty(LANES, np.float32)
-    ray, step, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    ray, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     upcoming, count = 0, 0
     while True:
         while count < LANES and upcoming < len(near):
             if near[upcoming] <= far[upcoming]:
-                ray[count], step[count] = upcoming, 0
+                ray[count] = upcoming
+                lanes[_ROOM, count] = np.float32(far[upcoming] - near[upcoming])
                 for axis in range(3):
                     start = origins[upcoming, axis] + near[upcoming] * directions[upcoming, axis]
                     lanes[_ORIGIN + axis, count] = np.float32(start)
                     lanes[_DIRECTION + axis, count] = np.float32(directions[upcoming, axis])
-                lanes[_T, count] = lanes[_BEFORE, count] = lanes[_F_BEFORE, count] = np.float32(0)
+                lanes[_T, count] = lanes[_BEFORE, count] = lanes[_F_BEFORE, count] = lanes[_STEPS, count] = 0
                 count += 1
             upcoming += 1
         if count == 0:
@@ -298,37 +320,29 @@ def _march(worn, rows, origins, directions, near, far, finest, found):  # type: 
             base[0, i] = gaps[i]
         for k in range(touched):
             base[0, low[k]] = gaps[low[k]] + highest - wear[0, k]
-        i = 0
+        for i in range(count):
+            if base[0, i] <= 0:
+                found[0, ray[i]], found[1, ray[i]] = lanes[_T, i], base[0, i]
+                found[2, ray[i]], found[3, ray[i]] = lanes[_BEFORE, i], lanes[_F_BEFORE, i]
+        for i in range(LANES):
+            f, gap, t, outside = base[0, i], gaps[i], lanes[_T, i], gaps[i] > 0
+            stride = finest * min(max(lanes[_STEPS, i] / np.float32(40), np.float32(1)), np.float32(4))
+            forward = f / bound if f / bound > gap else gap
+            forward += stride if outside else np.float32(0)
+            # f is not known outside the shell: 0 asks for it to be worked out.
+            lanes[_F_BEFORE, i] = np.float32(0) if outside else f
+            lanes[_BEFORE, i] = t + gap if outside else t
+            lanes[_T, i] = t + (forward if forward > stride else stride)
+            lanes[_STEPS, i] += np.float32(1)
         end = count
-        while i < end:
-            f, gap, t = base[0, i], gaps[i], lanes[_T, i]
-            number = ray[i]
-            over = False
-            if f <= 0:
-                found[0, number], found[1, number] = t, f
-                found[2, number], found[3, number] = lanes[_BEFORE, i], lanes[_F_BEFORE, i]
-                over = True
-            else:
-                stride = finest * np.float32(min(max(step[i] / 40, 1.0), 4.0))
-                forward = max(gap, f / bound)
-                if gap > 0:
-                    # f is not known outside the shell: 0 asks for it to be worked out.
-                    forward += stride
-                    lanes[_BEFORE, i], lanes[_F_BEFORE, i] = t + gap, np.float32(0)
-                else:
-                    lanes[_BEFORE, i], lanes[_F_BEFORE, i] = t, f
-                lanes[_T, i] = t + max(stride, forward)
-                step[i] += 1
-                over = lanes[_BEFORE, i] > far[number] - near[number] or step[i] >= MOST_STEPS
-            if over:
-                # The last lane comes here, with what was worked out for it.
-                end -= 1
-                base[0, i], gaps[i], ray[i], step[i] = base[0, end], gaps[end], ray[end], step[end]
-                for row in range(_LANE_ROWS):
-                    lanes[row, i] = lanes[row, end]
-            else:
-                i += 1
-        count = end
+        count = 0
+        for i in range(end):
+            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < MOST_STEPS:
+                if count < i:
+                    ray[count] = ray[i]
+                    for row in range(_LANE_ROWS):
+                        lanes[row, count] = lanes[row, i]
+                count += 1
 
 
 @compiled
