@@ -171,3 +171,15 @@ def test_ranking_float32_probabilities_ties_where_logits_do_not():
     logits = torch.tensor([17.5, 18.0, 25.0])
     assert len(torch.sigmoid(logits).unique()) == 1  # naive: all are exactly 1
     assert torch.argsort(logits, descending=True).tolist() == [2, 1, 0]
+
+
+def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():
+    """Convolutions in training take longer where they lie in memory channel by channel."""
+    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8), views=2)
+    strips = torch.rand(3, 16, 32, 3).permute(0, 3, 1, 2)  # as `to_batch` gives them
+    seen = []
+    matcher.photo_tower.register_forward_pre_hook(lambda _, images: seen.extend(images))
+    matcher.photo_features(strips)
+    expected = [strips[photo, :, :, 16 * view : 16 * view + 16] for photo in range(3) for view in range(2)]
+    assert torch.equal(seen[0], torch.stack(expected))
+    assert seen[0].is_contiguous(memory_format=torch.channels_last)

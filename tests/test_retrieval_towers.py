@@ -276,3 +276,17 @@ def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_p
     initialise_tower(tower, "mobilenet_v2", str(tmp_path / "weights.pth"))
     assert not any(key.startswith("features.18") for key in tower.state_dict())
     torch.testing.assert_close(tower.features[17].conv[2].weight, source.features[17].conv[2].weight)
+
+
+def test_group_norms_of_the_small_tower_stay_in_float32_where_convolutions_do_not():
+    """PyTorch's own rounds to bfloat16 what the norm gives, and is slow at that."""
+    tower = build_tower("small", "pooled")
+    norm = next(module for module in tower.modules() if isinstance(module, nn.GroupNorm))
+    images = torch.rand(2, norm.num_channels, 8, 8, generator=torch.Generator().manual_seed(0)).bfloat16()
+    exact = nn.functional.group_norm(images.float(), norm.num_groups)
+    with torch.autocast("cpu", torch.bfloat16):
+        ours, naive = norm(images), nn.functional.group_norm(images, norm.num_groups)
+        assert tower.stages[0](torch.zeros(1, 3, 8, 8)).dtype == torch.bfloat16
+    assert ours.dtype == torch.float32
+    torch.testing.assert_close(ours, exact)
+    assert (naive.float() - exact).abs().max() > 1e-3

@@ -52,19 +52,26 @@ def sync(path: Path) -> None:
 def write_atomically(path: Path, data: bytes) -> None:
     """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before, whenever the power
     fails. Where it is a link, the file that it leads to is written. Raises OSError that names `path`."""
-    with naming(path):
-        place = path.resolve() if path.is_symlink() else path
-        _sweep(place)
-        with _beside(place) as (temporary, descriptor):
-            with open(descriptor, "wb", closefd=False) as file:
-                file.write(data)
-            os.fsync(descriptor)
-            temporary.replace(place)
-        try:
-            sync(place.parent)
-        except OSError as error:
-            if error.errno not in _UNFLUSHED:
-                raise
+    with naming(path), replacing(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write what `path` shall hold, as `write_atomically` does it, piece by piece; where the block raises,
+    `path` stays as it was."""
+    place = path.resolve() if path.is_symlink() else path
+    _sweep(place)
+    with _beside(place) as (temporary, descriptor):
+        with open(descriptor, "wb", closefd=False) as file:
+            yield file
+        os.fsync(descriptor)
+        temporary.replace(place)
+    try:
+        sync(place.parent)
+    except OSError as error:
+        if error.errno not in _UNFLUSHED:
+            raise
 
 
 @contextmanager

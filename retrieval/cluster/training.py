@@ -27,6 +27,7 @@ def train_by_ray(
     *,
     split: Split | None = None,
     resume: bool = False,
+    cache: Path | None = None,
     workers: int = 2,
     cpus: int | None = None,
 ) -> Checkpoint:
@@ -45,6 +46,7 @@ def train_by_ray(
         "config": config,
         "split": split,
         "resume": resume,
+        "cache": cache and cache.resolve(),
     }
     with connected(cpus) as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError
@@ -77,7 +79,7 @@ def train_by_ray(
 def _rank(asked: dict[str, Any]) -> None:
     """Train in a process of Ray Train, which has joined the ranks."""
     resume = asked["resume"] or state_path(asked["out"]).exists()
-    train(asked["recording"], asked["out"], asked["config"], split=asked["split"], resume=resume)
+    train(asked["recording"], asked["out"], asked["config"], split=asked["split"], resume=resume, cache=asked["cache"])
 
 
 def _ours(error: BaseException) -> RetrievalError | None:

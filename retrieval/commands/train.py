@@ -46,6 +46,12 @@ def train(
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            help="folder where decoded images are kept, for towers that are trained: later trainings read them"
+        ),
+    ] = None,
     cluster: Annotated[
         bool, typer.Option("--cluster", help="Ray Train starts the ranks: that of RAY_ADDRESS, else one here")
     ] = False,
@@ -56,7 +62,7 @@ def train(
     if (cluster and task != "match") or (workers is not None and not cluster):
         raise BadInput("--cluster trains matchers (--task match), and --workers says on how many ranks")
     if task == "grasp-success":
-        for name, value in {"config": config, "split": split, "resume": resume, **inits}.items():
+        for name, value in {"config": config, "split": split, "resume": resume, "cache": cache, **inits}.items():
             if value:
                 option = "--" + name.replace("_", "-")
                 raise BadInput(f"{option} is of matchers; --task grasp-success takes --iterations and --seed")
@@ -67,7 +73,7 @@ def train(
             raise BadInput(
                 "--task relief needs no split and no pairs, and makes what --init-photo and --init-touch take"
             )
-        _train_relief(recording, out, config, init, iterations, seed, resume)
+        _train_relief(recording, out, config, init, iterations, seed, resume, cache)
         return
     from retrieval.search import defaults
     from retrieval.training import distributed
@@ -75,7 +81,7 @@ def train(
 
     try:
         settings = training_config(config, iterations, seed=seed, **inits)
-        asked: dict[str, Any] = {"split": read_split(split), "resume": resume}
+        asked: dict[str, Any] = {"split": read_split(split), "resume": resume, "cache": cache}
         if cluster:
             from retrieval.cluster.training import train_by_ray
 
@@ -100,12 +106,13 @@ def _train_relief(
     iterations: int | None,
     seed: int | None,
     resume: bool,
+    cache: Path | None,
 ) -> None:
     from retrieval.training.relief import ITERATIONS, train_relief
 
     settings = training_config(config, None, init=init, seed=seed)
     steps = ITERATIONS if iterations is None else iterations
-    report = train_relief(pictures, out, settings, iterations=steps, resume=resume)
+    report = train_relief(pictures, out, settings, iterations=steps, resume=resume, cache=cache)
     for line in report.lines():
         say(line)
     say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")

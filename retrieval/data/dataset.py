@@ -369,13 +369,13 @@ class ImageCache:
     Safe to call from several threads; an image that no longer fits is loaded again each time.
     """
 
-    def __init__(self, load: Callable[..., NDArray[np.float32]], limit_bytes: int = 4 << 30) -> None:
+    def __init__(self, load: Callable[..., NDArray[Any]], limit_bytes: int = 4 << 30) -> None:
         self._load, self._limit = load, limit_bytes
-        self._kept: dict[tuple[Path | None, ...], NDArray[np.float32]] = {}
+        self._kept: dict[tuple[Path | None, ...], NDArray[Any]] = {}
         self._used = 0
 
-    def __call__(self, *paths: Path | None) -> NDArray[np.float32]:
-        """The image that `load(*paths)` gives, (H, W, 3) float32."""
+    def __call__(self, *paths: Path | None) -> NDArray[Any]:
+        """The image that `load(*paths)` gives."""
         if (image := self._kept.get(paths)) is None:
             image = self._load(*paths)
             if self._used + image.nbytes <= self._limit:

@@ -135,7 +135,10 @@ class Matcher(nn.Module):
     def photo_features(self, photos: Tensor) -> Tensor:
         """Features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
         if self.views > 1:
-            photos = photos.reshape(*photos.shape[:3], self.views, -1).permute(0, 3, 1, 2, 4).flatten(0, 1)
+            # Copied once, with channels last: convolutions in training take 1.4 times as long otherwise.
+            count, _, height, _ = photos.shape
+            side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
+            photos = side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
         features: Tensor = self.photo_tower(photos)
         return features.float().view(len(photos) // self.views, -1)
 

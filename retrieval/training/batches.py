@@ -19,6 +19,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
+from retrieval.training.kept import KeptImages
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class BatchImages:
     def __init__(self, config: Config, device: torch.device, *, threads: int = 2, keep_bytes: int = 4 << 30) -> None:
         self.config, self.device = config, device
         self.uses_background = config.preprocessing.background != "none"
-        self._touch = ImageCache(config.preprocessing.load_touch, keep_bytes)
-        self._photo = ImageCache(config.preprocessing.load_photo, keep_bytes)
+        self._touch: ImageCache | KeptImages = ImageCache(config.preprocessing.load_touch, keep_bytes)
+        self._photo: ImageCache | KeptImages = ImageCache(config.preprocessing.load_photo, keep_bytes)
         self._ahead = ThreadPoolExecutor(1)
         self._threads = ThreadPoolExecutor(threads)
 
@@ -52,14 +53,18 @@ class BatchImages:
 
     def touch(self, grasp: Grasp) -> list[Image]:
         """The finger images of a grasp, preprocessed. Raises DatasetError where a no-contact frame is missing."""
+        return [self._touch(*files) for files in self._fingers(grasp)]
+
+    def _fingers(self, grasp: Grasp) -> list[tuple[Path, ...]]:
+        """What each finger image of a grasp is read from."""
         if not self.uses_background:
-            return [self._touch(path) for path in grasp.touches]
+            return [(path,) for path in grasp.touches]
         if len(grasp.backgrounds) != len(grasp.touches):
             raise DatasetError(
                 f"the background policy needs a no-contact frame for each finger; {grasp.grasp_id} has "
                 f'{len(grasp.backgrounds)} for {len(grasp.touches)}; set background = "none" or record them'
             )
-        return [self._touch(*pair) for pair in zip(grasp.touches, grasp.backgrounds, strict=True)]
+        return list(zip(grasp.touches, grasp.backgrounds, strict=True))
 
     def files(self, grasp: Grasp) -> tuple[Path, ...]:
         """What the finger images of a grasp are read from."""
@@ -68,6 +73,14 @@ class BatchImages:
     def photo(self, path: Path) -> Image:
         """A photo, preprocessed."""
         return self._photo(path)
+
+    def keep(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
+        """Have the images of these grasps decoded into `folder`, and taken from there from now on (`KeptImages`)."""
+        settings = self.config.preprocessing
+        self._touch = KeptImages(settings.load_touch, folder, "touch", settings.digest())
+        self._touch.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
+        self._photo = KeptImages(settings.load_photo, folder, "photo", settings.digest())
+        self._photo.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
 
 
 class TrainedFeatures(BatchImages):

@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from indexes.store.files import file_digest
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
@@ -29,6 +28,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import batches, default_device, photo_features, touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.training.batches import BatchImages
+from retrieval.training.kept import picture_digest
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -289,7 +289,7 @@ class _Parts(Generic[T]):
         """Where the features of these very images, made in this very way, are kept."""
         if self.cache is None:
             return None
-        digests = [_file_digest(path) for item in items for path in self.files(item)]
+        digests = [picture_digest(path) for item in items for path in self.files(item)]
         key = hashlib.sha256(json.dumps([_FORMAT, len(items), self.made_by, digests]).encode()).hexdigest()
         return self.cache / f"{self.made_by[0]}-{key[:32]}.safetensors"
 
@@ -303,10 +303,3 @@ def _read(path: Path) -> Tensor | None:
     except CheckpointError as error:
         log.warning("%s; its images are encoded again", error)
         return None
-
-
-def _file_digest(path: Path) -> str:
-    try:
-        return file_digest(path)
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error

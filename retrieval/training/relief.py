@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
+from retrieval.data.dataset import ImageCache
 from retrieval.data.images import to_float
 from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, load_labelled
 from retrieval.data.preprocessing import Preprocessing
@@ -31,6 +32,7 @@ from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.fit import Plan, fit, one_ahead
+from retrieval.training.kept import KeptImages
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
 WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
@@ -71,13 +73,21 @@ class ReliefReport:
 
 
 def train_relief(
-    folder: Path, out: Path, config: Config, *, iterations: int = ITERATIONS, resume: bool = False, quiet: bool = False
+    folder: Path,
+    out: Path,
+    config: Config,
+    *,
+    iterations: int = ITERATIONS,
+    resume: bool = False,
+    cache: Path | None = None,
+    quiet: bool = False,
 ) -> ReliefReport:
     """Train a tower of `config` on the pictures in `folder` and write its weights to `out` (.safetensors).
 
     Photos are seen as the view "grey" or "zoom" shows them, touches with and without their background, whichever of
     both the matcher wants (`config.preprocessing`, by which the report judges); the first weights are
-    `config.training.init`. resume: go on from the state beside `out`. Ctrl-C keeps a state and raises Interrupted.
+    `config.training.init`. resume: go on from the state beside `out`. cache: folder where decoded images are kept
+    (`retrieval.training.kept`). Ctrl-C keeps a state and raises Interrupted.
     Raises DatasetError, ConfigError, CheckpointError.
     """
     if iterations < 1:
@@ -90,6 +100,8 @@ def train_relief(
         training.resume(state)
     elif state.exists():
         raise CheckpointError(f"an unfinished training is at {state}; go on with --resume, or delete it to begin anew")
+    if cache:
+        training.keep(cache, quiet=quiet)
     with interruption() as stop, Bar("train relief", iterations, "steps", done=training.step, quiet=quiet) as bar:
         training.run(state, bar, stop.is_set)
     if training.step < iterations:
@@ -130,23 +142,31 @@ class ReliefTraining:
         self.optimizer = torch.optim.AdamW(
             [{"params": self.tower.parameters()}, {"params": self.head.parameters()}], weight_decay=WEIGHT_DECAY
         )
-        self._kept: dict[Path, list[NDArray[np.uint8]]] = {}
+        self._forms: ImageCache | KeptImages = ImageCache(self._load)
 
-    def _load(self, picture: LabelledPicture) -> list[NDArray[np.float32]]:
-        """As the matcher sees the picture; a touch also as a matcher of another policy for the background would."""
+    def _load(self, file: Path, before: Path | None) -> NDArray[np.uint8]:
+        """(forms, H, W, 3) of a picture as the matcher sees it; a touch also as a matcher of another policy for the
+        background would."""
         settings = self.config.preprocessing
         if self.kind == "photo":
-            return [Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(picture.file)]
-        policies = dict.fromkeys((settings.background, *BACKGROUNDS))
-        return [replace(settings, background=policy).load_touch(picture.file, picture.before) for policy in policies]
+            forms = [Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(file)]
+        else:
+            policies = dict.fromkeys((settings.background, *BACKGROUNDS))
+            forms = [replace(settings, background=policy).load_touch(file, before) for policy in policies]
+        return np.rint(255 * np.stack(forms)).astype(np.uint8)
+
+    def keep(self, folder: Path, *, quiet: bool = False) -> None:
+        """Have all pictures decoded into `folder`, and taken from there from now on (`KeptImages`)."""
+        seen_by = replace(self.config.preprocessing, views=("zoom",)).digest()
+        self._forms = KeptImages(self._load, folder, f"relief-{self.kind}", seen_by)
+        everything = sorted([*self.pictures, *self.validation], key=lambda picture: picture.file)
+        self._forms.keep([(picture.file, picture.before) for picture in everything], quiet=quiet)
 
     def _images(self, pictures: Sequence[LabelledPicture], rng: np.random.Generator | None = None) -> Tensor:
-        """(B, 3, H, W); a picture is read once, and kept in 8 bits. rng: draws how each touch is seen."""
+        """(B, 3, H, W) of pictures in 8 bits. rng: draws how each touch is seen."""
         seen = []
         for picture in pictures:
-            if picture.file not in self._kept:
-                self._kept[picture.file] = [np.rint(255 * form).astype(np.uint8) for form in self._load(picture)]
-            forms = self._kept[picture.file]
+            forms = self._forms(picture.file, picture.before)
             seen.append(to_float(forms[rng.integers(len(forms)) if rng else 0]))
         return to_batch(seen)
 

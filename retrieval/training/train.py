@@ -30,7 +30,7 @@ from retrieval.data.dataset import (
     recording_source,
 )
 from retrieval.data.labelled_pairs import pair_by_label
-from retrieval.errors import CheckpointError, Interrupted
+from retrieval.errors import CheckpointError, ConfigError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
@@ -76,14 +76,20 @@ def train(
     *,
     split: Split | None = None,
     resume: bool = False,
+    cache: Path | None = None,
     quiet: bool = False,
 ) -> Checkpoint:
     """Train on a recording and write the best checkpoint by validation objects to `out`.
 
-    split: drawn from the configuration where None. resume: go on from the state beside `out`. The number of fingers
-    is the recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
+    split: drawn from the configuration where None. resume: go on from the state beside `out`. cache: folder where
+    decoded images are kept (`retrieval.training.kept`), for towers that are trained. The number of fingers is the
+    recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
     one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
     """
+    if cache and config.training.freeze_towers:
+        raise ConfigError(
+            "images are kept for towers that are trained; frozen ones look at each once: leave out the cache"
+        )
     distributed.start()
     grasps = load_grasps(recording)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
@@ -100,6 +106,8 @@ def train(
         require_fresh(out)
     else:
         trainer.resume()
+    if cache:
+        trainer.features.keep(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
     trainer.run(quiet)
     return load_checkpoint(out)
 

@@ -1,0 +1,136 @@
+"""Images decoded once for all trainings: memory-mapped files in a folder, read in place of the pictures.
+
+Like features (`retrieval.training.features`), images are kept in parts, `photo-<digest>.npy`; the digest is of the
+files that a part was decoded from and of how they were seen. A part is written whole or not at all, so what was
+interrupted goes on, and where a picture or the preprocessing changed the part is another one. A part holds what was
+decoded, to the bit: eight bits would take a quarter of the disk, and be off by half a grey level wherever a picture was
+resized. Nothing deletes parts that are no longer asked for; the whole folder may be deleted at any time.
+"""
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from indexes.store.files import file_digest, naming, replacing
+from indexes.store.regular import open_regular
+from retrieval.console.output import say
+from retrieval.console.progress import Bar
+from retrieval.errors import BadInput, DatasetError
+from retrieval.model.encode import batches, default_device
+from retrieval.training import distributed
+
+log = logging.getLogger(__name__)
+_PART, _FORMAT = 128, 1
+_BATCH = 16
+
+Files = tuple[Path | None, ...]
+"""What one image is made from."""
+_Part = tuple[Path, list[Files]]
+
+
+class KeptImages:
+    """`load(*files)`, for images that were kept without decoding anything.
+
+    load: gives images of one shape and type. kind: begins the names of the parts. seen_by: what decides what `load`
+    gives beside the files, as a digest.
+    """
+
+    def __init__(self, load: Callable[..., NDArray[Any]], folder: Path, kind: str, seen_by: str) -> None:
+        self._load, self._folder, self._kind, self._seen_by = load, folder, kind, seen_by
+        self._kept: dict[Files, NDArray[Any]] = {}
+
+    def __call__(self, *files: Path | None) -> NDArray[Any]:
+        """The image; what was not kept is loaded."""
+        kept = self._kept.get(files)
+        return self._load(*files) if kept is None else kept
+
+    def keep(self, images: Sequence[Files], *, quiet: bool = False) -> None:
+        """Decode those that the folder does not hold, each rank its share, and map all of them.
+
+        Raises DatasetError for a picture that cannot be read, BadInput where the disk is too small, OSError.
+        """
+        parts = [(self._path(part), part) for part in batches(dict.fromkeys(images), _PART)]
+        missing = self._unmapped(parts)
+        if missing:
+            self._require_space(missing, quiet)
+        self._make(missing[distributed.rank() :: distributed.world_size()], quiet)
+        distributed.any_rank(False, default_device())  # all have made theirs
+        self._make(self._unmapped(missing), quiet)  # what the others wrote to disks of their own
+
+    def _unmapped(self, parts: Sequence[_Part]) -> list[_Part]:
+        """Those that are not there; the images of the others are taken from them."""
+        return [part for part in parts if not self._map(*part)]
+
+    def _make(self, parts: Sequence[_Part], quiet: bool) -> None:
+        if not parts:
+            return
+        count = sum(len(part) for _, part in parts)
+        with (
+            Bar(f"decode {self._kind}", count, "images", quiet=quiet) as bar,
+            ThreadPoolExecutor(2) as pool,
+        ):
+            for path, part in parts:
+                self._write(path, part, pool, bar)
+                self._map(path, part)
+
+    def _write(self, path: Path, part: list[Files], pool: ThreadPoolExecutor, bar: Bar) -> None:
+        """Image after image, so that a few are in memory at a time."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            for number, some in enumerate(batches(part, _BATCH)):
+                images = list(pool.map(lambda files: self._load(*files), some))
+                if number == 0:
+                    shape = (len(part), *images[0].shape)
+                    form = {"descr": images[0].dtype.str, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(file, form)
+                with naming(path):
+                    for image in images:
+                        file.write(image.tobytes())
+                bar.advance(len(some))
+
+    def _map(self, path: Path, part: list[Files]) -> bool:
+        """Whether the part is there, whole; then its images are taken from it."""
+        try:
+            with open_regular(path):
+                images = np.load(path, mmap_mode="r", allow_pickle=False)
+            if len(images) != len(part):
+                raise ValueError(f"it holds {len(images)} images, not {len(part)}")
+        except FileNotFoundError:
+            return False
+        except (OSError, ValueError, EOFError) as error:
+            log.warning("%s is damaged (%s); its images are decoded again", path, error)
+            return False
+        self._kept |= zip(part, np.asarray(images), strict=True)
+        return True
+
+    def _path(self, part: list[Files]) -> Path:
+        digests = [[path and picture_digest(path) for path in files] for files in part]
+        key = hashlib.sha256(json.dumps([_FORMAT, self._kind, self._seen_by, digests]).encode()).hexdigest()
+        return self._folder / f"{self._kind}-{key[:32]}.npy"
+
+    def _require_space(self, missing: Sequence[_Part], quiet: bool) -> None:
+        count = sum(len(part) for _, part in missing)
+        size = count * self._load(*missing[0][1][0]).nbytes
+        said = f"{size / 1e9:.2f} GB for {count} decoded images ({self._kind})"
+        folder = self._folder.absolute()
+        there = next(each for each in (folder, *folder.parents) if each.is_dir())
+        if size > shutil.disk_usage(there).free:
+            raise BadInput(f"{self._folder} must have room for {said}; give a folder on another disk, or none")
+        if not quiet:
+            say(f"{self._folder} takes {said}")
+
+
+def picture_digest(path: Path) -> str:
+    """SHA-256 of a picture's file. Raises DatasetError."""
+    try:
+        return file_digest(path)
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error
