@@ -1,12 +1,14 @@
 """What builds note of files, rows that are taken over unparsed, and checks in time of what changed."""
 
+import random
+
 import numpy as np
 import pytest
 
 from indexes.errors import MismatchedIndex, RowError
 from indexes.kinds.base import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.rows import first_equal, keys_of
+from indexes.store.rows import are_distinct, first_equal, keys_of
 from indexes.store.seen import Seen
 from indexes.store.tables import Block
 from tests.test_indexes_store import unit
@@ -43,6 +45,25 @@ def test_keys_that_begin_alike_are_told_apart():
     keys = np.array([b"8 bytes." + end for end in (b"a", b"b", b"c", b"b")] + [b"other", b""], "S16")
     wanted = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
     assert first_equal(keys, wanted).tolist() == [1, 2, -1, 4, 5, -1]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_keys_are_found_wherever_a_list_was_changed(seed):
+    draw = random.Random(seed)
+    names = [f"{number:04d}" for number in range(draw.choice([1, 2, 50, 300]))]
+    other = list(names)
+    for _ in range(draw.choice([0, 1, 5, 100])):
+        place = draw.randrange(len(other) + 1)
+        other[place : place + draw.randrange(3)] = draw.sample(["new", "0001", "0299"], draw.randrange(2))
+    place_of = {name: place for place, name in enumerate(names)}
+    found = first_equal(keys_of(names), keys_of(other))
+    assert found.tolist() == [place_of.get(name, -1) for name in other]
+
+
+def test_keys_are_distinct_though_they_begin_alike():
+    keys = np.array([b"8 bytes.a", b"8 bytes.b", b"other"], "S16")
+    assert are_distinct(keys)
+    assert not are_distinct(keys[[0, 1, 2, 1]])
 
 
 def test_rows_that_are_kept_are_those_that_would_have_been_written(store, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data import catalogue as module
-from retrieval.data.catalogue import CataloguePhoto, SkippedPhoto, decode_photo, list_catalogue, read_photo
+from retrieval.data.catalogue import CataloguePhoto, Photos, SkippedPhoto, decode_photo, list_catalogue, read_photo
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
 
@@ -205,7 +205,18 @@ def test_a_photo_has_the_metadata_of_its_object_and_its_own_wins(tmp_path):
 
 
 def test_without_metadata_a_photo_has_none(tmp_path):
-    assert list_catalogue(fill(tmp_path, "mug/1.png")).photos == (CataloguePhoto("mug/1.png", "mug"),)
+    assert list(list_catalogue(fill(tmp_path, "mug/1.png")).photos) == [CataloguePhoto("mug/1.png", "mug")]
+
+
+def test_photos_in_columns_are_the_photos_that_they_were():
+    photos = [
+        CataloguePhoto("a/1.png", "a"),
+        CataloguePhoto("a/2.png", "a", {"price": 5}),
+        CataloguePhoto("b.png", "b"),
+    ]
+    held = Photos.of(photos)
+    assert (list(held), len(held), held[-1], list(held[1:])) == (photos, 3, photos[2], photos[1:])
+    assert (held.paths, held.objects) == (("a/1.png", "a/2.png", "b.png"), ("a", "a", "b"))
 
 
 def test_metadata_goes_to_objects_by_the_same_naming(tmp_path):

@@ -122,7 +122,7 @@ def written_within_a_tick(own, checkpoint, index, monkeypatch):
     photo.write_bytes(content + b"cd")
 
     def still(path, **how):
-        return before if str(path) == str(photo) else stat(path, **how)
+        return before if path == named(own, photo) else stat(path, **how)
 
     monkeypatch.setattr(looks.os, "stat", still)
     return build_index(own, checkpoint, index, quiet=True)
@@ -255,3 +255,14 @@ def test_a_run_is_as_long_as_rows_follow_each_other(own, checkpoint, index, monk
     assert known.tolist() == [*range(10), *range(11, 20), -1, 21, 22, 23]
     assert list(looks.runs(catalogue.photos, known, parent)) == [slice(0, 10), slice(10, 19)]
     assert list(looks.runs(catalogue.photos, known, None)) == []
+
+
+@pytest.mark.usefixtures("an_hour_later")
+def test_a_photo_before_all_others_breaks_no_run(own, checkpoint, index, monkeypatch):
+    monkeypatch.setattr(looks, "LEAST_RUN", 5)
+    build_index(own, checkpoint, index, quiet=True)
+    other_picture(own / "aaa" / "0.jpg")
+    catalogue, parent = list_catalogue(own), IndexStore(index).open()
+    known = looks.Looked(catalogue, index).known(parent)
+    assert known.tolist() == [-1, *range(24)]
+    assert list(looks.runs(catalogue.photos, known, parent)) == [slice(1, 25)]

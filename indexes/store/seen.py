@@ -50,8 +50,8 @@ class Seen:
         """Put these records (N,) in the place of all others. Raises OSError where the disk refuses."""
         records = np.zeros(len(ids), RECORD)
         records["id"], records["digest"], records["looks"] = ids, digests, looks
-        content = _MAGIC + records.tobytes()
-        if records.tobytes() != self.records.tobytes():
+        if (body := records.tobytes()) != self.records.tobytes():
+            content = _MAGIC + body
             files.write_atomically(self._path, content + hashlib.sha256(content).digest())
         self.records = records
 

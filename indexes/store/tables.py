@@ -18,7 +18,7 @@ from indexes.store.arrays import ArrayFile, mapped, write_array
 from indexes.store.equal import first_of_equals
 from indexes.store.files import finish, json_of
 from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
-from indexes.store.rows import KEYS, RECORD, keys_of
+from indexes.store.rows import KEYS, RECORD, are_distinct, keys_of
 
 MOST_TOMBSTONES = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
@@ -228,14 +228,14 @@ class TableWriter:
 
     def _check_distinct(self, table: NDArray[Any]) -> None:
         keys = np.ascontiguousarray(table["id"])
+        if are_distinct(keys):
+            return
         order = np.argsort(keys, kind="stable")
-        twice = keys[order][1:] == keys[order][:-1]
-        if twice.any():
-            record = table[order[int(np.argmax(twice))]]
-            with (self.folder / ROWS).open("rb") as text:
-                text.seek(int(record["start"]))
-                name = json.loads(text.readline())["id"]
-            raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
+        record = table[order[int(np.argmax(keys[order][1:] == keys[order][:-1]))]]
+        with (self.folder / ROWS).open("rb") as text:
+            text.seek(int(record["start"]))
+            name = json.loads(text.readline())["id"]
+        raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
 
     def _number_slots(self, table: NDArray[Any]) -> bool:
         """Give equal vectors one slot, in the table and in the file; whether the parent's slots have other numbers.

@@ -14,11 +14,11 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Self, overload
 
 from indexes.store.regular import read_regular
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
@@ -43,6 +43,38 @@ class CataloguePhoto:
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
 
 
+class Photos(Sequence[CataloguePhoto]):
+    """Photos in columns, each made an object when it is asked for: a hundred thousand objects are looked through by the
+    garbage collector again and again.
+
+    paths (N,); objects (N,): the ids of theirs; metadata: of the photos that have any, by path.
+    """
+
+    def __init__(self, paths: Iterable[str], objects: Iterable[str], metadata: Mapping[str, dict[str, Any]]) -> None:
+        self.paths, self.objects, self.metadata = tuple(paths), tuple(objects), metadata
+
+    @classmethod
+    def of(cls, photos: Sequence[CataloguePhoto]) -> Self:
+        """The photos, of which no two have the same path."""
+        metadata = {photo.path: photo.metadata for photo in photos if photo.metadata}
+        return cls((photo.path for photo in photos), (photo.object_id for photo in photos), metadata)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    @overload
+    def __getitem__(self, index: int) -> CataloguePhoto: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Photos": ...
+
+    def __getitem__(self, index: "int | slice") -> "CataloguePhoto | Photos":
+        if isinstance(index, slice):
+            return Photos(self.paths[index], self.objects[index], self.metadata)
+        path = self.paths[index]
+        return CataloguePhoto(path, self.objects[index], self.metadata.get(path, {}))
+
+
 @dataclass(frozen=True)
 class SkippedPhoto:
     """A file or folder that could not be used, and why."""
@@ -59,7 +91,7 @@ class Catalogue:
     """
 
     folder: Path
-    photos: tuple[CataloguePhoto, ...]
+    photos: Photos
     ignored: tuple[str, ...] = ()
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
@@ -77,7 +109,7 @@ class Catalogue:
     @property
     def object_ids(self) -> tuple[str, ...]:
         """The objects, sorted, each once; some may have no photo that can be read."""
-        return tuple(sorted({photo.object_id for photo in self.photos} | set(self.unread)))
+        return tuple(sorted({*self.photos.objects, *self.unread}))
 
 
 @dataclass(frozen=True)
@@ -98,8 +130,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    found = list(_walk(str(root), "", Path(os.path.realpath(root)), set()))
-    skipped = [item for item in found if isinstance(item, SkippedPhoto)]
+    found = _Found(Path(os.path.realpath(root)))
+    found.walk(str(root), "")
     path = root / METADATA_FILE
     try:
         lines = read_regular(path)
@@ -107,7 +139,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         lines = b""
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    return catalogue_of(root, str(root), [item for item in found if isinstance(item, str)], skipped, naming, lines)
+    return catalogue_of(root, str(root), found.names, found.skipped, naming, lines)
 
 
 def catalogue_of(
@@ -115,7 +147,7 @@ def catalogue_of(
 ) -> Catalogue:
     """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
     METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does."""
-    photos: list[tuple[str, str]] = []
+    photos, objects = list[str](), list[str]()
     skipped, ignored, unfit, unread = list(passed_over), [], [], set()
     for path in sorted(names):
         dot = path.rfind(".")
@@ -132,7 +164,8 @@ def catalogue_of(
             skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
             unfit.append(path)
         else:
-            photos.append((path, name))
+            photos.append(path)
+            objects.append(name)
     if not photos and unfit:
         raise DatasetError(
             f"no photo in {where} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
@@ -144,13 +177,15 @@ def catalogue_of(
         kinds = ", ".join(sorted(EXTENSIONS))
         raise DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
     by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
-    strange = sorted(by_photo.keys() - {path for path, _ in photos})
-    strange += sorted(by_object.keys() - {name for _, name in photos})
+    strange = sorted(by_photo.keys() - photos) + sorted(by_object.keys() - objects)
+    told: _Table = {}
+    if by_object or by_photo:
+        for path, name in zip(photos, objects, strict=True):
+            if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
+                told[path] = own
     return Catalogue(
         folder,
-        tuple(
-            CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})}) for path, name in photos
-        ),
+        Photos(photos, objects, told),
         tuple(ignored),
         tuple(skipped),
         tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
@@ -175,41 +210,53 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
         return SkippedPhoto(file.photo.path, error.reason)
 
 
-def _walk(folder: str, prefix: str, root: Path, followed: set[Path]) -> Iterator[str | SkippedPhoto]:
-    """All files below a folder as relative posix paths, and what is passed over.
+@dataclass
+class _Found:
+    """Files below the folder `root` as relative posix paths, and what was passed over. followed: where links led."""
 
-    A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
-    """
-    try:
-        entries = sorted(os.scandir(folder), key=attrgetter("name"))
-    except OSError as error:
-        raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
-    for entry in entries:
-        path = prefix + entry.name
-        if entry.name.startswith("."):
-            continue
-        if not path.isascii() and not _is_utf8(path):
-            named = os.fsencode(path).decode(errors="backslashreplace")
-            yield SkippedPhoto(named, "the name is not valid UTF-8; rename it")
-            continue
+    root: Path
+    names: list[str] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    followed: set[Path] = field(default_factory=set)
+
+    def walk(self, folder: str, prefix: str) -> None:
+        """Look through a folder, whose names get this prefix.
+
+        A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
+        """
         try:
-            is_folder = entry.is_dir()
-        except OSError:  # a link that leads to itself
-            is_folder = False
-        if not is_folder:
-            yield path
-            continue
-        if not entry.is_symlink():
-            yield from _walk(entry.path, path + "/", root, followed)
-            continue
-        target = Path(os.path.realpath(entry.path))
-        if target.is_relative_to(root) or root.is_relative_to(target):
-            yield SkippedPhoto(path, "a link into or around the catalogue itself is not followed")
-        elif target in followed:
-            yield SkippedPhoto(path, f"a link to {target}, which another link has listed already")
+            entries = sorted(os.scandir(folder), key=attrgetter("name"))
+        except OSError as error:
+            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
+        for entry in entries:
+            name = entry.name
+            if name.startswith("."):
+                continue
+            path = prefix + name
+            if not path.isascii() and not _is_utf8(path):
+                named = os.fsencode(path).decode(errors="backslashreplace")
+                self.skipped.append(SkippedPhoto(named, "the name is not valid UTF-8; rename it"))
+                continue
+            try:
+                is_folder = entry.is_dir()
+            except OSError:  # a link that leads to itself
+                is_folder = False
+            if not is_folder:
+                self.names.append(path)
+            elif entry.is_symlink():
+                self._follow(entry.path, path)
+            else:
+                self.walk(entry.path, path + "/")
+
+    def _follow(self, link: str, path: str) -> None:
+        target = Path(os.path.realpath(link))
+        if target.is_relative_to(self.root) or self.root.is_relative_to(target):
+            self.skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
+        elif target in self.followed:
+            self.skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
         else:
-            followed.add(target)
-            yield from _walk(entry.path, path + "/", root, followed)
+            self.followed.add(target)
+            self.walk(link, path + "/")
 
 
 def _is_utf8(path: str) -> bool:

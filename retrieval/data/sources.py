@@ -27,6 +27,7 @@ from retrieval.data.catalogue import (
     METADATA_FILE,
     Catalogue,
     CataloguePhoto,
+    Photos,
     SkippedPhoto,
     catalogue_of,
     list_catalogue,
@@ -147,7 +148,8 @@ def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming
     if not found:
         why = f"; {skipped[0].path}: {skipped[0].reason}" if skipped else ""
         raise DatasetError(f"no photo in the catalogue {url}{why}")
-    return Fetched(Path(), tuple(sorted(found, key=lambda photo: photo.path)), (), tuple(skipped), (), (), source, url)
+    listed = Photos.of(sorted(found, key=lambda photo: photo.path))
+    return Fetched(Path(), listed, (), tuple(skipped), (), (), source, url)
 
 
 # Parquet ---------------------------------------------------------------------------------------------------

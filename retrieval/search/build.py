@@ -157,7 +157,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         unread=made.unread,
         skipped=made.skipped,
         ignored=_outside(catalogue, out),
-        without_photo=sorted(set(catalogue.object_ids) - set(names)),
+        without_photo=sorted({*catalogue.photos.objects, *catalogue.unread} - made.objects.keys()),
         notes=list(catalogue.notes),
         kind=generation.manifest.kind,
         reason=" ".join(filter(None, (wanted.note, why, generation.manifest.about["reason"]))),
@@ -201,11 +201,8 @@ def _about_before(store: IndexStore) -> Mapping[str, Any]:
 
 def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str]]:
     """The first, the middle and the last object, each with its first photo."""
-    wanted = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    found: dict[str, str] = {}
-    for photo in catalogue.photos:
-        found.setdefault(photo.object_id, photo.path)
-    return [(name, found[name]) for name in wanted]
+    wanted, photos = dict.fromkeys((names[0], names[len(names) // 2], names[-1])), catalogue.photos
+    return [(name, photos.paths[photos.objects.index(name)]) for name in wanted]
 
 
 def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:

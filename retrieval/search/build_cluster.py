@@ -35,7 +35,7 @@ from indexes.store.files import remove_folder
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos, SkippedPhoto
 from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
 from retrieval.data.storage import is_url
@@ -203,7 +203,7 @@ def _divided(catalogue: Catalogue, shards: int) -> list[tuple[int, Catalogue]]:
     for photo in catalogue.photos:
         own.setdefault(shard_of(photo.object_id, shards), []).append(photo)
     return [
-        (number, replace(catalogue, photos=tuple(photos), ignored=(), skipped=(), notes=(), unread=()))
+        (number, replace(catalogue, photos=Photos.of(photos), ignored=(), skipped=(), notes=(), unread=()))
         for number, photos in sorted(own.items())
     ]
 
@@ -239,7 +239,7 @@ def _report(
         objects_from=naming.text,
         per_object=per_object(counts),
         examples=reports[0].examples,
-        doubts=doubts(Counter(photo.object_id for photo in catalogue.photos), naming),
+        doubts=doubts(Counter(catalogue.photos.objects), naming),
         embedded=sum(report.embedded for report in reports),
         reused=sum(report.reused for report in reports),
         renamed=sum(report.renamed for report in reports),

@@ -20,7 +20,15 @@ from indexes.store.generation import Generation
 from indexes.store.tables import Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, SkippedPhoto, decode_photo, read_photo
+from retrieval.data.catalogue import (
+    Catalogue,
+    CataloguePhoto,
+    PhotoBytes,
+    Photos,
+    SkippedPhoto,
+    decode_photo,
+    read_photo,
+)
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, one_thread
@@ -65,7 +73,7 @@ class _Found:
 class _Kept:
     """Photos whose rows the parent has as they would be written, one after another."""
 
-    photos: Sequence[CataloguePhoto]
+    photos: Photos
     rows: range
 
 
@@ -227,7 +235,7 @@ class Embedder:
     def _encode(self, found: Sequence[_Item]) -> Part:
         """Decode and encode those that must be. Called on threads."""
         if isinstance(found[0], _Kept):
-            return Part([], kept=found[0].rows, objects=Counter(photo.object_id for photo in found[0].photos))
+            return Part([], kept=found[0].rows, objects=Counter(found[0].photos.objects))
         part, new, images = Part([]), list[dict[str, Any]](), list[Image]()
         codes = dict[str, _Code]()
         see = self.checkpoint.config.preprocessing.photo_of

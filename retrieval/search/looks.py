@@ -7,8 +7,9 @@ does with its "racily clean" files.
 
 import json
 import os
+import struct
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
 from indexes.store.seen import LOOKS, Looks, Seen
-from retrieval.data.catalogue import Catalogue, CataloguePhoto
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.sources import Fetched
 
 SETTLED_NS = 2 * 10**9
@@ -29,6 +30,8 @@ LEAST_RUN = 256
 """Photos in a row that are worth being taken over as they lie; each such run ends a batch of photos to encode."""
 
 _MASK = 2**64 - 1
+_LOOK = struct.Struct(f"={len(LOOKS)}Q")
+_UNSEEN = bytes(_LOOK.size)
 _BARE = b'"metadata": {}}'
 """How the line of a row without metadata ends, as `row_of` has it last."""
 
@@ -42,7 +45,7 @@ class Looked:
 
     def __init__(self, catalogue: Catalogue, index: Path, verify: bool = False) -> None:
         self.photos = catalogue.photos
-        self.ids = keys_of(photo.path for photo in self.photos)
+        self.ids = keys_of(self.photos.paths)
         self._seen = Seen(index)
         self._local, self._verify = not isinstance(catalogue, Fetched), verify
         self._looks, self._settled = _looks(catalogue) if self._local else _unknown(len(self.photos))
@@ -64,27 +67,30 @@ class Looked:
         self._seen.write(self.ids[good], made.rows.table["digest"][numbers[good]], self._looks[good])
 
 
-def runs(photos: tuple[CataloguePhoto, ...], known: Slots, parent: Generation | None) -> Iterator[slice]:
+def runs(photos: Photos, known: Slots, parent: Generation | None) -> Iterator[slice]:
     """Long runs of photos whose rows in the parent follow each other and would be written as they are."""
     if parent is None:
         return
     same = np.where(_as_they_are(photos, known, parent), known, -1)
-    ends = np.flatnonzero((same[1:] != same[:-1] + 1) | (same[1:] < 0)) + 1
+    kept = same >= 0
+    ends = np.flatnonzero((kept[1:] != kept[:-1]) | (kept[1:] & (same[1:] != same[:-1] + 1))) + 1
     for start, stop in pairwise([0, *ends.tolist(), len(same)]):
         if stop - start >= LEAST_RUN and same[start] >= 0:
             yield slice(start, stop)
 
 
-def _as_they_are(photos: Sequence[CataloguePhoto], known: Slots, parent: Generation) -> NDArray[np.bool_]:
+def _as_they_are(photos: Photos, known: Slots, parent: Generation) -> NDArray[np.bool_]:
     """Whether the parent's rows of these numbers say of the photos (N,) what is to be said now. Ids and contents fit.
 
     Rows without metadata are compared by the keys of their objects, and not parsed.
     """
-    names = {photo.object_id for photo in photos}
-    keys = dict(zip(names, keys_of(names).tolist(), strict=True))
-    objects = np.array([keys[photo.object_id] for photo in photos], "S16")
+    names = list(dict.fromkeys(photos.objects))
+    number_of = {name: number for number, name in enumerate(names)}
+    objects = keys_of(names)[[number_of[name] for name in photos.objects]]
     same: NDArray[np.bool_] = (known >= 0) & (parent.rows.table["object_id"][known] == objects)
-    telling = ~parent.rows.ending(_BARE)[known] | np.array([bool(photo.metadata) for photo in photos])
+    telling = ~parent.rows.ending(_BARE)[known]
+    if photos.metadata:
+        telling |= [path in photos.metadata for path in photos.paths]
     for place in np.flatnonzero(same & telling).tolist():
         same[place] = _is_row(photos[place], parent, int(known[place]))
     return same
@@ -112,19 +118,25 @@ def row_of(photo: CataloguePhoto, digest: str) -> dict[str, Any]:
 
 def _looks(catalogue: Catalogue) -> tuple[Looks, NDArray[np.bool_]]:
     """Of each file (N, 4), and whether it had been left alone for `SETTLED_NS`."""
-    now, folder = time.time_ns(), f"{catalogue.folder}/"
-    looks, settled = list[int](), list[bool]()
-    for photo in catalogue.photos:
-        try:
-            found = os.stat(folder + photo.path)
-        except (OSError, ValueError):  # reading it will say why
-            looks += [0] * len(LOOKS)
-            settled.append(False)
-            continue
-        modified, changed = found.st_mtime_ns, found.st_ctime_ns
-        looks += [found.st_size & _MASK, modified & _MASK, changed & _MASK, found.st_ino & _MASK]
-        settled.append(max(modified, changed) + SETTLED_NS < now)
-    return np.array(looks, np.uint64).reshape(-1, len(LOOKS)), np.array(settled)
+    now, paths, looks = time.time_ns(), catalogue.photos.paths, list[bytes]()
+    try:
+        folder = os.open(catalogue.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError:  # gone since it was listed
+        return _unknown(len(paths))
+    try:
+        for path in paths:  # below an open folder they are found sooner
+            try:
+                found = os.stat(path, dir_fd=folder)
+            except (OSError, ValueError):  # reading it will say why
+                looks.append(_UNSEEN)
+                continue
+            modified, changed = found.st_mtime_ns & _MASK, found.st_ctime_ns & _MASK
+            looks.append(_LOOK.pack(found.st_size & _MASK, modified, changed, found.st_ino & _MASK))
+    finally:
+        os.close(folder)
+    table = np.frombuffer(b"".join(looks), np.uint64).reshape(-1, len(LOOKS))
+    times = table[:, 1:3].view(np.int64)
+    return table, (times.max(axis=1) + SETTLED_NS < now) & table.any(axis=1)
 
 
 def _unknown(count: int) -> tuple[Looks, NDArray[np.bool_]]:
