@@ -24,8 +24,9 @@ def check_unit(
     if names is not None and len(names) != len(table):
         raise VectorError(f"as many vectors as {what} names are needed; got {len(table)} and {len(names)}")
     norms = row_norms(table)
-    bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
-    if bad.size:
+    good = np.abs(norms - 1.0) <= NORM_TOLERANCE
+    if not good.all():
+        bad = np.flatnonzero(~good)
         number = int(bad[0])
         name = str(number) if names is None else names[number]
         fault = _fault(table[number], float(norms[number]))

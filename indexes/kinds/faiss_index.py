@@ -102,20 +102,22 @@ class FaissIndex(VectorIndex):
         return scores, slots
 
     def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
-        """What the first round names, where that is enough: scored again are, of an exact kind, those alone that
-        rounding may have put on the wrong side of the last place."""
+        """What the first round names, where that is enough. Of an exact kind those alone are scored again that rounding
+        may have put on the wrong side of the last place, and mostly none is as near to it."""
         dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
         fetch = math.ceil(self._first_fetch(k) * dilution)
         if fetch < self.count:
             with guarded("searching", 1):
                 rough, found = (row[0] for row in self._named(query, fetch, 1))
             kept = found >= 0 if live is None else (found >= 0) & live[found]
-            scores: Doubles = rough[kept].astype(np.float64)  # what is added to them must not be rounded
-            slots: Slots = found[kept]
+            scores, slots = (rough, found) if kept.all() else (rough[kept], found[kept])
             if len(slots) >= k and not self.exact:
                 return slots
             if len(slots) > k:
-                last, off = scores[k - 1], 2 * slack(self.dim)
+                last, off = float(scores[k - 1]), 2 * slack(self.dim)
+                if float(scores[k]) < last - off:
+                    return slots[:k]
+                scores = scores.astype(np.float64)  # what is added to them must not be rounded
                 above = scores > last + off
                 sure, near = slots[above], slots[~above & (scores >= last - off)]
                 if rough[-1] < last - off:
