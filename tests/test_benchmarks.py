@@ -25,6 +25,7 @@ from tests.benchmarks import (
     rerank,
     simulation,
     step,
+    table,
 )
 from tests.conftest import TINY
 
@@ -69,6 +70,38 @@ def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
     for line in lines:
         assert set(line.figures) == {"cpu_s", "cpu:0_s", "ratio"}
         json.dumps(line.figures, allow_nan=False)
+
+
+def test_naming_candidates_stands_beside_the_bare_call(monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(peers, "NAMED", (10, 50))
+    lines = list(peers.named(photos=700, queries=3, repetitions=2))
+    assert [(line.tower, line.figures["k"]) for line in lines] == [
+        (kind, k) for kind in ("flat", "ivf_sq8", "hnsw") for k in (10, 50)
+    ]
+    for line in lines:
+        ours, bare = line.each["ours"], line.each["bare"]
+        assert line.figures["ratio"] == pytest.approx(np.median(ours) / np.median(bare))
+
+
+@pytest.mark.slow
+def test_a_build_with_the_shipped_model_stands_beside_its_encoder(monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    (line,) = build.measure_shipped(photos=3, photo_px=64, repetitions=1)
+    assert line.figures["build_per_s"] == pytest.approx(3 / line.each["build"][0])
+
+
+def test_a_row_of_the_table_tells_medians_with_their_spread():
+    row = table.Row("work", "ms", [2.0, 1.0, 1234.5], "other work", [4.0])
+    assert str(row) == "| work | 2 (1 to 1,234) ms | other work | 4 (4 to 4) ms | 0.50 |"
+    assert str(table.Row("work", "ms", [2.0])) == "| work | 2 (2 to 2) ms |  |  |  |"
+
+
+@pytest.mark.slow
+def test_a_section_of_the_table_is_measured_by_a_process_of_its_own():
+    rows = list(table.rows("judging"))
+    assert [row.what for row in rows] == ["100 candidates judged", "1,000 candidates judged"]
+    assert all(len(row.ours) == len(row.theirs) > 1 for row in rows)
 
 
 @pytest.mark.slow

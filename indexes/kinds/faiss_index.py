@@ -110,16 +110,17 @@ class FaissIndex(VectorIndex):
             with guarded("searching", 1):
                 rough, found = (row[0] for row in self._named(query, fetch, 1))
             kept = found >= 0 if live is None else (found >= 0) & live[found]
-            scores, slots = (rough, found) if kept.all() else (rough[kept], found[kept])
+            scores: Floats = rough[kept]
+            slots: Slots = found[kept]
             if len(slots) >= k and not self.exact:
                 return slots
             if len(slots) > k:
                 last, off = float(scores[k - 1]), 2 * slack(self.dim)
                 if float(scores[k]) < last - off:
                     return slots[:k]
-                scores = scores.astype(np.float64)  # what is added to them must not be rounded
-                above = scores > last + off
-                sure, near = slots[above], slots[~above & (scores >= last - off)]
+                exact: Doubles = scores.astype(np.float64)  # what is added to them must not be rounded
+                above = exact > last + off
+                sure, near = slots[above], slots[~above & (exact >= last - off)]
                 if rough[-1] < last - off:
                     gridded = on_grid(query[0])
                     more = best(grid_scores(gridded, on_grid(self._vectors[near])), near, k - len(sure))[1]

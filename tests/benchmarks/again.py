@@ -80,7 +80,7 @@ def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[Line]:
         f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s once it has been done), and what every command "
         f"takes, Python, its imports and the model, {median['started']:.2f} s"
     )
-    yield Line("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median})
+    yield Line("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(told))
 
 
 def build(catalogue: Path, index: Path, new: int, verify: bool) -> dict[str, float]:

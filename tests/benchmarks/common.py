@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -17,12 +17,13 @@ LEAST_S = 0.2
 
 @dataclass(frozen=True)
 class Line:
-    """One result: a sentence for people, and its figures."""
+    """One result: a sentence for people, and its figures. each: of arms what single repetitions took, for a spread."""
 
     benchmark: str
     tower: str
     text: str
     figures: dict[str, float]
+    each: dict[str, list[float]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.benchmark}, {self.tower}: {self.text}"

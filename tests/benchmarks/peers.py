@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import takewhile
+from itertools import chain, takewhile
 
 import numpy as np
 
@@ -24,7 +24,7 @@ import indexes
 from indexes.kinds.faiss_index import faiss, guarded
 from indexes.kinds.measure import sample_queries
 from indexes.kinds.scores import Floats, Slots, scan
-from tests.benchmarks.common import Line, in_turns
+from tests.benchmarks.common import Line, as_text, in_turns
 
 DIM, QUERIES, BEST, RECALL = 64, 100, 10, 0.99
 LINKS, BREADTH = 32, 80
@@ -165,7 +165,39 @@ def compared(vectors: Floats, queries: Floats, what: str) -> Iterator[Line]:
             f"{what}: {figures['query_us']:.0f} us a query, width {widths[name]}, recall of the best {BEST} "
             f"{figures['recall']:.3f}; built in {took[name]:.2f} s of CPU time"
         )
-        yield Line("peers", name, text, figures)
+        each = [1e6 * seconds / len(timed) for seconds in times.seconds[name]]
+        yield Line("peers", name, text, figures, {"query_us": each})
+
+
+def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -> Iterator[Line]:
+    """A line for each kind and each of `NAMED`: naming candidates, beside FAISS's own call for as many, in turns."""
+    with guarded("being measured", 1):
+        vectors = drawn(photos, 0)
+        asked, bare = sample_queries(vectors, queries), faiss.IndexFlatIP(DIM)
+        bare.add(vectors)
+        for kind in ("flat", "ivf_sq8", "hnsw"):
+            index = indexes.load_kind(kind).build(vectors, threads=1)
+            structure, settings = getattr(index, "_structure", None) or bare, index.settings()
+            for k in NAMED:
+                how = {
+                    "flat": None,
+                    "ivf_sq8": faiss.SearchParametersIVF(nprobe=settings.get("probes", 1)),
+                    "hnsw": faiss.SearchParametersHNSW(efSearch=max(k, settings.get("ef_search", 1))),
+                }[kind]
+                times = in_turns(
+                    {
+                        "ours": lambda index=index, k=k: [index.candidates(query[None], k) for query in asked],
+                        "bare": lambda structure=structure, k=k, how=how: [
+                            structure.search(query[None], k, params=how) for query in asked
+                        ],
+                    },
+                    repetitions,
+                )
+                each = {arm: [1e6 * one / queries for one in seconds] for arm, seconds in times.seconds.items()}
+                ratio = times.ratio("ours", "bare")
+                took = np.median(each["ours"])
+                text = f"the best {k} of {photos:,} named in {took:.0f} us: {as_text(ratio)} the bare call"
+                yield Line("named", kind, text, {"k": k, "ratio": ratio[0]}, each)
 
 
 def least_width(built: Built, vectors: Floats, queries: Floats) -> int:
@@ -188,5 +220,6 @@ def found(built: Built, width: int, queries: Floats) -> list[Slots]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.peers", description=__doc__)
     parser.add_argument("--photos", type=int, default=100_000)
-    for line in measure(parser.parse_args().photos):
+    photos = parser.parse_args().photos
+    for line in chain(named(photos), measure(photos)):
         print(line, flush=True)

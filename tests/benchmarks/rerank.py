@@ -57,4 +57,5 @@ def measure(
                 "ratio": ratio[0],
                 "share_of_product": share[0],
             },
+            {"halves": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
         )
