@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from indexes import KINDS, load_kind
-from indexes.errors import MismatchedIndex, ParameterError, RowError, SelfRetrievalFailed, VectorError
+from indexes.errors import CorruptIndex, MismatchedIndex, ParameterError, RowError, SelfRetrievalFailed, VectorError
 from indexes.kinds.hnsw import HNSWParameters
 from indexes.kinds.ivf import IVFPQParameters
 from indexes.store.folder import IndexStore
@@ -76,6 +76,23 @@ def test_what_is_written_is_read_back(tmp_path, kind):
     for a, b in zip(written.search(unit(5, seed=1), 4), read.search(unit(5, seed=1), 4), strict=True):
         assert np.array_equal(a[0], b[0])
         assert np.array_equal(a[1], b[1])
+
+
+def test_a_document_may_be_an_array_that_is_of_no_row(tmp_path):
+    touches = np.arange(6, dtype=np.float16).reshape(2, 3)
+    filled(tmp_path, documents={"touches": touches, "calibration": {}})
+    read = IndexStore(tmp_path).open()
+    np.testing.assert_array_equal(read.documents["touches"], touches)
+    assert isinstance(read.documents["touches"], np.memmap)
+    path = read.folder / "touches.npy"
+    path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    with pytest.raises(CorruptIndex, match=r"touches\.npy: the SHA-256 differs"):
+        IndexStore(tmp_path).open()
+
+
+def test_an_empty_array_is_a_document_too(tmp_path):
+    filled(tmp_path, documents={"touches": np.empty((0, 3), np.float32)})
+    assert IndexStore(tmp_path).open().documents["touches"].shape == (0, 3)
 
 
 def test_the_folder_is_laid_out_as_promised(tmp_path):
@@ -302,6 +319,12 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
         ({"arrays": {"../x": np.zeros(3)}}, RowError, "lower-case words"),
         ({"documents": {"manifest": {}}}, RowError, "lower-case words"),
         ({"documents": {"calibration": {"a": float("nan")}}}, RowError, "document 'calibration'"),
+        (
+            {"documents": {"touches": np.float16([1, np.nan])}},
+            RowError,
+            "document 'touches': an array must hold finite",
+        ),
+        ({"documents": {"touches": np.array([{}])}}, RowError, "document 'touches': an array must hold finite"),
         ({"documents": {"x": 1}, "arrays": {"x": np.zeros(3)}}, RowError, "cannot share a name"),
         ({"fingerprint": {"checkpoint": 3}}, RowError, "fingerprint must map text to text"),
         ({"about": {"a": float("inf")}}, RowError, "about must be JSON"),

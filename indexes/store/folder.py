@@ -8,7 +8,7 @@
       NAME.npy            per-row arrays
       embeddings.npy      (slots, d) float32, from which any kind of index is built
       vectors.faiss       the structure of the index, for kinds that have one
-      NAME.json           documents
+      NAME.json           documents; NAME.npy those that are arrays, of no row
     LOCK                  held by the writer
     seen.records          how the files behind the rows looked, of no generation (`indexes.store.seen`)
     unfinished/           what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
@@ -120,7 +120,7 @@ class IndexStore:
 
         rows         JSON objects with a distinct text "id", and a "digest" of the content for later reuse
         embeddings   (F, d) float32 unit vectors; arrays: name -> (F, ...) finite numbers
-        documents    name -> JSON; never taken over from the parent
+        documents    name -> JSON, or an array that is of no row; never taken over from the parent
         settings     those of `write_blocks`. Rows that `parent.reusable` gives for their ids and digests keep its
                      vectors and arrays, and F counts only the other rows, in their order (embeddings may be None
                      when F = 0). Without a parent, F is the number of rows.

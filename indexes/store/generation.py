@@ -41,7 +41,7 @@ class Generation:
     slots       (N,) int64, the slot of each row; rows with equal vectors share one
     embeddings  (S, d) float32 unit vectors, one for each slot, memory-mapped
     arrays      name -> (N, ...) per-row array, memory-mapped
-    documents   name -> JSON document
+    documents   name -> JSON document, or array that is of no row, memory-mapped
     manifest    what `manifest.json` says
     index       the vector index over the slots
 
@@ -228,7 +228,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     check_files(folder, manifest, verify=verify)
     try:
         rows, arrays, embeddings = _tables(folder, manifest)
-        documents = {name: read_json(folder / f"{name}.json") for name in manifest.documents}
+        documents = {name: _document(folder, manifest, name) for name in manifest.documents}
         _check_counts(manifest, rows.table, embeddings)
         if verify:
             _check_vectors(folder, embeddings)
@@ -248,6 +248,11 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise
     except Exception as error:  # damaged files raise anything: OSError, ValueError, KeyError, SyntaxError
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
+
+
+def _document(folder: Path, manifest: Manifest, name: str) -> Any:
+    array = f"{name}.npy"
+    return mapped(folder / array) if array in manifest.files else read_json(folder / f"{name}.json")
 
 
 def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:

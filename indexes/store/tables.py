@@ -42,12 +42,14 @@ class Block:
 class Tables:
     """What a generation will hold, on the disk and memory-mapped.
 
-    vectors (S, d), not all of which need have a row; slots (N,) of the rows; arrays: name -> (N, ...); parent: the
-    generation that rows were taken from, None where there were none; renumbered: whether slots are others than there.
+    vectors (S, d), not all of which need have a row; slots (N,) of the rows, and objects (N,), the keys of their
+    "object_id" (`indexes.store.rows`); arrays: name -> (N, ...); parent: the generation that rows were taken from, None
+    where there were none; renumbered: whether slots are others than there.
     """
 
     vectors: Floats
     slots: Slots
+    objects: NDArray[np.bytes_]
     arrays: Mapping[str, NDArray[Any]]
     parent: Generation | None
     renumbered: bool
@@ -143,7 +145,8 @@ class TableWriter:
         write_array(self.folder / TABLE, RECORD, (), [table])
         arrays = {name: mapped(file.path) for name, file in (self._arrays or {}).items()}
         parent = self.parent if self._used else None
-        return Tables(mapped(self._vectors.path), np.ascontiguousarray(table["slot"]), arrays, parent, renumbered)
+        slots, objects = (np.ascontiguousarray(table[name]) for name in ("slot", "object_id"))
+        return Tables(mapped(self._vectors.path), slots, objects, arrays, parent, renumbered)
 
     def _array_files(self) -> list[ArrayFile]:
         return [*([self._vectors] if self._vectors else ()), *(self._arrays or {}).values()]
@@ -271,10 +274,13 @@ class TableWriter:
 
 
 def check_documents(documents: Mapping[str, Any]) -> dict[str, Any]:
-    """The documents, named for files and of finite JSON, or `RowError`."""
+    """The documents, named for files and of finite JSON or arrays of finite numbers, or `RowError`."""
     for name, document in documents.items():
         check_name(name)
-        json_of(document, f"document {name!r}")
+        if not isinstance(document, np.ndarray):
+            json_of(document, f"document {name!r}")
+        elif document.dtype.kind not in "biuf" or not np.isfinite(document).all():
+            raise RowError(f"document {name!r}: an array must hold finite numbers; got {document.dtype}")
     return dict(documents)
 
 

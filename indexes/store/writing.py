@@ -14,6 +14,7 @@ from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.kinds.scores import Floats
 from indexes.store import files
+from indexes.store.arrays import write_array
 from indexes.store.generation import STRUCTURE, Generation
 from indexes.store.manifest import Counts, Manifest, sealed, write_manifest
 from indexes.store.tables import Block, Tables, TableWriter
@@ -66,6 +67,9 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
     if clash:
         raise RowError(f"an array and a document cannot share a name; got {', '.join(clash)}")
     for document, content in job.documents.items():
+        if isinstance(content, np.ndarray):
+            write_array(folder / f"{document}.npy", content.dtype, content.shape[1:], [content])
+            continue
         with files.durable(folder / f"{document}.json") as handle:
             handle.write(files.encoded(content, indent=2) + b"\n")
     if job.settle is not None:

@@ -13,18 +13,20 @@ from retrieval.adaptation.folds import Fold
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import first_rows
 from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.methods.cca import unit_rows
 from retrieval.methods.cca_towers import Affine, Codes, fit_codes
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
+from retrieval.model.posterior import JudgedTouches, fit_posterior
+from retrieval.model.references import FeltTouches, fit_references
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, by_image
 from retrieval.training.judgement import with_verdicts
 
 MOST_JUDGED = 60
-"""Touches of an object that the posterior is fitted on."""
+"""Touches of an object that the posterior is fitted on, and what references are worth."""
 
 
 @one_thread()
@@ -98,7 +100,9 @@ def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, q
     """With the check of touches, and with the posterior of the folds: codes know the objects that they were fitted on
     too well to say what a match is worth."""
     made = _checked(made, material.grasps, material.features, quiet)
-    return dataclasses.replace(made, posterior=_posterior(made.matcher, estimate) if estimate else None)
+    if estimate is None:
+        return dataclasses.replace(made, posterior=None, references=None)
+    return _calibrated(made, _left_out(made.matcher, estimate))
 
 
 def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
@@ -107,8 +111,13 @@ def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bo
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": material.source, "data_digest": data_digest(material.grasps)}
     provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
-    posterior = fit_posterior(*estimate.known.judged(folds, MOST_JUDGED))
-    return dataclasses.replace(made, provenance=provenance, posterior=posterior)
+    return _calibrated(dataclasses.replace(made, provenance=provenance), estimate.known.felt(folds, MOST_JUDGED))
+
+
+def _calibrated(made: Checkpoint, left_out: list[FeltTouches]) -> Checkpoint:
+    """With what logits mean and what reference touches are worth, by touches of objects that were left out."""
+    posterior = fit_posterior(*(part.judged for part in left_out))
+    return dataclasses.replace(made, posterior=posterior, references=fit_references(*left_out))
 
 
 def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
@@ -121,7 +130,7 @@ def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: b
         return with_verdicts(made, source, *halves, quiet=quiet)
 
 
-def _posterior(matcher: Matcher, estimate: Estimate) -> Posterior:
+def _left_out(matcher: Matcher, estimate: Estimate) -> list[FeltTouches]:
     assert matcher.cosine_scale is not None
     scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
     parts = []
@@ -129,5 +138,7 @@ def _posterior(matcher: Matcher, estimate: Estimate) -> Posterior:
         rows = first_rows(fold.left_out, MOST_JUDGED)
         logits = scale * fold.cosines(estimate.ridge)[np.ix_(rows, rows)] + offset
         owner = fold.left_out.owner[rows]
-        parts.append(JudgedTouches(logits, owner, owner, np.eye(len(rows), dtype=np.bool_)))
-    return fit_posterior(*parts)
+        touch = fold.left_out.touch.reshape(len(fold.left_out), -1)[rows]
+        codes = unit_rows(fold.codes[estimate.ridge].touch(touch))
+        parts.append(FeltTouches(JudgedTouches(logits, owner, owner, np.eye(len(rows), dtype=np.bool_)), codes))
+    return parts

@@ -14,6 +14,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher, score_halves
 from retrieval.model.posterior import JudgedTouches
+from retrieval.model.references import FeltTouches, touch_codes
 from retrieval.training.features import Features, encode_recording
 
 
@@ -37,23 +38,28 @@ class AsItIs:
     @one_thread()
     def logits(self, asked: Features) -> NDArray[np.float32]:
         """(n, n) of the touch of every grasp with the photo of every one."""
-        matcher = self.start.matcher
+        matcher, felt = self.start.matcher, self._halves(asked)
         with torch.inference_mode():
-            felt = matcher.touch_code(torch.from_numpy(asked.touch).flatten(1)).half
             photos = matcher.photo_code(torch.from_numpy(asked.photo)).half.numpy()
         return np.stack([score_halves(matcher.head, half[None], photos) for half in felt])
+
+    @torch.inference_mode()
+    def _halves(self, asked: Features) -> torch.Tensor:
+        return self.start.matcher.touch_code(torch.from_numpy(asked.touch).flatten(1)).half
 
     def told(self, folds: Sequence[Sequence[str]]) -> list[Told]:
         """How it tells the objects of each fold apart."""
         return [told(self.logits(asked), asked) for asked in map(self.features.of_objects, folds)]
 
-    def judged(self, folds: Sequence[Sequence[str]], most: int) -> list[JudgedTouches]:
-        """What its posterior can be fitted on: of each object at most so many touches."""
+    def felt(self, folds: Sequence[Sequence[str]], most: int) -> list[FeltTouches]:
+        """What its posterior can be fitted on, and what references are worth: of each object at most so many
+        touches."""
         parts = []
         for asked in map(self.features.of_objects, folds):
             some = asked.select(first_rows(asked, most))
             none = np.eye(len(some), dtype=np.bool_)
-            parts.append(JudgedTouches(self.logits(some), some.owner, some.owner, none))
+            codes = touch_codes(self._halves(some).numpy(), self.start.config.matcher.hidden)
+            parts.append(FeltTouches(JudgedTouches(self.logits(some), some.owner, some.owner, none), codes))
         return parts
 
 

@@ -2,6 +2,7 @@
 
     catalog/<object_id>/<photo>     the first folder names the object, however deep the photo lies below it
     catalog/<object_id>.<ext>       or one photo per object, named by its file; other rules: retrieval.data.naming
+    catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.touched)
     catalog/metadata.jsonl          optional: one JSON object a line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; where both
                                     give a key, the photo's own wins
@@ -15,7 +16,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
@@ -24,6 +25,7 @@ from indexes.store.regular import read_regular
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
+from retrieval.data.touched import CatalogueTouch, grouped, touch_name
 from retrieval.errors import DatasetError, ImageError
 
 METADATA_FILE = "metadata.jsonl"
@@ -87,7 +89,8 @@ class SkippedPhoto:
 class Catalogue:
     """What a folder holds: photos by id, files that are no photos by name, what was left out, remarks.
 
-    unread: objects of pictures that were left out by their names' endings.
+    unread: objects of pictures that were left out by their names' endings. touches: of the objects, whether these have
+    photos or not.
     """
 
     folder: Path
@@ -96,6 +99,7 @@ class Catalogue:
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
+    touches: tuple[CatalogueTouch, ...] = ()
 
     @property
     def where(self) -> str:
@@ -109,7 +113,7 @@ class Catalogue:
     @property
     def object_ids(self) -> tuple[str, ...]:
         """The objects, sorted, each once; some may have no photo that can be read."""
-        return tuple(sorted({*self.photos.objects, *self.unread}))
+        return tuple(sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unread}))
 
 
 @dataclass(frozen=True)
@@ -122,9 +126,9 @@ class PhotoBytes:
 
 
 def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
-    """List the photos below `folder`, by id. naming: which object each shows; by folder where None.
+    """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None.
 
-    Raises DatasetError: no folder, no photo, none that fits the naming, bad metadata.
+    Raises DatasetError: no folder, neither photo nor touch, none that fits the naming, bad metadata.
     """
     root, naming = Path(folder), naming or Naming()
     if not root.is_dir():
@@ -147,7 +151,7 @@ def catalogue_of(
 ) -> Catalogue:
     """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
     METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does."""
-    photos, objects = list[str](), list[str]()
+    photos, objects, gels = list[str](), list[str](), list[tuple[str, str]]()
     skipped, ignored, unfit, unread = list(passed_over), [], [], set()
     for path in sorted(names):
         dot = path.rfind(".")
@@ -163,21 +167,25 @@ def catalogue_of(
             why = ": a number alone" if naming.text == STEM else ""
             skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
             unfit.append(path)
-        else:
+        elif touch_name(path, naming) is None:
             photos.append(path)
             objects.append(name)
-    if not photos and unfit:
+        else:
+            gels.append((path, name))
+    if not photos and not gels and unfit:
         raise DatasetError(
             f"no photo in {where} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
             "Give folder, stem, or a pattern for paths like this one"
         )
-    if not photos:
+    if not photos and not gels:
         others = f"{len(ignored)} other files" + (f" such as {ignored[0]}" if ignored else "")
         left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
         kinds = ", ".join(sorted(EXTENSIONS))
         raise DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
     by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
-    strange = sorted(by_photo.keys() - photos) + sorted(by_object.keys() - objects)
+    touches = grouped(gels, naming)
+    strange = sorted(by_photo.keys() - [*photos, *(path for path, _ in gels)])
+    strange += sorted(by_object.keys() - [*objects, *(touch.object_id for touch in touches)])
     told: _Table = {}
     if by_object or by_photo:
         for path, name in zip(photos, objects, strict=True):
@@ -190,6 +198,10 @@ def catalogue_of(
         tuple(skipped),
         tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
         tuple(sorted(unread)),
+        tuple(
+            replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
+            for touch in touches
+        ),
     )
 
 

@@ -18,7 +18,7 @@ import re
 import tarfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
@@ -125,9 +125,7 @@ def _folder(url: str, naming: Naming) -> Catalogue:
 
 
 def _fetched(listed: Catalogue, source: Source, url: str) -> Fetched:
-    return Fetched(
-        listed.folder, listed.photos, listed.ignored, listed.skipped, listed.notes, listed.unread, source, url
-    )
+    return Fetched(**{one.name: getattr(listed, one.name) for one in fields(listed)}, source=source, url=url)
 
 
 def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source) -> Fetched:
@@ -149,7 +147,7 @@ def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming
         why = f"; {skipped[0].path}: {skipped[0].reason}" if skipped else ""
         raise DatasetError(f"no photo in the catalogue {url}{why}")
     listed = Photos.of(sorted(found, key=lambda photo: photo.path))
-    return Fetched(Path(), listed, (), tuple(skipped), (), (), source, url)
+    return Fetched(Path(), listed, skipped=tuple(skipped), source=source, url=url)
 
 
 # Parquet ---------------------------------------------------------------------------------------------------

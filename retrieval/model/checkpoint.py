@@ -26,6 +26,7 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.judge import GelCheck
 from retrieval.model.posterior import Posterior
+from retrieval.model.references import ReferenceWorth
 from retrieval.model.stored import (
     FORMAT,
     Stored,
@@ -54,7 +55,8 @@ _DTYPES = {
 class Checkpoint(Stored):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
-    posterior: what its logits mean; None where it was never calibrated. queries: (Q, half) halves of touches of
+    posterior: what its logits mean; None where it was never calibrated. references: what reference touches are worth;
+    None where nothing could tell. queries: (Q, half) halves of touches of
     validation objects, by which an index can measure its own search.
 
     >>> from pathlib import Path
@@ -67,6 +69,7 @@ class Checkpoint(Stored):
     split: Split | None
     posterior: Posterior | None = None
     queries: NDArray[np.float16] | None = None
+    references: ReferenceWorth | None = None
 
 
 def save_checkpoint(
@@ -79,6 +82,7 @@ def save_checkpoint(
     posterior: Posterior | None = None,
     gel_check: GelCheck | None = None,
     queries: NDArray[np.float16] | None = None,
+    references: ReferenceWorth | None = None,
     float16: bool = False,
 ) -> None:
     """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
@@ -91,6 +95,7 @@ def save_checkpoint(
         "split": split.to_dict() if split else None,
         "posterior": posterior.to_dict() if posterior else None,
         "gel_check": gel_check.to_dict() if gel_check else None,
+        "references": references.to_dict() if references else None,
         "provenance": dict(provenance),
     }
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
@@ -104,9 +109,13 @@ def save_checkpoint(
     write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
 
 
+CALIBRATED = ("split", "provenance", "posterior", "gel_check", "queries", "references")
+"""What is stored of a checkpoint beside matcher and configuration."""
+
+
 def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> None:
     """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
-    about = {name: getattr(made, name) for name in ("split", "provenance", "posterior", "gel_check", "queries")}
+    about = {name: getattr(made, name) for name in CALIBRATED}
     save_checkpoint(path, made.matcher, made.config, **about, float16=float16)
 
 
@@ -149,6 +158,8 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
+        references = header.get("references")
+        references = None if references is None else ReferenceWorth.from_dict(references)
         queries = state.pop(_QUERIES, None)
         half = about.config.matcher.half
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (half,)):
@@ -174,6 +185,7 @@ def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
         split,
         posterior,
         None if queries is None else np.asarray(queries.numpy()),
+        references,
     )
 
 
@@ -263,6 +275,11 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
             f"* Probabilities: fitted on {posterior['tests']} sets of validation touches; "
             f"slope {posterior['slope']:.3f}, offset {posterior['offset']:.3f}, "
             f"dependence of grasps {posterior['dependence']:.3f}"
+        )
+    if references := header["references"]:
+        lines.append(
+            f"* Reference touches: fitted on {references['touches']} touches of {references['objects']} objects that "
+            "were left out"
         )
     if gel_check:
         shares = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["shares"].items()]

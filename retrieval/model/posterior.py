@@ -111,6 +111,14 @@ class Posterior:
         """What the sum of the match logits of so many grasps is multiplied by."""
         return self.slope / (1 + self.dependence * (grasps - 1))
 
+    def log_ratio(self, logits: ArrayLike, grasps: int) -> Floats:
+        """How much likelier the grasps are of objects with these logits than of one that the catalogue lacks; logs."""
+        return self.weight(grasps) * _finite(logits, "every logit") + self.offset
+
+    def logit_of(self, log_ratio: Floats, grasps: int) -> Floats:
+        """Inverse of `log_ratio`."""
+        return np.asarray((log_ratio - self.offset) / self.weight(grasps))
+
     def object_logits(self, logits: ArrayLike, owner: Numbers, counts: Numbers, grasps: int = 1) -> Floats:
         """Logit (J,) of each object from the summed match logits (N,) of its judged photos.
 
@@ -224,11 +232,11 @@ def fit_posterior(*parts: JudgedTouches, seed: int = 0) -> Posterior:
     object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than three objects, or where
     no touch has another photo of its object.
     """
-    return fit_questions([questions for judged in parts for questions in _asked(judged, seed)])
+    return fit_questions([questions for judged in parts for questions in questions_of(judged, seed)])
 
 
-def _asked(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
-    """Of single touches, and of sets of each size that its objects have grasps for."""
+def questions_of(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
+    """Of single touches, and then of sets of each size that its objects have grasps for."""
     for grasps in range(1, _MOST_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
         sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch

@@ -21,7 +21,16 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
         ]
         for paths in result.touches
     ]
-    matches = [{**match.to_dict(), "uri": _data_uri(catalogue / match.photo)} for match in result.results]
+    matches = [
+        {
+            **match.to_dict(),
+            "uri": _data_uri(catalogue / match.photo),
+            "felt": [
+                {"uri": _data_uri(catalogue / path)} for path in (match.reference.touch if match.reference else ())
+            ],
+        }
+        for match in result.results
+    ]
     return render("query.html", result=result, touches=touches, matches=matches)
 
 

@@ -2,10 +2,11 @@
 
 import sys
 from collections.abc import Collection, Sequence
+from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
 from retrieval.console.output import printable, printing, show
-from retrieval.search.answer import QueryResult
+from retrieval.search.answer import NearestReference, QueryResult
 
 if TYPE_CHECKING:
     from retrieval.report.results import Results
@@ -18,7 +19,7 @@ def print_table(result: QueryResult) -> None:
     """Print the ranking of a query, with "none of these" at its end; nothing where there is no ranking."""
     if not result.results:
         return
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             str(match.rank),
             match.object_id,
@@ -30,8 +31,19 @@ def print_table(result: QueryResult) -> None:
     ]
     if result.none_probability is not None:
         rows.append(("-", "none of these", f"{result.none_probability:.3f}", "", ""))
-    header = ("rank", "object", "probability", "logit", "photo")
-    print_columns("Which object is in the hand?", header, rows, words=(1, 4))
+    header: tuple[str, ...] = ("rank", "object", "probability", "logit", "photo")
+    if any(match.reference for match in result.results):
+        header += ("nearest touch", "cosine", "adds")
+        nearest = chain((_reference(match.reference) for match in result.results), repeat(_reference(None)))
+        rows = [(*row, *told) for row, told in zip(rows, nearest, strict=False)]
+    print_columns("Which object is in the hand?", header, rows, words=(1, 4, 5))
+
+
+def _reference(nearest: NearestReference | None) -> tuple[str, str, str]:
+    """Its first gel image, how near it is, and what the object's references add to the logit of its photos."""
+    if nearest is None:
+        return "", "", ""
+    return nearest.touch[0], f"{nearest.cosine:.2f}", "no photo" if nearest.adds is None else f"{nearest.adds:+.2f}"
 
 
 def print_measures(results: "Results") -> None:

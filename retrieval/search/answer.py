@@ -16,12 +16,30 @@ EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_
 
 
 @dataclass(frozen=True)
+class NearestReference:
+    """The reference touch of an object that is nearest to one of the grasps.
+
+    touch: its gel images, paths in the catalogue. cosine: how near it is. adds: what all references of the object add
+    to the logit that its photos alone give it, perhaps less than nothing; None for an object without photos, which its
+    references alone have found.
+    """
+
+    touch: tuple[str, ...]
+    cosine: float
+    adds: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return {"touch": list(self.touch), "cosine": self.cosine, "adds": self.adds}
+
+
+@dataclass(frozen=True)
 class Match:
     """One object of a ranking, shown by its best photo.
 
     logit: what ranks. probability: P(object | touches, catalogue); over all objects and "none of these" it adds up to
     1; None where the model was never calibrated. photo: its path in the catalogue; photo_path: on the disk, absolute.
-    metadata: the user's own.
+    metadata: the user's own. reference: its nearest reference touch; None, and in no document, where it has none.
 
     >>> with retrieval.open("index") as searcher:
     ...     best = searcher.query(["a.png", "b.png"]).top
@@ -36,10 +54,13 @@ class Match:
     photo: str
     metadata: dict[str, Any]
     photo_path: Path
+    reference: NearestReference | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "photo_path"}
+        said = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "photo_path"}
+        reference = said.pop("reference")
+        return said if reference is None else {**said, "reference": reference.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -85,7 +106,7 @@ class QueryResult:
         """Inverse of `to_dict`. Raises BadInput for another document."""
         try:
             catalogue, asked = Path(document["index"]["catalogue"]), document["query"]
-            matches = [Match(**match, photo_path=catalogue / match["photo"]) for match in document["results"]]
+            matches = [_match(match, catalogue) for match in document["results"]]
             others = {
                 name: document[name] for name in ("index", "timing_ms", "verdict", "none_probability", "posterior")
             }
@@ -104,6 +125,14 @@ class QueryResult:
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],
         }
+
+
+def _match(said: dict[str, Any], catalogue: Path) -> Match:
+    own = {name: value for name, value in said.items() if name != "reference"}
+    reference = said.get("reference")
+    if reference is not None:
+        reference = NearestReference(**{**reference, "touch": tuple(reference["touch"])})
+    return Match(**own, photo_path=catalogue / said["photo"], reference=reference)
 
 
 def in_words(result: QueryResult) -> str:

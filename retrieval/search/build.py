@@ -24,6 +24,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.stored import fingerprint, halves_kept
 from retrieval.search.build_report import BuildReport
 from retrieval.search.embed import Embedder, Part, layouts
+from retrieval.search.embed_touches import MadeReferences, make_references, worth_of
 from retrieval.search.looks import Looked
 from retrieval.search.measuring import WinnerBench, can_measure, query_codes
 from retrieval.search.operating import (
@@ -36,6 +37,7 @@ from retrieval.search.operating import (
     settle,
     settle_by_neighbours,
 )
+from retrieval.search.references import ROWS, WORTH
 from retrieval.version import __version__
 
 
@@ -116,11 +118,14 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock():
         parent, halves, why = _before(store, checkpoint)
+        references = make_references(catalogue, checkpoint, parent, wanted.quiet)
+        catalogue = references.shown(catalogue)
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
             "objects_from": naming.text,
             "asked": asdict(asked),
+            **references.about,
             **wanted.about,
         }
         start = time.perf_counter()
@@ -129,7 +134,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
             made = Embedder(checkpoint, parent, unfinished, looked, wanted.donors, halves)
             with closing(made.parts(catalogue, wanted.quiet)) as parts:
                 changed = _unless_same(parent, parts, about)
-                job = _Job(store, made, about, asked, wanted.quiet, wanted.keep)
+                job = _Job(store, made, references, about, asked, wanted.quiet, wanted.keep)
                 generation = parent if parent is not None and changed is None else job.write(changed or ())
             unfinished.clear()
         looked.note(generation)
@@ -155,9 +160,9 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         resumed=made.resumed,
         removed=made.removed,
         unread=made.unread,
-        skipped=made.skipped,
+        skipped=[*made.skipped, *references.skipped],
         ignored=_outside(catalogue, out),
-        without_photo=sorted({*catalogue.photos.objects, *catalogue.unread} - made.objects.keys()),
+        without_photo=sorted(set(catalogue.object_ids) - made.objects.keys()),
         notes=list(catalogue.notes),
         kind=generation.manifest.kind,
         reason=" ".join(filter(None, (wanted.note, why, generation.manifest.about["reason"]))),
@@ -165,6 +170,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted
         candidates=generation.manifest.about["candidates"],
         half_error=made.half_error,
         seconds=seconds,
+        references=_said(references, generation),
     )
 
 
@@ -208,7 +214,8 @@ def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str
 def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:
     """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest say the
     same. Parts are held back until one differs; these have rows alone."""
-    if parent is None or any(parent.manifest.about.get(key) != value for key, value in about.items()):
+    told = {ROWS: None, **about}  # there may be no references any more
+    if parent is None or any(parent.manifest.about.get(key) != value for key, value in told.items()):
         return parts
     same: list[Part] = []
     place = 0
@@ -231,6 +238,7 @@ class _Job:
 
     store: IndexStore
     made: Embedder
+    references: MadeReferences
     about: Mapping[str, Any]
     asked: Asked
     quiet: bool
@@ -245,7 +253,8 @@ class _Job:
                 part.kept or Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
                 for part in parts
             ),
-            {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
+            ({"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {})
+            | self.references.documents,
             fingerprint=fingerprint(checkpoint),
             about=self.about,
             parent=self.made.parent,
@@ -260,7 +269,19 @@ class _Job:
         settled = _settled(self.made, tables, self.asked, self.quiet)
         self.settling_s = time.perf_counter() - start
         about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
+        if self.references.rows:
+            worth, by = worth_of(self.references, self.made.checkpoint, tables)
+            about[WORTH] = {"by": by, "worth": worth.to_dict()}
         return Chosen(settled.kind, settled.parameters, about)
+
+
+def _said(references: MadeReferences, generation: Generation) -> dict[str, Any] | None:
+    """Of reference touches, for the report."""
+    if not references.rows:
+        return None
+    counts = {key: generation.manifest.about[ROWS][key] for key in ("touches", "objects")}
+    more = {"alone": len(references.alone), "encoded": references.encoded}
+    return {**counts, **more, "by": generation.manifest.about[WORTH]["by"]}
 
 
 def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:

@@ -39,6 +39,7 @@ from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos, SkippedP
 from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
 from retrieval.data.storage import is_url
+from retrieval.data.touched import CatalogueTouch
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint
@@ -46,6 +47,7 @@ from retrieval.search.build import Wanted, build_listed, naming_by
 from retrieval.search.build_report import BuildReport
 from retrieval.search.object_store import StoredCluster, folder_with, names
 from retrieval.search.operating import Asked
+from retrieval.search.references import ROWS, WORTH
 from retrieval.version import __version__
 
 BAD_SHARE = 0.05
@@ -121,6 +123,11 @@ def build_cluster(
         before, note = _before(lambda: read_cluster(own) if stored is None else stored.parsed(seen))
         naming, renamed = naming_by(objects_from, {} if before is None else before.about)
         catalogue = list_photos(folder, naming)
+        if catalogue.touches and checkpoint.references is None:
+            raise BadInput(
+                "of a catalogue in shards the model must say what reference touches are worth, for shards would find "
+                "it out each for itself, and this one does not; take one that `retrieve adapt` has made"
+            )
         _sweep(own, before, shards)
         left = {} if stored is None else stored.generations()
         donors = [] if before is None or before.of == shards else before.shards
@@ -130,10 +137,12 @@ def build_cluster(
         ]
         built = sorted((run or one_after_another)(jobs, checkpoint), key=lambda one: one.folder)
         report = _report(out, catalogue, naming, checkpoint, built)
-        if (bad := len(report.skipped)) > bad_share * len(catalogue.photos):
+        every = len(catalogue.photos) + len(catalogue.touches)
+        what = "photos and touches" if catalogue.touches else "photos"
+        if (bad := len(report.skipped)) > bad_share * every:
             first = report.skipped[0]
             raise TooManyBad(
-                f"{bad} of {len(catalogue.photos)} photos cannot be read, more than the share of {bad_share:g} that is "
+                f"{bad} of {every} {what} cannot be read, more than the share of {bad_share:g} that is "
                 f"allowed (--bad-share); the cluster stays as it was. The first: {first.path}: {first.reason}"
             )
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report, asked)
@@ -198,13 +207,18 @@ def _sweep(out: Path, before: ClusterManifest | None, shards: int) -> None:
 
 
 def _divided(catalogue: Catalogue, shards: int) -> list[tuple[int, Catalogue]]:
-    """The catalogue's photos by shard; a shard without any is left out. What concerns no photo is said of none."""
-    own: dict[int, list[CataloguePhoto]] = {}
+    """The catalogue's photos and touches by shard; a shard without any is left out. What concerns neither is said of
+    none."""
+    photos: dict[int, list[CataloguePhoto]] = {}
+    touches: dict[int, list[CatalogueTouch]] = {}
     for photo in catalogue.photos:
-        own.setdefault(shard_of(photo.object_id, shards), []).append(photo)
+        photos.setdefault(shard_of(photo.object_id, shards), []).append(photo)
+    for touch in catalogue.touches:
+        touches.setdefault(shard_of(touch.object_id, shards), []).append(touch)
+    none = replace(catalogue, ignored=(), skipped=(), notes=(), unread=())
     return [
-        (number, replace(catalogue, photos=Photos.of(photos), ignored=(), skipped=(), notes=(), unread=()))
-        for number, photos in sorted(own.items())
+        (number, replace(none, photos=Photos.of(photos.get(number, [])), touches=tuple(touches.get(number, ()))))
+        for number in sorted(photos.keys() | touches.keys())
     ]
 
 
@@ -258,7 +272,16 @@ def _report(
         half_error=max(report.half_error for report in reports),
         seconds=sum(report.seconds for report in reports),
         shards=[asdict(one.entry) for one in built if one.entry is not None],
+        references=_references([report.references for report in reports if report.references]),
     )
+
+
+def _references(told: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Of reference touches in all shards."""
+    if not told:
+        return None
+    counts = {key: sum(one[key] for one in told) for key in ("touches", "objects", "alone", "encoded")}
+    return {**counts, "by": told[0]["by"]}
 
 
 def _manifest(
@@ -278,6 +301,9 @@ def _manifest(
         "asked": asdict(asked),
         "half_error": report.half_error,
     }
+    if report.references is not None and checkpoint.references is not None:
+        about[ROWS] = {key: report.references[key] for key in ("touches", "objects")}
+        about[WORTH] = {"by": report.references["by"], "worth": checkpoint.references.to_dict()}
     made = ClusterManifest(
         generation=cluster_name(1 if before is None else number_of(before.generation) + 1),
         created=datetime.now(UTC).isoformat(timespec="seconds"),

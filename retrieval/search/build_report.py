@@ -28,6 +28,8 @@ class BuildReport:
     (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
     rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a
     cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
+    references: how many reference touches of how many objects, how many of these have no photo (`alone`), how many
+    touches were encoded now, and by what was told what they are worth; None without.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -64,6 +66,7 @@ class BuildReport:
     half_error: float
     seconds: float
     shards: list[dict[str, Any]] | None = None
+    references: dict[str, Any] | None = None
 
     @property
     def left_out(self) -> dict[str, int]:
@@ -75,7 +78,10 @@ class BuildReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
-        return asdict(self) | {"left_out": self.left_out}
+        said = asdict(self) | {"left_out": self.left_out}
+        if self.references is None:
+            del said["references"]
+        return said
 
     def lines(self) -> Iterator[str]:
         """The report for people."""
@@ -99,6 +105,11 @@ class BuildReport:
         yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
         yield from (f"  {name} <- {photo}" for name, photo in self.examples)
         yield from (f"warning: {doubt}" for doubt in self.doubts)
+        if told := self.references:
+            yield (
+                f"{told['touches']} reference touches of {told['objects']} objects, {told['alone']} of which have no "
+                f"photo; {told['encoded']} embedded; what they are worth is told by {told['by']}"
+            )
         measured = ""
         if self.recall["queries"]:  # else exact by construction
             at, recall = self.recall["at"], self.recall["value"]

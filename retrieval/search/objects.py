@@ -1,6 +1,7 @@
 """The photos of an index, checked as they are read, for an index may come from anyone; and its objects: from the match
 logits of photos to what each object's logit is, which are best, and a sample of the others."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
+from indexes.store.rows import keys_of
 from retrieval.model.posterior import Posterior
 
 Floats = NDArray[np.float32]
@@ -56,11 +58,13 @@ def require_usable(generation: Generation, half: int) -> None:
 
 
 class JudgedObjects(NamedTuple):
-    """Objects with a judged photo: their numbers (J,), logits (J,) float64, and best photos' rows (J,)."""
+    """Objects with a judged photo: their numbers (J,), logits (J,) float64, and best photos' rows (J,). by_photos (J,):
+    the logits that photos alone give them, NaN without photos; None where there are no reference touches."""
 
     numbers: Rows
     logits: NDArray[np.float64]
     rows: Rows
+    by_photos: NDArray[np.float64] | None = None
 
 
 class Objects:
@@ -79,6 +83,13 @@ class Objects:
     def count(self) -> int:
         """Number of objects."""
         return len(self._photos)
+
+    def numbers_of(self, names: Sequence[str]) -> Rows:
+        """Of each object its number, -1 for one that is not there."""
+        keys, first = np.unique(self._rows.keys("object_id"), return_index=True)
+        wanted = keys_of(names)
+        places = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        return np.asarray(np.where(keys[places] == wanted, self._of_row[first[places]], -1))
 
     def equal_for_equals(self, rows: Rows, logits: Floats) -> Floats:
         """Photos of equal bytes have equal logits; a matrix product may round its last rows in another way."""

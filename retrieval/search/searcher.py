@@ -32,6 +32,7 @@ from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, Q
 from retrieval.search.object_store import is_cluster, read_cluster
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, folder_shard, open_cluster, stored_for
+from retrieval.search.references import ROWS, told_of
 from retrieval.search.shard import Felt, FolderShard, Judged, Shard
 
 Floats = NDArray[np.float32]
@@ -322,10 +323,11 @@ class Searcher:
 
     def _ranking(self, judged: "_Judged") -> list[Match]:
         ranking, base = [], self.catalogue.absolute()
-        for rank, (logit, photo) in enumerate(judged.found.best, start=1):
+        for rank, (logit, photo, reference) in enumerate(judged.found.best, start=1):
             probability = None if judged.belief is None else float(judged.belief.objects[rank - 1])
             path = base / photo.path
-            ranking.append(Match(rank, photo.object_id, logit, probability, photo.path, photo.metadata, path))
+            told = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
+            ranking.append(Match(*told, path, reference))
         return ranking
 
     def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
@@ -339,6 +341,7 @@ class Searcher:
             "objects": self.described.objects,
             "judged_objects": judged.found.objects,
             "unjudged_probability": judged.belief.unjudged,
+            **({ROWS: told} if (told := told_of(self.described.about)) else {}),
         }
 
 

@@ -22,7 +22,9 @@ from retrieval.errors import BadInput
 from retrieval.model.judge import Judge
 from retrieval.model.posterior import Mass, Posterior
 from retrieval.model.touches import Stopwatch
+from retrieval.search.answer import NearestReference
 from retrieval.search.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
+from retrieval.search.references import Near, by_both, open_references
 
 DEFAULT_CANDIDATES = 1000
 COMPLETED = 20
@@ -39,10 +41,11 @@ class Felt(NamedTuple):
 
 
 class Ranked(NamedTuple):
-    """An object with its logit, and the photo that shows it best."""
+    """An object with its logit, the photo that shows it best, and its nearest reference touch where it has any."""
 
     logit: float
     photo: ListedPhoto
+    reference: NearestReference | None = None
 
 
 @dataclass(frozen=True)
@@ -115,12 +118,13 @@ class FolderShard:
     model's head. Threads may ask it at once; they wait for each other only where words are looked for in all rows.
 
     judge: the layers of the head that take halves. has_embeddings: whether the model's embeddings were trained;
-    without, every photo is judged.
+    without, every photo is judged. Objects with reference touches are judged by these, too. Raises CorruptIndex.
     """
 
     def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
         self.generation, self.judge, self.has_embeddings = generation, judge, has_embeddings
         self.objects = Objects(generation)
+        self.references = open_references(generation, self.objects, len(judge.out))
         self._lock = Lock()
 
     @property
@@ -141,14 +145,13 @@ class FolderShard:
         """As `Shard.ask`. Candidates are some photos of an object: of the best objects the others are judged too."""
         clock = Stopwatch()
         with clock("candidates"):
-            rows = self._candidates(felt.embeddings, self.limit(top, candidates))
+            limit = self.limit(top, candidates)
+            near = None if self.references is None else self.references.near(felt.halves)
+            rows = self._with_near(self._candidates(felt.embeddings, limit), near, limit)
         with clock("rerank"):
-            objects, photos = self._judged(felt.halves, rows, top, posterior or Posterior())
-            mass = None if posterior is None else self._mass(felt.halves, objects, posterior)
-        best = [
-            Ranked(float(objects.logits[place]), listed_photo(self.generation.rows[int(objects.rows[place])]))
-            for place in self.objects.best(objects, top)
-        ]
+            objects, photos = self._judged(felt.halves, rows, top, posterior or Posterior(), near)
+            mass = None if posterior is None else self._mass(felt.halves, objects, posterior, near)
+        best = [self._ranked(objects, place, felt.halves) for place in self.objects.best(objects, top).tolist()]
         return Judged(photos, len(objects.numbers), best, mass, self.generation.count, clock.finished(1))
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
@@ -192,10 +195,35 @@ class FolderShard:
             return np.arange(self.generation.count)
         return np.unique(np.concatenate(self.generation.candidates(embeddings, k)))
 
-    def _judged(self, halves: Floats, rows: Rows, top: int, meaning: Posterior) -> tuple[JudgedObjects, int]:
+    def _with_near(self, rows: Rows, near: Near | None, most: int) -> Rows:
+        """With the photos of at most so many objects whose reference touches are nearest."""
+        if self.references is None or near is None or len(rows) == self.generation.count:
+            return rows
+        return np.union1d(rows, self.objects.rest_of(self.references.nearest_objects(near, most), rows))
+
+    def _ranked(self, objects: JudgedObjects, place: int, halves: Floats) -> Ranked:
+        photo, logit = listed_photo(self.generation.rows[int(objects.rows[place])]), float(objects.logits[place])
+        if self.references is None or objects.by_photos is None:
+            return Ranked(logit, photo)
+        number, by_photos = int(objects.numbers[place]), float(objects.by_photos[place])
+        return Ranked(logit, photo, self.references.nearest(number, halves, logit, by_photos))
+
+    def _objects_of(
+        self, rows: Rows, logits: Floats, meaning: Posterior, grasps: int, near: Near | None
+    ) -> JudgedObjects:
+        """Objects by their photos at these rows, and by their reference touches."""
+        objects = self.objects.judged(rows, logits, meaning, grasps)
+        if self.references is None or near is None:
+            return objects
+        both = by_both(self.references, self.objects, rows, logits, grasps)
+        return self.references.added(objects, both, near, meaning, grasps)
+
+    def _judged(
+        self, halves: Floats, rows: Rows, top: int, meaning: Posterior, near: Near | None
+    ) -> tuple[JudgedObjects, int]:
         """Objects by their judged photos, and how many photos these are."""
         logits = self._logits(halves, rows)
-        objects = self.objects.judged(rows, logits, meaning, len(halves))
+        objects = self._objects_of(rows, logits, meaning, len(halves), near)
         if len(rows) == self.generation.count:
             return objects, len(rows)
         best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
@@ -204,15 +232,15 @@ class FolderShard:
             return objects, len(rows)
         rows = np.concatenate([rows, rest])
         logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
-        return self.objects.judged(rows, logits, meaning, len(halves)), len(rows)
+        return self._objects_of(rows, logits, meaning, len(halves), near), len(rows)
 
-    def _mass(self, halves: Floats, objects: JudgedObjects, posterior: Posterior) -> Mass:
+    def _mass(self, halves: Floats, objects: JudgedObjects, posterior: Posterior, near: Near | None) -> Mass:
         unjudged = self.objects.count - len(objects.numbers)
         # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
         # expected to be.
         sample = objects.logits.min(keepdims=True)
         if unjudged and len(drawn := self.objects.sample_without(objects.numbers)):
-            sample = self.objects.judged(drawn, self._logits(halves, drawn), posterior, len(halves)).logits
+            sample = self._objects_of(drawn, self._logits(halves, drawn), posterior, len(halves), near).logits
         return posterior.mass(objects.logits, len(halves), unjudged=unjudged, sample=sample)
 
     def _logits(self, halves: Floats, rows: Rows) -> Floats:

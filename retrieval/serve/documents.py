@@ -39,8 +39,18 @@ EXAMPLE: dict[str, Any] = {
 }
 
 
+class ReferenceDocument(BaseModel):
+    """The reference touch of an object that is nearest: its gel images, paths in the catalogue. adds: what the object's
+    references add to the logit of its photos; null for an object without photos."""
+
+    touch: list[str]
+    cosine: float
+    adds: float | None
+
+
 class MatchDocument(BaseModel):
-    """One object of a ranking, shown by its best photo, whose id is `photo`."""
+    """One object of a ranking, shown by its best photo, whose id is `photo`. reference: only where the catalogue has
+    touches of the object."""
 
     rank: int
     object_id: str
@@ -48,6 +58,7 @@ class MatchDocument(BaseModel):
     probability: float | None
     photo: str
     metadata: dict[str, Any]
+    reference: ReferenceDocument | None = None
 
 
 class QueryDocument(BaseModel):

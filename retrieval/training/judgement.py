@@ -23,7 +23,8 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
 from retrieval.model.fusion import KINDS, QUIET, GelHead, Matcher, judge_of
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
+from retrieval.model.posterior import JudgedTouches, fit_posterior
+from retrieval.model.references import FeltTouches, fit_references, touch_codes
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign import draw_foreign
 
@@ -68,8 +69,12 @@ def with_verdicts(
     if not learned or not judged:
         return made
     touches, photos = recorded_features(matcher, source, judged, what="posterior", quiet=quiet, stopped=stopped)
-    posterior = posterior_of(matcher, judged, touches, photos, seed)
-    made = dataclasses.replace(made, posterior=posterior)
+    asked = asked_touches(matcher, judged, touches, photos)
+    made = dataclasses.replace(
+        made,
+        posterior=None if asked is None else fit_posterior(asked.judged, seed=seed),
+        references=None if asked is None else fit_references(asked, seed=seed),
+    )
     if len(judged) < FEWEST_GRASPS:
         return made
     others, _ = recorded_features(matcher, source, learned, what="check of touches", quiet=quiet, stopped=stopped)
@@ -94,10 +99,11 @@ def _drawn(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
 # Which object was it? --------------------------------------------------------------------------------------
 
 
-def posterior_of(
-    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor], seed: int
-) -> Posterior | None:
-    """Fitted on touches (G, fingers * F) of grasps and on their photos; None where these are too few."""
+def asked_touches(
+    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor]
+) -> FeltTouches | None:
+    """What a posterior is fitted on: touches (G, fingers * F) of grasps and their photos; None where these are too
+    few."""
     objects = sorted({grasp.object_id for grasp in grasps})
     shows = {grasp.photo: grasp.object_id for grasp in grasps}
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
@@ -110,7 +116,8 @@ def posterior_of(
         photo_halves = matcher.photo_code(torch.stack(list(photos.values()))).half.cpu().numpy()
     judge = judge_of(matcher.head)
     logits = np.stack([judge.logits(half[None], photo_halves) for half in touch_halves])
-    return fit_posterior(JudgedTouches(logits, touch_owner, photo_owner, own), seed=seed)
+    codes = touch_codes(touch_halves, matcher.config.hidden)
+    return FeltTouches(JudgedTouches(logits, touch_owner, photo_owner, own), codes)
 
 
 # What does a gel image show? -------------------------------------------------------------------------------

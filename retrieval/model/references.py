@@ -1,0 +1,204 @@
+"""What reference touches are worth: touches of the catalogue's objects, with which a query's touch is compared.
+
+    c(g, o) = 1 / SHARPNESS * log mean exp(SHARPNESS * cosine)   grasp g with object o, over the references of o
+    C(o)    = sum of c(g, o) over the grasps
+
+The cosine is that of the contrastive embeddings of two touches; a reference is one touch of its object, each as likely,
+so a copy of a reference changes nothing. What C says is fitted as match logits are (`retrieval.model.posterior`), on
+objects whose touches are in part references and in part ask:
+
+    an object shown by touches alone    log likelihood ratio = w_a C + offset_a
+    an object shown by photos, too      log likelihood ratio = w_b (l_b + weight C) + offset_b
+
+w_a, offset_a and w_b, offset_b are those of two posteriors, l_b the object's logit over its photos by the second one.
+The second is fitted on sums of both, for photo and reference are asked by one and the same touch and do not count as
+two witnesses. Told as the logit that an object with photos alone would have for that ratio, all objects of a catalogue
+are ranked and believed by one formula, whatever shows them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput
+from retrieval.model.posterior import (
+    LEAST_OBJECTS,
+    JudgedTouches,
+    Posterior,
+    fit_posterior,
+    fit_questions,
+    questions_of,
+)
+
+Floats = NDArray[np.float32]
+Numbers = NDArray[np.int64]
+SHARPNESS = 16.0
+"""How far the nearest of an object's references counts before the others; of simulated unseen objects 8, 16 and the
+nearest alone found the object equally often."""
+MOST_REFERENCES = 3
+"""Of an object, when it is fitted what they are worth: as many as somebody takes who takes few."""
+WEIGHTS = (0.01, 1000.0)
+"""Within which the weight beside photos is looked for."""
+
+
+@dataclass(frozen=True)
+class ReferenceWorth:
+    """The numbers of the formulas above. alone: of objects without photos; weight, beside: of those with photos, None
+    where no object had both. objects, touches: on how many it was fitted, and how many touches of these asked."""
+
+    alone: Posterior
+    weight: float | None
+    beside: Posterior | None
+    objects: int
+    touches: int
+
+    def __post_init__(self) -> None:
+        numbers = [self.objects, self.touches, 0.0 if self.weight is None else self.weight]
+        if any(type(number) not in (int, float) or not 0 <= number <= 1e9 for number in numbers):
+            raise BadInput(f"what references are worth must be told in finite numbers from 0 on; got {numbers}")
+        if (self.weight is None) != (self.beside is None):
+            raise BadInput("a weight beside photos and its posterior go together; one of them is missing")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary, as stored in checkpoints and in the manifests of indexes."""
+        parts = {name: None if one is None else one.to_dict() for name, one in self._posteriors.items()}
+        return {**dataclasses.asdict(self), **parts}
+
+    @property
+    def _posteriors(self) -> dict[str, Posterior | None]:
+        return {"alone": self.alone, "beside": self.beside}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "ReferenceWorth":
+        """Inverse of `to_dict`. Raises BadInput for anything else."""
+        names = {field.name for field in dataclasses.fields(cls)}
+        if not isinstance(data, Mapping) or set(data) != names:
+            raise BadInput(f"what references are worth must hold {', '.join(sorted(names))}")
+        beside = None if data["beside"] is None else Posterior.from_dict(data["beside"])
+        return cls(**{**data, "alone": Posterior.from_dict(data["alone"]), "beside": beside})
+
+
+def touch_codes(halves: NDArray[np.floating[Any]], hidden: int) -> Floats:
+    """Unit contrastive embeddings (G, d) of touches, from halves (G, hidden + d) that end with them; d is 0 for a model
+    whose logit counts no cosine."""
+    codes = np.asarray(halves[:, hidden:], dtype=np.float32)
+    return np.asarray(codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), np.float32(1e-6)))
+
+
+def nearness(cosines: NDArray[np.floating[Any]], starts: Numbers) -> NDArray[np.float64]:
+    """c (G, O) of cosines (G, R) of grasps with references, those of an object side by side from `starts` (O,) on."""
+    scaled = SHARPNESS * cosines.astype(np.float64)
+    counts = np.diff(np.append(starts, scaled.shape[1]))
+    top = np.maximum.reduceat(scaled, starts, axis=1)
+    sums = np.add.reduceat(np.exp(scaled - np.repeat(top, counts, axis=1)), starts, axis=1)
+    return np.asarray((top + np.log(sums / counts)) / SHARPNESS)
+
+
+# Fitting ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FeltTouches:
+    """Touches of known objects in the order of capture, with their codes (T, d) and what photos say of them; there may
+    be no photo."""
+
+    judged: JudgedTouches
+    codes: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """Objects some of whose touches are references: C of the others, alone, and these with the photos' logits."""
+
+    alone: JudgedTouches
+    photos: JudgedTouches
+
+    @property
+    def both(self) -> NDArray[np.float64]:
+        """(T, N): C of each photo's object."""
+        return np.asarray(self.alone.logits[:, self.photos.photo_owner])
+
+    @property
+    def with_photos(self) -> bool:
+        """Whether it can be asked which object it was of those with photos."""
+        own = self.photos.photo_owner == self.photos.touch_owner[:, None]
+        return len(np.unique(self.photos.photo_owner)) >= LEAST_OBJECTS and bool((own & ~self.photos.own).any())
+
+
+def fit_references(*parts: FeltTouches, seed: int = 0) -> ReferenceWorth | None:
+    """What references are worth, by touches of objects that have two at least; None for fewer than three such objects,
+    and for codes of nothing.
+
+    parts: as `retrieval.model.posterior.fit_posterior` takes them. References are of an object's first half of touches,
+    of many touches of the first quarter, at most `MOST_REFERENCES`; the last half asks. Where there are enough, so, no
+    touch is asked beside its neighbour.
+    """
+    asked = [found for part in parts if part.codes.shape[1] and (found := _asked(part)) is not None]
+    if not asked:
+        return None
+    seen = [part for part in asked if part.with_photos]
+    weight = _weight(seen, seed) if seen else None
+    beside = None
+    if weight is not None:
+        sums = (dataclasses.replace(part.photos, logits=part.photos.logits + weight * part.both) for part in seen)
+        beside = fit_posterior(*sums, seed=seed)
+    return ReferenceWorth(
+        fit_posterior(*(part.alone for part in asked), seed=seed),
+        weight,
+        beside,
+        sum(len(part.alone.photo_owner) for part in asked),
+        sum(len(part.alone.touch_owner) for part in asked),
+    )
+
+
+def _asked(part: FeltTouches) -> _Asked | None:
+    judged = part.judged
+    rows = [np.flatnonzero(judged.touch_owner == name) for name in np.unique(judged.touch_owner)]
+    rows = [mine for mine in rows if len(mine) > 1]
+    if len(rows) < LEAST_OBJECTS:
+        return None
+    shown = [_spread(mine[: max(len(mine) // 4, min(MOST_REFERENCES, len(mine) // 2))]) for mine in rows]
+    asking = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
+    owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
+    cosines = part.codes[asking] @ part.codes[np.concatenate(shown)].T
+    near = nearness(cosines, np.cumsum([0, *(len(some) for some in shown[:-1])]))
+    number = {int(judged.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
+    known = np.flatnonzero(np.isin(judged.photo_owner, list(number)))
+    photo_owner = np.array([number[int(name)] for name in judged.photo_owner[known]], np.int64)
+    return _Asked(
+        JudgedTouches(near, owner, np.arange(len(rows)), np.zeros(near.shape, np.bool_)),
+        JudgedTouches(judged.logits[np.ix_(asking, known)], owner, photo_owner, judged.own[np.ix_(asking, known)]),
+    )
+
+
+def _spread(rows: Numbers) -> Numbers:
+    """At most `MOST_REFERENCES` of the rows, evenly spaced."""
+    places = np.linspace(0, len(rows) - 1, min(MOST_REFERENCES, len(rows)))
+    return np.asarray(rows[places.round().astype(np.int64)])
+
+
+def _weight(asked: Sequence[_Asked], seed: int) -> float:
+    """How many match logits a C of 1 is worth: the likeliest weight for "which object was it, or none", asked of single
+    touches."""
+    from scipy.optimize import minimize_scalar  # slow to import, and no query needs it
+
+    photos = [next(questions_of(part.photos, seed)) for part in asked]
+    near = [next(questions_of(dataclasses.replace(part.photos, logits=part.both), seed)) for part in asked]
+    count = sum(len(one.scores) for one in photos)
+
+    def loss(log_weight: float) -> float:
+        weight = math.exp(log_weight)
+        sums = [
+            dataclasses.replace(seen, scores=seen.scores + weight * felt.scores)
+            for seen, felt in zip(photos, near, strict=True)
+        ]
+        posterior = fit_questions(sums)
+        return sum(len(one.scores) * one.loss(posterior, 1 / (count + 2)) for one in sums) / count
+
+    bounds = [math.log(weight) for weight in WEIGHTS]
+    return math.exp(float(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 0.1}).x))

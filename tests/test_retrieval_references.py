@@ -1,0 +1,423 @@
+"""Reference touches: what they are worth by hand, and that they are encoded, kept, asked and told beside photos."""
+
+import dataclasses
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from indexes.errors import CorruptIndex
+from indexes.store.folder import IndexStore
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.model.posterior import JudgedTouches, Posterior
+from retrieval.model.references import (
+    SHARPNESS,
+    FeltTouches,
+    ReferenceWorth,
+    fit_references,
+    nearness,
+    touch_codes,
+)
+from retrieval.report.query import query_html
+from retrieval.report.terminal import print_table
+from retrieval.search.answer import QueryResult
+from retrieval.search.build import build_index
+from retrieval.search.build_cluster import build_cluster
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import FolderShard
+from tests import synthetic
+from tests.conftest import TINY
+
+WORTH = ReferenceWorth(Posterior(8.0, -3.0, 0.5, 40), 5.0, Posterior(1.5, -2.0, 0.8, 40), 20, 40)
+MEANING = Posterior(0.9, -0.5, 0.7, 40)
+OBJECTS = synthetic.make_objects(8, seed=9)
+NAMES = sorted(one.object_id for one in OBJECTS)
+
+
+# What they are worth ------------------------------------------------------------------------------------------------
+
+
+def test_one_reference_says_its_cosine_and_a_copy_of_it_nothing_more():
+    cosines = np.float32([[0.3, -0.2], [0.9, 0.1]])
+    one = nearness(cosines, np.array([0, 1]))
+    np.testing.assert_allclose(one, cosines, atol=1e-7)
+    copied = nearness(cosines[:, [0, 0, 0, 1]], np.array([0, 3]))
+    np.testing.assert_allclose(copied, cosines, atol=1e-7)
+
+
+def test_several_references_are_averaged_as_likelihoods_are():
+    """By two plain loops, over objects with one, three and two references."""
+    cosines = np.random.default_rng(0).uniform(-1, 1, (4, 6)).astype(np.float32)
+    parts = ([0], [1, 2, 3], [4, 5])
+    for grasp, row in enumerate(nearness(cosines, np.array([0, 1, 4]))):
+        for part, got in zip(parts, row, strict=True):
+            mean = sum(math.exp(SHARPNESS * float(cosines[grasp, place])) for place in part) / len(part)
+            assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
+
+
+def test_codes_are_the_end_of_halves_at_norm_one():
+    halves = np.float16([[9, 9, 3, 4], [9, 9, 0, -2]])
+    np.testing.assert_allclose(touch_codes(halves, 2), [[0.6, 0.8], [0, -1]], atol=1e-6)
+    assert touch_codes(halves, 4).shape == (2, 0)
+
+
+def test_what_they_are_worth_is_stored_and_read_again():
+    assert ReferenceWorth.from_dict(json.loads(json.dumps(WORTH.to_dict()))) == WORTH
+    bare = dataclasses.replace(WORTH, weight=None, beside=None)
+    assert ReferenceWorth.from_dict(bare.to_dict()) == bare
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"weight": math.inf}, {"weight": -1.0}, {"weight": None}, {"objects": "many"}, {"alone": {}}, {"more": 1}],
+)
+def test_what_is_no_worth_is_refused(change):
+    with pytest.raises(BadInput):
+        ReferenceWorth.from_dict(WORTH.to_dict() | change)
+
+
+def felt(objects=10, touches=4, noise=0.3, photos=True, seed=0):
+    """Codes around a direction of each object, and photos whose logits say a little."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), touches)
+    codes = rng.normal(size=(objects, 16))[owner] + 4 * noise * rng.normal(size=(len(owner), 16))
+    codes = (codes / np.linalg.norm(codes, axis=1, keepdims=True)).astype(np.float32)
+    photo_owner = np.arange(objects if photos else 0)
+    logits = rng.normal(size=(len(owner), len(photo_owner))) + (owner[:, None] == photo_owner)
+    return FeltTouches(JudgedTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool)), codes)
+
+
+def test_near_touches_weigh_much_and_noise_weighs_little():
+    near, far = fit_references(felt(noise=0.1)), fit_references(felt(noise=50.0))
+    assert near.alone.slope > 5 > far.alone.slope
+    assert near.weight * near.beside.slope > 5 * far.weight * far.beside.slope
+    assert (near.objects, near.touches) == (10, 20)  # the last half of four touches each
+
+
+def test_without_photos_the_touches_alone_are_fitted():
+    found = fit_references(felt(photos=False))
+    assert found.beside is None
+    assert found.weight is None
+    assert found.alone.slope > 1
+
+
+def test_too_few_objects_or_touches_or_numbers_teach_nothing():
+    assert fit_references(felt(objects=2)) is None
+    assert fit_references(felt(touches=1)) is None
+    given = felt()
+    assert fit_references(dataclasses.replace(given, codes=given.codes[:, :0])) is None
+
+
+# In an index --------------------------------------------------------------------------------------------------------
+
+
+def a_model(path, references=WORTH, posterior=MEANING, cosine=True):
+    """A matcher of random weights whose touches differ."""
+    matcher = dataclasses.replace(TINY.matcher, cosine=cosine)
+    config = Config(matcher, TINY.training, TINY.preprocessing)
+    torch.manual_seed(0)
+    about = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
+    save_checkpoint(
+        path,
+        Matcher(matcher).eval(),
+        config,
+        split=None,
+        provenance=about,
+        posterior=posterior,
+        references=references,
+    )
+    return load_checkpoint(path)
+
+
+@pytest.fixture
+def felt_model(tmp_path):
+    return a_model(tmp_path / "felt.safetensors")
+
+
+@pytest.fixture(scope="module")
+def touches(tmp_path_factory):
+    """Three touches of each of the catalogue's objects, by object."""
+    return synthetic.write_queries(tmp_path_factory.mktemp("touches"), OBJECTS, 3)
+
+
+def put(catalogue, name, number, files):
+    """A touch into a catalogue."""
+    (catalogue / name).mkdir(exist_ok=True)
+    for finger, path in zip("ab", files, strict=True):
+        shutil.copy(path, catalogue / name / f"touch_{number}_{finger}.png")
+
+
+@pytest.fixture
+def touched(own, touches):
+    """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
+    for name in NAMES[:4]:
+        for number in (0, 1):
+            put(own, name, number, touches[name][number])
+    for photo in (own / NAMES[2]).glob("*.jpg"):
+        photo.unlink()
+    return own
+
+
+def answered(catalogue, model, index, files, **asked):
+    build_index(catalogue, model, index, quiet=True)
+    with Searcher.open(index) as searcher:
+        return searcher.query(files, **{"top": 8, **asked})
+
+
+def test_a_touch_that_is_a_reference_itself_is_the_nearest_and_is_named(touched, felt_model, tmp_path, touches):
+    result = answered(touched, felt_model, tmp_path / "index", touches[NAMES[1]][1])
+    best = {match.object_id: match for match in result.results}[NAMES[1]]
+    assert best.reference.touch == (f"{NAMES[1]}/touch_1_a.png", f"{NAMES[1]}/touch_1_b.png")
+    assert best.reference.cosine == pytest.approx(1.0, abs=1e-3)  # halves are float16
+    assert [match.reference is None for match in result.results].count(False) == 4
+
+
+def test_an_object_without_photos_is_found_by_its_touches(touched, felt_model, tmp_path, touches):
+    result = answered(touched, felt_model, tmp_path / "index", touches[NAMES[2]][0])
+    alone = {match.object_id: match for match in result.results}[NAMES[2]]
+    assert alone.reference.adds is None
+    assert alone.photo == f"{NAMES[2]}/touch_0_a.png"  # which shows it to people
+    cosines = [1.0, other_cosine(felt_model, touches[NAMES[2]][:2])]
+    near = math.log(sum(math.exp(SHARPNESS * one) for one in cosines) / 2) / SHARPNESS
+    ratio = WORTH.alone.slope * near + WORTH.alone.offset
+    assert alone.logit == pytest.approx((ratio - MEANING.offset) / MEANING.slope, abs=0.05)
+
+
+def other_cosine(model, grasps):
+    from retrieval.model.encode import encode_touches
+
+    load = model.config.preprocessing.load_touch
+    codes = touch_codes(
+        encode_touches(model.matcher, [[load(path) for path in one] for one in grasps]).half.numpy(), 32
+    )
+    return float(codes[0] @ codes[1])
+
+
+def test_photos_and_references_of_an_object_add_up_as_reckoned_by_hand(touched, felt_model, tmp_path, touches):
+    files = touches[NAMES[0]][2]
+    index = tmp_path / "index"
+    result = answered(touched, felt_model, index, files)
+    match = {one.object_id: one for one in result.results}[NAMES[0]]
+    with Searcher.open(index) as searcher:
+        halves = searcher.encode(files).halves
+        rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
+        photos = searcher.judge.logits(halves, searcher.generation.arrays["halves"][rows])
+        mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
+        kept = touch_codes(searcher.generation.documents["touches"][mine], 32)
+    cosines = touch_codes(halves, 32) @ kept.T
+    near = math.log(np.exp(SHARPNESS * cosines.astype(float)).mean()) / SHARPNESS
+    slope = WORTH.beside.slope
+    by_photos = math.log(np.exp(slope * (photos.astype(float) + WORTH.weight * near)).mean()) / slope
+    ratio = slope * by_photos + WORTH.beside.offset
+    assert match.logit == pytest.approx((ratio - MEANING.offset) / MEANING.slope, abs=1e-4)
+    bare = math.log(np.exp(MEANING.slope * photos.astype(float)).mean()) / MEANING.slope
+    assert match.reference.adds == pytest.approx(match.logit - bare, abs=1e-4)
+
+
+def test_objects_without_references_are_judged_as_they_were(own, touched, felt_model, tmp_path, touches):
+    with_them = answered(touched, felt_model, tmp_path / "index", touches[NAMES[0]][2])
+    for path in touched.rglob("touch_*"):
+        path.unlink()
+    without = answered(touched, felt_model, tmp_path / "bare", touches[NAMES[0]][2])
+    before, after = ({match.object_id: match.logit for match in one.results} for one in (without, with_them))
+    assert [after[name] for name in NAMES[4:]] == pytest.approx([before[name] for name in NAMES[4:]], abs=1e-5)
+
+
+def test_all_that_may_be_adds_up_to_one(touched, felt_model, tmp_path, touches):
+    result = answered(touched, felt_model, tmp_path / "index", [touches[NAMES[0]][2], touches[NAMES[0]][1]])
+    whole = result.none_probability + sum(match.probability for match in result.results)
+    assert whole + result.posterior["unjudged_probability"] == pytest.approx(1.0)
+
+
+def test_photos_of_the_object_of_the_nearest_touch_are_judged_whatever_the_candidates_are(
+    touched, felt_model, tmp_path, touches, monkeypatch
+):
+    judged = []
+    whole = FolderShard._judged
+    monkeypatch.setattr(FolderShard, "_judged", lambda *asked: judged.append(asked[2]) or whole(*asked))
+    build_index(touched, felt_model, tmp_path / "index", quiet=True)
+    with Searcher.open(tmp_path / "index") as searcher:
+        for name in NAMES[:4]:
+            searcher.query(touches[name][0], top=1, candidates=1)
+            rows = judged.pop().tolist()
+            own = {at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == name}
+            assert own <= set(rows)
+            assert len(rows) <= len(own) + 1
+
+
+def test_the_answer_says_what_it_rests_on_and_is_read_again(touched, felt_model, tmp_path, touches):
+    result = answered(touched, felt_model, tmp_path / "index", touches[NAMES[0]][2])
+    told = result.posterior["references"]
+    assert (told["touches"], told["objects"], told["by"]) == (8, 4, "objects that the model was not fitted to")
+    assert ReferenceWorth.from_dict(told["worth"]) == WORTH
+    document = json.loads(json.dumps(result.to_dict()))
+    assert QueryResult.from_dict(document).to_dict() == result.to_dict()
+
+
+def test_pages_and_tables_show_the_nearest_touch(touched, felt_model, tmp_path, touches, capsys):
+    result = answered(touched, felt_model, tmp_path / "index", touches[NAMES[0]][2])
+    page = query_html(result, touched)
+    assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
+    assert "no photo: by touches alone" in page
+    assert "fitted on 40 touches of 20 objects" in page
+    print_table(result)
+    table = capsys.readouterr().out
+    assert "nearest touch" in table
+    assert "no photo" in table
+
+
+def test_without_touches_nothing_is_said_of_them(own, felt_model, tmp_path, touches, capsys):
+    result = answered(own, felt_model, tmp_path / "index", touches[NAMES[0]][2])
+    generation = IndexStore(tmp_path / "index").open()
+    assert list(generation.documents) == ["calibration"]
+    assert not {"references", "reference_worth"} & set(generation.manifest.about)
+    assert "references" not in result.posterior
+    assert all("reference" not in one for one in result.to_dict()["results"])
+    print_table(result)
+    assert "touch" not in capsys.readouterr().out
+
+
+# Building again -----------------------------------------------------------------------------------------------------
+
+
+def test_only_new_touches_are_encoded_again(touched, felt_model, tmp_path, touches):
+    index = tmp_path / "index"
+    first = build_index(touched, felt_model, index, quiet=True)
+    assert first.references == {
+        "touches": 8,
+        "objects": 4,
+        "alone": 1,
+        "encoded": 8,
+        "by": "objects that the model was not fitted to",
+    }
+    again = build_index(touched, felt_model, index, quiet=True)
+    assert (again.written, again.references["encoded"]) == (False, 0)
+    put(touched, NAMES[5], 0, touches[NAMES[5]][0])
+    more = build_index(touched, felt_model, index, quiet=True)
+    assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
+
+
+def test_without_the_touches_the_index_is_what_it_was_before_them(own, felt_model, tmp_path, touches):
+    index = tmp_path / "index"
+    before = answered(own, felt_model, index, touches[NAMES[0]][2])
+    put(own, NAMES[0], 0, touches[NAMES[0]][0])
+    assert answered(own, felt_model, index, touches[NAMES[0]][2]).results != before.results
+    (own / NAMES[0] / "touch_0_a.png").unlink()
+    (own / NAMES[0] / "touch_0_b.png").unlink()
+    assert answered(own, felt_model, index, touches[NAMES[0]][2]).results == before.results
+
+
+def test_what_cannot_be_compared_is_left_out_with_its_reason(touched, felt_model, tmp_path):
+    (touched / NAMES[0] / "touch_0_b.png").unlink()
+    (touched / NAMES[1] / "touch_0_a.png").write_bytes(b"no picture")
+    for path in (touched / NAMES[2]).glob("touch_*"):
+        path.write_bytes(b"")
+    report = build_index(touched, felt_model, tmp_path / "index", quiet=True)
+    reasons = {item.path: item.reason for item in report.skipped}
+    assert "1 gel image(s), the model takes 2: names end in _a and _b" in reasons[f"{NAMES[0]}/touch_0_a.png"]
+    assert len(reasons) == 4
+    assert report.references["touches"] == 4
+    assert report.without_photo == [NAMES[2]]  # neither photo nor touch of it can be used
+
+
+@pytest.mark.parametrize("changed", [{"cosine": False, "references": None}, {"posterior": None, "references": None}])
+def test_a_model_that_cannot_compare_touches_says_so(touched, tmp_path, changed):
+    with pytest.raises(BadInput, match="this model cannot compare touches"):
+        build_index(touched, a_model(tmp_path / "other.safetensors", **changed), tmp_path / "index", quiet=True)
+
+
+def test_where_nothing_says_what_they_are_worth_nothing_is_built(touched, tmp_path):
+    model = a_model(tmp_path / "untold.safetensors", references=None)
+    with pytest.raises(BadInput, match="8 reference touches are worth"):
+        build_index(touched, model, tmp_path / "index", quiet=True)
+    assert not (tmp_path / "index" / "CURRENT").exists()
+
+
+def test_the_catalogues_own_touches_tell_what_they_are_worth_where_the_model_does_not(tmp_path):
+    model = a_model(tmp_path / "untold.safetensors", references=None)
+    objects = synthetic.make_objects(11, seed=4)
+    catalogue = synthetic.write_catalogue(tmp_path / "catalog", objects, 1)
+    for name, own in synthetic.write_queries(tmp_path / "felt", objects, 2).items():
+        for number, files in enumerate(own):
+            put(catalogue, name, number, files)
+    report = build_index(catalogue, model, tmp_path / "index", quiet=True)
+    assert report.references["by"] == "the catalogue's own touches"
+    told = IndexStore(tmp_path / "index").open().manifest.about["reference_worth"]["worth"]
+    worth = ReferenceWorth.from_dict(told)
+    assert (worth.objects, worth.touches) == (11, 11)
+    assert worth.beside is not None
+
+
+# Several shards, and what others wrote ------------------------------------------------------------------------------
+
+
+def test_a_cluster_answers_as_one_folder_does(touched, felt_model, tmp_path, touches):
+    files = touches[NAMES[1]][2]
+    whole = answered(touched, felt_model, tmp_path / "index", files)
+    report = build_cluster(touched, felt_model, tmp_path / "cluster", 3, quiet=True)
+    assert (report.references["touches"], report.references["alone"]) == (8, 1)
+    with Searcher.open(tmp_path / "cluster") as searcher:
+        divided = searcher.query(files, top=8)
+    assert [one.object_id for one in divided.results] == [one.object_id for one in whole.results]
+    for mine, other in zip(divided.results, whole.results, strict=True):
+        assert (mine.logit, mine.probability) == pytest.approx((other.logit, other.probability), abs=1e-5)
+        assert (mine.reference is None) == (other.reference is None)
+    assert divided.posterior["references"]["touches"] == 8
+
+
+def test_shards_do_not_find_out_each_for_itself_what_references_are_worth(touched, tmp_path):
+    model = a_model(tmp_path / "untold.safetensors", references=None)
+    with pytest.raises(BadInput, match="in shards the model must say"):
+        build_cluster(touched, model, tmp_path / "cluster", 2, quiet=True)
+
+
+def forged(index, **changed):
+    """The index written again with another list of touches, other halves or another worth."""
+    store = IndexStore(index)
+    there = store.open()
+    rows = list(there.rows)
+    documents = {name: changed.get(name, content) for name, content in there.documents.items()}
+    about = {**there.manifest.about, **{name: changed[name] for name in changed if name == "reference_worth"}}
+    store.write(
+        rows,
+        there.embeddings[there.slots],
+        {name: np.array(part) for name, part in there.arrays.items()},
+        documents,
+        fingerprint=there.fingerprint,
+        about=about,
+    )
+
+
+TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"references": []},
+        {"references": {"touches": [], "alone": "all"}},
+        {"references": {"touches": [TOUCH | {"touch": ["../../etc/passwd"]}] * 8, "alone": []}},
+        {"references": {"touches": [TOUCH | {"touch": ["/etc/passwd"]}] * 8, "alone": []}},
+        {"references": {"touches": [TOUCH | {"object_id": 3}] * 8, "alone": []}},
+        {"references": {"touches": [TOUCH], "alone": []}},
+        {"references": {"touches": [TOUCH | {"touch": "a.png"}] * 8, "alone": [3]}},
+        {"touches": np.zeros((8, 3), np.float16)},
+        {"touches": np.zeros((8, 48), np.int16)},
+        {"touches": {"not": "an array"}},
+        {"reference_worth": None},
+        {"reference_worth": {"by": "hand", "worth": {"weight": 1}}},
+        {"reference_worth": [1]},
+    ],
+)
+def test_forged_references_are_refused_in_a_sentence(touched, felt_model, tmp_path, changed):
+    index = tmp_path / "index"
+    build_index(touched, felt_model, index, quiet=True)
+    forged(index, **changed)
+    with pytest.raises(CorruptIndex, match="retrieve build-index"):
+        Searcher.open(index)
