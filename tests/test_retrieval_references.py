@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import shutil
 
 import numpy as np
@@ -33,6 +34,7 @@ from retrieval.search.searcher import Searcher
 from retrieval.search.shard import FolderShard
 from tests import synthetic
 from tests.conftest import TINY
+from tests.documents import ROOT, text_of
 
 WORTH = ReferenceWorth(Posterior(8.0, -3.0, 0.5, 40), 5.0, Posterior(1.5, -2.0, 0.8, 40), 20, 40)
 MEANING = Posterior(0.9, -0.5, 0.7, 40)
@@ -258,6 +260,18 @@ def test_the_answer_says_what_it_rests_on_and_is_read_again(touched, felt_model,
     assert ReferenceWorth.from_dict(told["worth"]) == WORTH
     document = json.loads(json.dumps(result.to_dict()))
     assert QueryResult.from_dict(document).to_dict() == result.to_dict()
+
+
+def test_the_page_of_formats_names_what_is_written_of_references(touched, felt_model, tmp_path, touches):
+    said = text_of(ROOT / "docs" / "formats.md").split("| with reference touches |")[1].split("\n\n")[0]
+    result = answered(touched, felt_model, tmp_path / "index", touches[NAMES[0]][2]).to_dict()
+    generation = IndexStore(tmp_path / "index").open()
+    about = {name: generation.manifest.about[name] for name in ("references", "reference_worth")}
+    keys = {f"about.{name}.{key}" for name, part in about.items() for key in part}
+    keys |= {f"reference.{key}" for key in result["results"][0]["reference"]}
+    assert keys | {"posterior.references"} == set(re.findall(r"`([a-z_0-9]+\.[\w.]+)`", said))
+    assert set(result["posterior"]["references"]) == {key.rsplit(".")[-1] for key in keys if key.startswith("about")}
+    assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
 
 
 def test_pages_and_tables_show_the_nearest_touch(touched, felt_model, tmp_path, touches, capsys):
