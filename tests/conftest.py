@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, settings
 
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
-from tests import synthetic
+from tests import s3, synthetic
 
 # Of two processes side by side (`-n 2`) each has one thread: two that wait for each other on one core crawl.
 THREADS = 1 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1 else 2
@@ -171,6 +171,13 @@ def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(photo_encoder, "encode_photos", counted)
     return sizes
+
+
+@pytest.fixture(scope="module")
+def s3_server() -> Iterator[s3.Faults]:
+    """A server that speaks S3, without faults until told otherwise; the environment names it."""
+    with s3.served() as faults:
+        yield faults
 
 
 def pytest_configure() -> None:

@@ -382,22 +382,18 @@ def test_commands_take_a_url(store, catalogue, model, touch, capsys):
 # A real S3 server -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def server():
-    with s3.served() as faults:
-        yield faults
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(server, catalogue, model, searcher, grasps):
+def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
+    s3_server, catalogue, model, searcher, grasps
+):
     s3.put(catalogue, "photos/catalog")
-    server.refuse, server.tear = 20, 7
+    s3_server.refuse, s3_server.tear = 20, 7
     url = "s3://photos/cluster"
     report = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
     assert (report.photos, report.embedded, report.skipped) == (24, 24, [])
-    assert server.refused
-    assert server.torn
+    assert s3_server.refused
+    assert s3_server.torn
     another_machine()
     with Searcher.open(url) as opened:
         for own in grasps:
@@ -410,13 +406,13 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(serve
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # Ray's own warnings
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
-def test_ray_builds_into_and_holds_a_cluster_on_s3(server, catalogue, model, searcher, grasps):
+def test_ray_builds_into_and_holds_a_cluster_on_s3(s3_server, catalogue, model, searcher, grasps):
     """Whoever holds a shard fetches it."""
     from retrieval.cluster.building import by_ray
     from retrieval.cluster.serving import Deployments, Held
     from retrieval.cluster.session import connected
 
-    server.refuse = server.tear = None
+    s3_server.refuse = s3_server.tear = None
     s3.put(catalogue, "photos/catalog")
     with connected(2) as ray:
         url, checkpoint = "s3://photos/by-ray", load_checkpoint(model)

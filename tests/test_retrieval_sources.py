@@ -221,15 +221,9 @@ def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, 
 # A real S3 server -----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def server():
-    with s3.served() as faults:
-        yield faults
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(server, catalogue, model, index, tmp_path):
+def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(s3_server, catalogue, model, index, tmp_path):
     s3.put(catalogue, "photos/catalog")
     report = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     assert (report.photos, report.skipped) == (24, [])

@@ -39,8 +39,7 @@ class WriterLock:
 
     def _take(self) -> int:
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+            descriptor = _opened(self.path)
         except OSError as error:
             raise WriteFailed(f"{self.path}: the lock file cannot be opened; {error.strerror}") from error
         if not _is_lock(descriptor):
@@ -60,6 +59,12 @@ class WriterLock:
         return descriptor
 
 
+def _opened(path: Path) -> int:
+    """A lock file, made where there is none; a link is refused, and a pipe blocks nobody. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+
+
 def _is_lock(descriptor: int) -> bool:
     """Whether a file holds nothing but a process id: any other one is of the user."""
     status = os.fstat(descriptor)
@@ -76,8 +81,7 @@ def _holder(descriptor: int) -> int | None:
 @contextmanager
 def one_at_a_time(path: Path) -> Iterator[None]:
     """The block runs when no other one does that was given the same lock file, in whatever process. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    descriptor = _opened(path)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

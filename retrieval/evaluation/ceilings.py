@@ -1,11 +1,8 @@
 """Ceilings: how well each side alone knows the object, and so which side is short. Printed beside the result."""
 
 import dataclasses
-from typing import Any
 
-from retrieval.evaluation.controls import MEASURED
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.scoring import MethodScores, summaries
 from retrieval.training.features import Features
 
 CEILING_METHOD = "cca"
@@ -35,9 +32,3 @@ def _is_taken_twice(features: Features, name: str) -> bool:
         return True
     photos = {(owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)}
     return len(photos) > len(set(features.object_ids))
-
-
-def score_ceiling(name: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
-    """A ceiling's entry of results.json."""
-    judged = MethodScores(experiment.queries, experiment.predictions(CEILING_METHOD, training_seed), seed)
-    return {"what": CEILINGS[name], "measures": summaries([judged.measures(MEASURED)], draws, seed)}

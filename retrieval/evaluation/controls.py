@@ -62,7 +62,9 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
     return [grasps[row] for row in sorted(kept)]
 
 
-def score_control(name: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int) -> dict[str, Any]:
-    """A control's entry of results.json."""
-    judged = MethodScores(experiment.queries, experiment.predictions(CONTROL_METHOD, training_seed), seed)
-    return {"what": CONTROLS[name], "measures": summaries([judged.measures(MEASURED)], draws, seed)}
+def score_beside(
+    what: str, method: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int
+) -> dict[str, Any]:
+    """The entry of results.json of a control, or of a ceiling (`retrieval.evaluation.ceilings`)."""
+    judged = MethodScores(experiment.queries, experiment.predictions(method, training_seed), seed)
+    return {"what": what, "measures": summaries([judged.measures(MEASURED)], draws, seed)}

@@ -18,8 +18,8 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
-from retrieval.evaluation.ceilings import CEILING_METHOD, ceiling_experiments, score_ceiling
-from retrieval.evaluation.controls import CONTROL_METHOD, control_experiments, score_control
+from retrieval.evaluation.ceilings import CEILING_METHOD, CEILINGS, ceiling_experiments
+from retrieval.evaluation.controls import CONTROL_METHOD, CONTROLS, control_experiments, score_beside
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.faint import faint_touches, score_faint
 from retrieval.evaluation.material import Material, prepare
@@ -87,10 +87,12 @@ def evaluate(
         **_scored(experiment, jobs, seed, quiet),
         "faint": _faint(material, experiment, jobs, seed, quiet),
         "controls": {
-            name: score_control(name, control, seed, draws=DRAWS, seed=seed) for name, control in controls.items()
+            name: score_beside(CONTROLS[name], CONTROL_METHOD, control, seed, draws=DRAWS, seed=seed)
+            for name, control in controls.items()
         },
         "ceilings": {
-            name: score_ceiling(name, ceiling, seed, draws=DRAWS, seed=seed) for name, ceiling in ceilings.items()
+            name: score_beside(CEILINGS[name], CEILING_METHOD, ceiling, seed, draws=DRAWS, seed=seed)
+            for name, ceiling in ceilings.items()
         },
     }
     _write(out / "results.json", results)
