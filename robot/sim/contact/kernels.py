@@ -14,12 +14,12 @@ FFT with zero padding to at least 2 n - 1, hence without wrap-around (Liu, Wang 
 import copy
 import functools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from scipy.interpolate import CubicSpline
-from scipy.special import j0
+from scipy.special import j0, j1
 
 Floats = npt.NDArray[np.float64]
 Quadrant = tuple[int, int]
@@ -27,7 +27,7 @@ Quadrant = tuple[int, int]
 THIN_PIXELS = 2.0  # a thinner layer's correction is too sharp for pixels
 REACH = 32.0  # in thicknesses: a bonded layer's influence falls faster than exp(-.739 r/h), 1e-10 here
 _X_MAX, _X_PANELS, _PANEL_POINTS = 20.0, 32, 24  # 1 - S falls like x^2 exp(-2 x), 1e-14 at 20
-_RHO_STEP = 0.02
+_RHO_STEP = 0.0075  # of log(1 + rho): the correction is smoother where it is small
 _PATCH_POINTS = 3  # Gauss points on a pixel's side; 1e-7 at THIN_PIXELS
 _SERIES_BELOW = 0.5
 _DEEP = 100.0  # S is 1 from here on, by far more than float64 tells
@@ -80,19 +80,40 @@ def love_patch(shape: Quadrant) -> Floats:
     return np.asarray(total / np.pi)
 
 
-@functools.lru_cache(maxsize=64)
-def layer_correction(poisson: float) -> CubicSpline:
-    """C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel).
+@dataclass(frozen=True)
+class LayerCorrection:
+    """C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel): cubic between values
+    and slopes that are known at rho + 1 = exp(k _RHO_STEP).
 
     A point force F on a layer h thick displaces F (1/rho - C(rho)) / (pi E* h) at rho = r/h.
     """
+
+    rho: Floats
+    value: Floats
+    slope: Floats
+
+    def __call__(self, rho: npt.ArrayLike) -> Floats:
+        place = np.asarray(rho, np.float64)
+        left = np.minimum((np.log1p(place) / _RHO_STEP).astype(np.intp), len(self.rho) - 2)
+        step = self.rho[left + 1] - self.rho[left]
+        u = (place - self.rho[left]) / step
+        v = 1.0 - u
+        from_left = (1.0 + 2.0 * u) * self.value[left] + u * step * self.slope[left]
+        from_right = (1.0 + 2.0 * v) * self.value[left + 1] - v * step * self.slope[left + 1]
+        return np.asarray(v * v * from_left + u * u * from_right)
+
+
+@functools.lru_cache(maxsize=64)
+def layer_correction(poisson: float) -> LayerCorrection:
+    """The correction of a layer of this Poisson's ratio, by Gauss-Legendre over x."""
     nodes, weights = np.polynomial.legendre.leggauss(_PANEL_POINTS)
     edges = np.linspace(0.0, _X_MAX, _X_PANELS + 1)
     half = 0.5 * (edges[1] - edges[0])
     x = ((edges[:-1] + edges[1:])[:, None] * 0.5 + half * nodes).ravel()
     weight = np.tile(half * weights, _X_PANELS) * (1.0 - layer_symbol(x, poisson))
-    rho = np.arange(0.0, REACH + 1.0 + _RHO_STEP, _RHO_STEP)
-    return CubicSpline(rho, j0(rho[:, None] * x) @ weight, bc_type=((1, 0.0), "not-a-knot"))
+    rho = np.expm1(np.arange(0.0, math.log1p(REACH + 1.0) + _RHO_STEP, _RHO_STEP))
+    angle = rho[:, None] * x
+    return LayerCorrection(rho, j0(angle) @ weight, -j1(angle) @ (weight * x))
 
 
 @functools.lru_cache(maxsize=16)
@@ -112,12 +133,12 @@ def _corrected_influence(shape: Quadrant, thickness: float, poisson: float) -> F
     """Love's patch less the correction integrated over the pixel; nothing beyond REACH thicknesses."""
     rows, cols = (min(n, math.ceil(REACH * thickness) + 1) for n in shape)
     nodes, weights = np.polynomial.legendre.leggauss(_PATCH_POINTS)
-    spline, near = layer_correction(poisson), love_patch((rows, cols))
+    correction, near = layer_correction(poisson), love_patch((rows, cols))
     y, x = np.ogrid[0.0:rows, 0.0:cols]
     for dy, wy in zip(0.5 * nodes, 0.5 * weights, strict=True):
         for dx, wx in zip(0.5 * nodes, 0.5 * weights, strict=True):
             rho = np.minimum(np.hypot(y + dy, x + dx) / thickness, REACH + 1.0)
-            near -= wy * wx / (np.pi * thickness) * spline(rho)
+            near -= wy * wx / (np.pi * thickness) * correction(rho)
     near[np.hypot(y, x) > REACH * thickness] = 0.0
     table = np.zeros(shape)
     table[:rows, :cols] = near
