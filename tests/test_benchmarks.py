@@ -19,6 +19,7 @@ from tests.benchmarks import (
     cylinder,
     gpu,
     gripper,
+    growth,
     large,
     peers,
     query,
@@ -129,6 +130,19 @@ def test_the_parts_of_a_simulated_grasp_are_timed_beside_another_checkout():
     assert set(made["ours"]) == set(made["before"]) >= {"photo of 256 px", "two contacts", "attempt with its files"}
     said = [simulation.line(part, ours, made["before"][part]) for part, ours in made["ours"].items()]
     assert all(" ms, " in each and " times (" in each for each in said)
+
+
+def test_the_slope_of_a_growth_is_its_power():
+    assert growth.slope({1: 3.0, 2: 3.0 * 2**1.5, 8: 3.0 * 8**1.5}) == pytest.approx(1.5)
+
+
+@pytest.mark.slow
+def test_growth_is_measured_with_grasps_objects_and_touches():
+    tables = [*growth.collecting([1, 2], [1, 2], rounds=1), *growth.asking([1, 2], rounds=1, photos=9)]
+    assert [what for what, _ in tables] == ["grasps an object", "objects", "grasps a query"]
+    for _, seconds in tables:
+        assert list(seconds) == [1, 2]
+        assert min(seconds.values()) > 0
 
 
 OF_DEVICES = {

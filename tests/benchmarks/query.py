@@ -61,10 +61,7 @@ def _lines(folder: Path, checkpoint: Checkpoint, photos: int, repetitions: int) 
 
 
 def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Path], repetitions: int) -> Line:
-    generation = IndexStore(index).open(threads=1)
-    judge = read_judge(checkpoint.path)
-    shard = FolderShard(generation, judge, checkpoint.config.has_embeddings)
-    searcher = Searcher(index, shard, checkpoint, encoder, judge)
+    searcher = searcher_of(index, checkpoint, encoder)
     images = [checkpoint.config.preprocessing.load_touch(path) for path in touch]
     told: list[dict[str, float]] = []
     arms = {
@@ -78,10 +75,17 @@ def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Pat
     return Line(
         "query",
         checkpoint.config.matcher.tower,
-        f"{encoder.name}, {generation.count} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
+        f"{encoder.name}, {searcher.described.photos} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
         f"({shown} ms), {duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
-        {"photos": generation.count, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
+        {"photos": searcher.described.photos, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
     )
+
+
+def searcher_of(index: Path, checkpoint: Checkpoint, encoder: Encoder) -> Searcher:
+    """One that encodes touches by this encoder."""
+    judge = read_judge(checkpoint.path)
+    shard = FolderShard(IndexStore(index).open(threads=1), judge, checkpoint.config.has_embeddings)
+    return Searcher(index, shard, checkpoint, encoder, judge)
 
 
 def _bare(matcher: Matcher, encoder: Encoder, images: list[np.ndarray]):

@@ -44,7 +44,7 @@ def parts(objects: int, grasps: int) -> dict[str, float]:
     spent: dict[str, list[float]] = defaultdict(list)
     for scene in _scenes(objects, 1 + grasps):
         _outputs(scene, spent)
-    start, attempts = time.process_time(), _collected(objects, grasps)
+    start, attempts = time.process_time(), collected(objects, grasps)
     whole = (time.process_time() - start) / attempts
     return {name: float(np.mean(each)) for name, each in spent.items()} | {"attempt with its files": whole}
 
@@ -79,7 +79,7 @@ def _outputs(scene: Scene, spent: dict[str, list[float]]) -> None:
     timed("two gels", lambda: [scene.image(f"touch_{finger}") for finger in scene.sensors])
 
 
-def _collected(objects: int, grasps: int) -> int:
+def collected(objects: int, grasps: int) -> int:
     """Attempts of a collection into a folder that is thrown away."""
     with tempfile.TemporaryDirectory() as folder:
         settings = CollectSettings(grasps=grasps)
