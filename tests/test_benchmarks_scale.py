@@ -10,7 +10,7 @@ import torch
 
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import judge_of
-from tests.benchmarks import scale
+from tests.benchmarks import needed, scale
 from tests.benchmarks.common import matcher_of
 from tests.conftest import TINY
 
@@ -93,3 +93,26 @@ def test_the_slope_of_a_power_of_n_is_its_exponent():
         for n in (10**3, 10**4, 10**6)
     ]
     assert dict(scale.slopes(sizes)) == pytest.approx({"exhaustive_s": 0.7, "flat search_s": 1.0})
+
+
+def test_winners_of_blocks_that_are_not_kept_are_those_of_the_whole_catalogue(crowd, monkeypatch):
+    """Judged in half as many bits, and exactly where that could tell wrong."""
+    monkeypatch.setattr(scale, "BLOCK", 64)
+    sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
+    cosines, _ = needed.winners(crowd, touches, sizes)
+    found = needed.places(crowd, touches, sizes, cosines)
+    blocks = [*crowd.blocks(0, 100, 0), *crowd.blocks(100, 300, 0)]
+    halves, photos = (
+        np.concatenate(part) for part in zip(*((b.arrays["halves"], b.embeddings) for b in blocks), strict=True)
+    )
+    for size, places in zip(sizes, found, strict=True):
+        for touch, query, place in zip(touches, crowd.embeddings(touches, "touch"), places, strict=True):
+            scores = photos[:size] @ query
+            winner = scores[crowd.judge.logits(touch[None], halves[:size]).argmax()]
+            assert place == 1 + (scores > winner + 1e-6).sum()
+
+
+def test_candidates_are_four_times_as_many_as_the_touches_that_choose_need():
+    """Of touches 1 to 3 the worst needs 5; the two that judge need 20 and 21."""
+    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), asked=3))
+    assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
