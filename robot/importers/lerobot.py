@@ -113,6 +113,7 @@ class _Source:
         except (KeyError, TypeError, ValueError) as error:
             raise ImporterError(f"{src}: info.json must say fps") from error
         self._has_moments = isinstance(features, dict) and "moment" in features
+        self._films: dict[str, tuple[Path, Any]] = {}
 
     def said(self) -> dict[str, Any]:
         """What our own export, or the data set, says of where it comes from, and of its sensors."""
@@ -216,18 +217,26 @@ class _Source:
             raise ImporterError("its video is missing")
         end = start + (row["length"] - 0.5) / self._fps
         try:
-            with av.open(str(path)) as film:
-                stream = film.streams.video[0]
-                if stream.codec_context.width * stream.codec_context.height > _MOST_PIXELS:
-                    raise ImporterError(f"its video has more than {_MOST_PIXELS} pixels")
-                film.seek(int(start / stream.time_base), stream=stream)
-                for frame in film.decode(stream):
-                    if frame.time is not None and frame.time >= start - 0.5 / self._fps:
-                        if frame.time >= end:
-                            return
-                        yield frame.to_ndarray(format="rgb24")
+            film = self._film(key, path)
+            stream = film.streams.video[0]
+            if stream.codec_context.width * stream.codec_context.height > _MOST_PIXELS:
+                raise ImporterError(f"its video has more than {_MOST_PIXELS} pixels")
+            film.seek(int(start / stream.time_base), stream=stream)
+            for frame in film.decode(stream):
+                if frame.time is not None and frame.time >= start - 0.5 / self._fps:
+                    if frame.time >= end:
+                        return
+                    yield frame.to_ndarray(format="rgb24")
         except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+            self._films.pop(key, None)
             raise ImporterError("its video cannot be decoded") from error
+
+    def _film(self, key: str, path: Path) -> Any:
+        """The film of one camera, which holds many episodes and stays open until another is wanted: opened for each, its
+        buffers leave holes in the heap between the names of grasps, several kB an episode."""
+        if self._films.get(key, (None, None))[0] != path:
+            self._films[key] = (path, library("av", _WHAT).open(str(path)))
+        return self._films[key][1]
 
     def _stored(self, key: str, row: _Row) -> Iterator[Picture]:
         """Pictures that stand in the rows of steps as PNG or JPEG."""
