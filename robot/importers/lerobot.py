@@ -232,8 +232,8 @@ class _Source:
             raise ImporterError("its video cannot be decoded") from error
 
     def _film(self, key: str, path: Path) -> Any:
-        """The film of one camera, which holds many episodes and stays open until another is wanted: opened for each, its
-        buffers leave holes in the heap between the names of grasps, several kB an episode."""
+        """The film of one camera, which holds many episodes and stays open until another is wanted. Opened for each,
+        its buffers leave holes in the heap between the names of grasps, several kB an episode."""
         if self._films.get(key, (None, None))[0] != path:
             self._films[key] = (path, library("av", _WHAT).open(str(path)))
         return self._films[key][1]
