@@ -90,6 +90,7 @@ def test_a_build_with_the_shipped_model_stands_beside_its_encoder(monkeypatch):
     monkeypatch.setattr(common, "LEAST_S", 0.0)
     (line,) = build.measure_shipped(photos=3, photo_px=64, repetitions=1)
     assert line.figures["build_per_s"] == pytest.approx(3 / line.each["build"][0])
+    assert line.each["looking"] == [0.0]  # a build of so few does not
 
 
 def test_a_row_of_the_table_tells_medians_with_their_spread():
