@@ -8,6 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from retrieval.model.encode import has_fast_bfloat16
 from tests.benchmarks import __main__ as program
 from tests.benchmarks import (
     again,
@@ -27,6 +28,7 @@ from tests.benchmarks import (
     simulation,
     step,
     table,
+    training,
 )
 from tests.conftest import TINY
 
@@ -104,6 +106,26 @@ def test_a_section_of_the_table_is_measured_by_a_process_of_its_own():
     rows = list(table.rows("judging"))
     assert [row.what for row in rows] == ["100 candidates judged", "1,000 candidates judged"]
     assert all(len(row.ours) == len(row.theirs) > 1 for row in rows)
+
+
+def test_the_benchmark_of_training_tells_rates_and_parts_of_a_step(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    with training.matching(TINY, recording, tmp_path) as (trainer, works):
+        rates, parts = training.rates("small", works, threads=1, steps=1, repetitions=1)
+        assert training.validation("small", trainer).figures["validation_s"] > 0
+        if has_fast_bfloat16(trainer.device):
+            assert 0 < training.rounding("small", trainer, works["kept"]).figures["apart"] < 1
+    images = 4 * 2 + len(trainer.sampler.batch(0, 4).photos)
+    assert works["kept"].images == images
+    rate = rates.figures
+    assert rate["ratio_kept"] == pytest.approx(rate["kept_per_s"] / rate["bare_per_s"])
+    assert list(parts.figures) == ["draw and decode_s", "draw and map_s", "forward_s", "backward_s", "optimiser_s"]
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_training_compares_two_processes_with_one(recording):
+    (line,) = training.ranks(["small"], recording, "auto", rounds=1)
+    assert line.figures["ratio"] == pytest.approx(line.figures["one_s"] / line.figures["two_s"])
 
 
 @pytest.mark.slow

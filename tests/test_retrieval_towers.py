@@ -278,6 +278,23 @@ def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_p
     torch.testing.assert_close(tower.features[17].conv[2].weight, source.features[17].conv[2].weight)
 
 
+FIRST = {
+    "mobilenet_v2": ("features.2", "features.3.conv.0.0"),
+    "small": ("stages.2", "stages.3"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(FIRST))
+def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat16(name):
+    """An image rounded to bfloat16 has lost what tells two gels apart."""
+    tower, types = build_tower(name, "stages"), []
+    for place in FIRST[name]:
+        tower.get_submodule(place).register_forward_hook(lambda _, __, made: types.append(made.dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        tower(torch.rand(2, 3, 32, 32))
+    assert types == [torch.float32, torch.bfloat16]
+
+
 def test_group_norms_of_the_small_tower_stay_in_float32_where_convolutions_do_not():
     """PyTorch's own rounds to bfloat16 what the norm gives, and is slow at that."""
     tower = build_tower("small", "pooled")

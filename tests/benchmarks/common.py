@@ -45,24 +45,27 @@ class Times:
         return scale * self.median(slow) / self.median(fast), float(each.min()), float(each.max())
 
 
-def in_turns(arms: Mapping[str, Callable[[], object]], repetitions: int) -> Times:
+def in_turns(
+    arms: Mapping[str, Callable[[], object]], repetitions: int, clock: Callable[[], float] = time.perf_counter
+) -> Times:
     """Run every arm once unmeasured, then all of them in turn, `repetitions` times.
 
     A short arm is called again and again for about `LEAST_S` at its turn, and the mean of the calls is taken.
+    clock: gives seconds; those of `time.process_time` are CPU time.
     """
-    calls = {name: max(1, int(LEAST_S / _seconds(arm, 1))) for name, arm in arms.items()}
+    calls = {name: max(1, int(LEAST_S / _seconds(arm, 1, clock))) for name, arm in arms.items()}
     seconds: dict[str, list[float]] = {name: [] for name in arms}
     for _ in range(repetitions):
         for name, arm in arms.items():
-            seconds[name].append(_seconds(arm, calls[name]))
+            seconds[name].append(_seconds(arm, calls[name], clock))
     return Times(seconds)
 
 
-def _seconds(arm: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
+def _seconds(arm: Callable[[], object], calls: int, clock: Callable[[], float]) -> float:
+    start = clock()
     for _ in range(calls):
         arm()
-    return (time.perf_counter() - start) / calls
+    return (clock() - start) / calls
 
 
 def config_of(tower: str) -> Config:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from torch import Tensor, nn
 
-from retrieval.model.towers.base import Tower, stage_statistics
+from retrieval.model.towers.base import Tower, stage_statistics, unrounded
 
 # Expansion, output channels, blocks, first stride: table 2 of the paper.
 _STAGES = (
@@ -19,6 +19,8 @@ _STAGES = (
 )
 # Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
 _DESCRIBED = {6: 32, 10: 64, 13: 96, 17: 320}
+_UNROUNDED = 3
+"""Layers of the strides up to 4."""
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -79,13 +81,15 @@ class MobileNetV2(Tower):
                 nn.init.zeros_(module.bias)
 
     def _encode(self, images: Tensor) -> Tensor:
+        with unrounded(images):
+            x = self.features[:_UNROUNDED](images)
         if self.output == "stages":
-            return stage_statistics(self._stages(images))
-        x = nn.functional.adaptive_avg_pool2d(self.features(images), 1).flatten(1)
+            return stage_statistics(self._stages(x))
+        x = nn.functional.adaptive_avg_pool2d(self.features[_UNROUNDED:](x), 1).flatten(1)
         return x if self.classifier is None else self.classifier(x)
 
     def _stages(self, x: Tensor) -> Iterator[Tensor]:
-        for number, layer in enumerate(self.features):
+        for number, layer in enumerate(list(self.features)[_UNROUNDED:], start=_UNROUNDED):
             x = layer(x)
             if number in _DESCRIBED:
                 yield x

@@ -8,9 +8,11 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from retrieval.model.towers.base import Tower, stage_statistics
+from retrieval.model.towers.base import Tower, stage_statistics, unrounded
 
 _WIDTHS = (24, 48, 96, 128)
+_UNROUNDED = 3
+"""The first convolution, its norm and rectifier."""
 
 
 class GroupNorm(nn.GroupNorm):
@@ -19,7 +21,7 @@ class GroupNorm(nn.GroupNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) in the type of the weights."""
-        with torch.autocast(x.device.type, enabled=False):
+        with unrounded(x):
             return super().forward(x.to(self.weight.dtype))
 
 
@@ -46,14 +48,16 @@ class Small(Tower):
         self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 
     def _encode(self, images: Tensor) -> Tensor:
+        with unrounded(images):
+            first = self.stages[:_UNROUNDED](images)
         if self.output == "stages":
-            return stage_statistics(self._maps(images))
-        x = self.stages(images).flatten(2)
+            return stage_statistics([first, *self._maps(first)])
+        x = self.stages[_UNROUNDED:](first).flatten(2)
         x = torch.cat([x.mean(2), x.amax(2)], dim=1)
         return x if self.fc is None else self.fc(x)
 
     def _maps(self, x: Tensor) -> Iterator[Tensor]:
-        for layer in self.stages:
+        for layer in list(self.stages)[_UNROUNDED:]:
             x = layer(x)
             if isinstance(layer, nn.ReLU):
                 yield x
