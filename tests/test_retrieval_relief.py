@@ -11,7 +11,7 @@ import torch
 from retrieval.commands.main import main
 from retrieval.data.labelled import load_labelled
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import CheckpointError, DatasetError
+from retrieval.errors import CheckpointError, ConfigError, DatasetError
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training import relief
@@ -159,6 +159,12 @@ def test_what_is_no_folder_of_pictures_is_said(tmp_path, file, content, said):
     (folder / file).write_text(content)
     with pytest.raises(DatasetError, match=said):
         load_labelled(folder)
+
+
+def test_differences_below_zero_are_refused_for_eight_bits_would_turn_them_bright(tmp_path):
+    signed = dataclasses.replace(CONFIG.preprocessing, background="difference")
+    with pytest.raises(ConfigError, match=r"difference\+0.5"):
+        train_relief(tmp_path, tmp_path / "tower.safetensors", dataclasses.replace(CONFIG, preprocessing=signed))
 
 
 def test_one_family_alone_teaches_nothing(quick, tmp_path):

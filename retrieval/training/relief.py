@@ -90,6 +90,10 @@ def train_relief(
     (`retrieval.training.kept`). Ctrl-C keeps a state and raises Interrupted.
     Raises DatasetError, ConfigError, CheckpointError.
     """
+    if config.preprocessing.background == "difference":
+        raise ConfigError(
+            'pictures are learned from in 8 bits, which hold no darker than black; set background = "difference+0.5"'
+        )
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
     kind, pictures = load_labelled(folder)
