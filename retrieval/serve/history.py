@@ -150,7 +150,8 @@ async def history(
     return HistoryDocument(total=total, offset=offset, next=end if end < total and found else None, items=items)
 
 
-@router.get("/v1/history/{name}", responses=problems("unknown"))
+# What an answer did not say, such as a reference touch, it does not say here either.
+@router.get("/v1/history/{name}", responses=problems("unknown"), response_model_exclude_unset=True)
 async def entry(name: str, parts: Parts) -> HistoryEntry:
     """A query with its whole answer."""
     kept = await _entry(parts, name)
