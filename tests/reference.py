@@ -54,12 +54,13 @@ retrieve check recording/                                   # before anything is
 ```
 
 An importer reads a public data set as it is published, or pictures of your own, and writes a
-[recording](formats.md#recording), to train, evaluate and search with. It takes one grasp at a time, so memory does not
-grow with the pictures, but by names: 100,000 rows instead of 10,000 take 15 to 67 MB more, by importer (`python -m
-tests.importers_memory`), and a line a grasp once the recording is read back. Run again it goes on where it stopped.
-What cannot be read is skipped, counted by reason and told; `recording.json` keeps the counts under `skipped`, licence and citation, and under `objects` what the data
-set says of them. Pictures that many grasps share, such as one no-contact frame, are kept once. A published split that
-parts objects stands in `splits/<name>.json`, for `--split`. Some importers need packages of the extra:
+[recording](formats.md#recording), to train, evaluate and search with. It takes one grasp at a time, so memory does
+not grow with the pictures, but by names: 100,000 rows instead of 10,000 take 15 to 67 MB more, by importer (`python
+-m tests.importers_memory`), and a line a grasp once the recording is read back. Run again it goes on where it
+stopped. What cannot be read is skipped, counted by reason and told; `recording.json` keeps the counts under
+`skipped`, licence and citation, and under `objects` what the data set says of them. Pictures that many grasps share,
+such as one no-contact frame, are kept once. A published split that parts objects stands in `splits/<name>.json`, for
+`--split`. Some importers need packages of the extra:
 `pip install 'touch-retrieval[importers]'`.
 
 The data sets are not ours: the licence is what their own pages say, and what you do with them is between you and them.

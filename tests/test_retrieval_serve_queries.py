@@ -43,7 +43,7 @@ def same(document, result):
 def test_openapi_says_the_form_that_answers_have(client, searcher, grasps):
     answer = searcher.query(grasps).to_dict()
     assert set(answer) == set(QueryDocument.model_fields)
-    assert set(answer["results"][0]) == set(MatchDocument.model_fields) - {"reference"}  # there are no reference touches
+    assert set(answer["results"][0]) == set(MatchDocument.model_fields) - {"reference"}  # the catalogue has no touches
     assert QueryDocument(**answer).model_dump(exclude_unset=True) == answer
 
 
