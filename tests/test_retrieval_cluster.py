@@ -25,10 +25,11 @@ from indexes.store.folder import IndexStore
 from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import BadInput, TooManyBad, Unanswered
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
 from retrieval.search.build_cluster import build_cluster
 from retrieval.search.opening import stored_for
 from retrieval.search.searcher import Searcher
-from tests import on_ray, serving, synthetic
+from tests import on_ray, referenced, serving, synthetic
 from tests.waiting import first_line, running, until
 
 pytestmark = [
@@ -99,6 +100,26 @@ def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
     name = rows[0]["object_id"]
     assert held.shard.page([], name, 0, 10).total == 3
     assert held.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
+
+
+def test_reference_touches_answer_over_ray_as_in_the_folder(ray, own, tmp_path):
+    touches = referenced.write_touches(tmp_path / "touches")
+    catalogue = referenced.put_touches(own, touches)
+    model = referenced.a_model(tmp_path / "felt.safetensors")
+    build_index(catalogue, model, tmp_path / "index", quiet=True)
+    build_cluster(catalogue, model, tmp_path / "cluster", 2, quiet=True)
+    with (
+        Searcher.open(tmp_path / "cluster", shards=deployments(ray, wait_s=120.0).open) as ours,
+        Searcher.open(tmp_path / "index") as theirs,
+    ):
+        for name in referenced.NAMES[:3]:
+            mine, whole = (one.query(touches[name][2], top=8) for one in (ours, theirs))
+            assert names(mine) == names(whole)
+            assert numbers(mine) == pytest.approx(numbers(whole), abs=1e-5)
+            for one, other in zip(mine.results, whole.results, strict=True):
+                assert (one.reference and one.reference.touch) == (other.reference and other.reference.touch)
+        gel = f"{referenced.NAMES[0]}/touch_1_b.png"
+        assert ours.shard.rows([gel, "absent"]) == theirs.shard.rows([gel, "absent"])
 
 
 def test_everything_listens_on_this_machine_alone(held, touch):

@@ -1,30 +1,16 @@
-"""Reference touches: what they are worth by hand, and that they are encoded, kept, asked and told beside photos."""
+"""Reference touches in an index: that they are encoded, kept, asked and told beside photos."""
 
-import dataclasses
 import json
 import math
 import re
-import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import JudgedTouches, Posterior
-from retrieval.model.references import (
-    SHARPNESS,
-    FeltTouches,
-    ReferenceWorth,
-    fit_references,
-    nearness,
-    touch_codes,
-)
+from retrieval.model.references import SHARPNESS, ReferenceWorth, touch_codes
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
 from retrieval.search.answer import QueryResult
@@ -33,108 +19,8 @@ from retrieval.search.build_cluster import build_cluster
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import FolderShard
 from tests import synthetic
-from tests.conftest import TINY
 from tests.documents import ROOT, text_of
-
-WORTH = ReferenceWorth(Posterior(8.0, -3.0, 0.5, 40), 5.0, Posterior(1.5, -2.0, 0.8, 40), 20, 40)
-MEANING = Posterior(0.9, -0.5, 0.7, 40)
-OBJECTS = synthetic.make_objects(8, seed=9)
-NAMES = sorted(one.object_id for one in OBJECTS)
-
-
-# What they are worth ------------------------------------------------------------------------------------------------
-
-
-def test_one_reference_says_its_cosine_and_a_copy_of_it_nothing_more():
-    cosines = np.float32([[0.3, -0.2], [0.9, 0.1]])
-    one = nearness(cosines, np.array([0, 1]))
-    np.testing.assert_allclose(one, cosines, atol=1e-7)
-    copied = nearness(cosines[:, [0, 0, 0, 1]], np.array([0, 3]))
-    np.testing.assert_allclose(copied, cosines, atol=1e-7)
-
-
-def test_several_references_are_averaged_as_likelihoods_are():
-    """By two plain loops, over objects with one, three and two references."""
-    cosines = np.random.default_rng(0).uniform(-1, 1, (4, 6)).astype(np.float32)
-    parts = ([0], [1, 2, 3], [4, 5])
-    for grasp, row in enumerate(nearness(cosines, np.array([0, 1, 4]))):
-        for part, got in zip(parts, row, strict=True):
-            mean = sum(math.exp(SHARPNESS * float(cosines[grasp, place])) for place in part) / len(part)
-            assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
-
-
-def test_codes_are_the_end_of_halves_at_norm_one():
-    halves = np.float16([[9, 9, 3, 4], [9, 9, 0, -2]])
-    np.testing.assert_allclose(touch_codes(halves, 2), [[0.6, 0.8], [0, -1]], atol=1e-6)
-    assert touch_codes(halves, 4).shape == (2, 0)
-
-
-def test_what_they_are_worth_is_stored_and_read_again():
-    assert ReferenceWorth.from_dict(json.loads(json.dumps(WORTH.to_dict()))) == WORTH
-    bare = dataclasses.replace(WORTH, weight=None, beside=None)
-    assert ReferenceWorth.from_dict(bare.to_dict()) == bare
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"weight": math.inf}, {"weight": -1.0}, {"weight": None}, {"objects": "many"}, {"alone": {}}, {"more": 1}],
-)
-def test_what_is_no_worth_is_refused(change):
-    with pytest.raises(BadInput):
-        ReferenceWorth.from_dict(WORTH.to_dict() | change)
-
-
-def felt(objects=10, touches=4, noise=0.3, photos=True, seed=0):
-    """Codes around a direction of each object, and photos whose logits say a little."""
-    rng = np.random.default_rng(seed)
-    owner = np.repeat(np.arange(objects), touches)
-    codes = rng.normal(size=(objects, 16))[owner] + 4 * noise * rng.normal(size=(len(owner), 16))
-    codes = (codes / np.linalg.norm(codes, axis=1, keepdims=True)).astype(np.float32)
-    photo_owner = np.arange(objects if photos else 0)
-    logits = rng.normal(size=(len(owner), len(photo_owner))) + (owner[:, None] == photo_owner)
-    return FeltTouches(JudgedTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool)), codes)
-
-
-def test_near_touches_weigh_much_and_noise_weighs_little():
-    near, far = fit_references(felt(noise=0.1)), fit_references(felt(noise=50.0))
-    assert near.alone.slope > 5 > far.alone.slope
-    assert near.weight * near.beside.slope > 5 * far.weight * far.beside.slope
-    assert (near.objects, near.touches) == (10, 20)  # the last half of four touches each
-
-
-def test_without_photos_the_touches_alone_are_fitted():
-    found = fit_references(felt(photos=False))
-    assert found.beside is None
-    assert found.weight is None
-    assert found.alone.slope > 1
-
-
-def test_too_few_objects_or_touches_or_numbers_teach_nothing():
-    assert fit_references(felt(objects=2)) is None
-    assert fit_references(felt(touches=1)) is None
-    given = felt()
-    assert fit_references(dataclasses.replace(given, codes=given.codes[:, :0])) is None
-
-
-# In an index --------------------------------------------------------------------------------------------------------
-
-
-def a_model(path, references=WORTH, posterior=MEANING, cosine=True):
-    """A matcher of random weights whose touches differ."""
-    matcher = dataclasses.replace(TINY.matcher, cosine=cosine)
-    config = Config(matcher, TINY.training, TINY.preprocessing)
-    torch.manual_seed(0)
-    about = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
-    save_checkpoint(
-        path,
-        Matcher(matcher).eval(),
-        config,
-        split=None,
-        provenance=about,
-        posterior=posterior,
-        references=references,
-    )
-    return load_checkpoint(path)
+from tests.referenced import MEANING, NAMES, WORTH, a_model, put, put_touches, write_touches
 
 
 @pytest.fixture
@@ -145,25 +31,13 @@ def felt_model(tmp_path):
 @pytest.fixture(scope="module")
 def touches(tmp_path_factory):
     """Three touches of each of the catalogue's objects, by object."""
-    return synthetic.write_queries(tmp_path_factory.mktemp("touches"), OBJECTS, 3)
-
-
-def put(catalogue, name, number, files):
-    """A touch into a catalogue."""
-    (catalogue / name).mkdir(exist_ok=True)
-    for finger, path in zip("ab", files, strict=True):
-        shutil.copy(path, catalogue / name / f"touch_{number}_{finger}.png")
+    return write_touches(tmp_path_factory.mktemp("touches"))
 
 
 @pytest.fixture
 def touched(own, touches):
     """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
-    for name in NAMES[:4]:
-        for number in (0, 1):
-            put(own, name, number, touches[name][number])
-    for photo in (own / NAMES[2]).glob("*.jpg"):
-        photo.unlink()
-    return own
+    return put_touches(own, touches)
 
 
 def answered(catalogue, model, index, files, **asked):
@@ -419,6 +293,8 @@ TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
         {"references": {"touches": [TOUCH | {"touch": ["../../etc/passwd"]}] * 8, "alone": []}},
         {"references": {"touches": [TOUCH | {"touch": ["/etc/passwd"]}] * 8, "alone": []}},
         {"references": {"touches": [TOUCH | {"object_id": 3}] * 8, "alone": []}},
+        {"references": {"touches": [TOUCH | {"digests": [3]}] * 8, "alone": []}},
+        {"references": {"touches": [TOUCH | {"digests": []}] * 8, "alone": []}},
         {"references": {"touches": [TOUCH], "alone": []}},
         {"references": {"touches": [TOUCH | {"touch": "a.png"}] * 8, "alone": [3]}},
         {"touches": np.zeros((8, 3), np.float16)},

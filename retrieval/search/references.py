@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,14 @@ and in the manifest of what they are worth."""
 Near = NDArray[np.float64]
 
 
+class _Touch(NamedTuple):
+    """Of an object: its gel images, and the digests of their files."""
+
+    object_id: str
+    paths: tuple[str, ...]
+    digests: tuple[str, ...]
+
+
 class References:
     """Touches of a generation's objects; `count` objects are numbered as in `Objects`."""
 
@@ -36,15 +44,25 @@ class References:
             self.worth = ReferenceWorth.from_dict(told_of(generation.manifest.about).get("worth"))
         except (BadInput, TypeError) as error:
             raise CorruptIndex(f"{where}: what its references are worth is damaged ({error}); {AGAIN}") from error
-        known = objects.numbers_of([name for name, _ in touches] + alone)
+        known = objects.numbers_of([one.object_id for one in touches] + alone)
         numbers, shown_alone = known[: len(touches)], known[len(touches) :]
         order = np.flatnonzero(numbers >= 0)  # an object whose photos are all broken has no number
         order = order[np.argsort(numbers[order], kind="stable")]
-        self._touches = [touches[row][1] for row in order]
+        self._touches = [touches[row].paths for row in order]
+        self._images = {path: (one, place) for one in touches for place, path in enumerate(one.paths)}
         self._codes: Floats = touch_codes(halves[order], hidden)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
         self._hidden, self._alone = hidden, np.zeros(objects.count, np.bool_)
         self._alone[shown_alone[shown_alone >= 0]] = True
+
+    def image(self, path: str) -> dict[str, Any] | None:
+        """A row for the gel image at this path of the catalogue, as those of photos, but with `touch`; None where no
+        reference has it."""
+        if path not in self._images:
+            return None
+        one, place = self._images[path]
+        told = {"object_id": one.object_id, "digest": one.digests[place], "metadata": {}, "touch": True}
+        return {"id": path, "path": path, **told}
 
     def near(self, halves: Floats) -> Near:
         """C (count,) of the grasps with these halves (G, half) with every object; NaN where it has no reference."""
@@ -109,17 +127,19 @@ def by_both(
     return None if beside is None else objects.judged(rows, logits, beside, grasps)
 
 
-def _checked(document: Any, where: object) -> tuple[list[tuple[str, tuple[str, ...]]], list[str]]:
-    """Each touch's object and gel images, and the objects without photos."""
+def _checked(document: Any, where: object) -> tuple[list[_Touch], list[str]]:
+    """The touches, and the objects without photos."""
     wrong = CorruptIndex(f"{where}: its list of reference touches is not what the format says; {AGAIN}")
     if not isinstance(document, dict) or not all(isinstance(document.get(key), list) for key in ("touches", "alone")):
         raise wrong
     touches = []
     for row in document["touches"]:
-        paths = row.get("touch") if isinstance(row, dict) else None
+        paths, digests = (row.get("touch"), row.get("digests")) if isinstance(row, dict) else (None, None)
         if not isinstance(paths, list) or not isinstance(row.get("object_id"), str) or not all(map(_is_inside, paths)):
             raise wrong
-        touches.append((row["object_id"], tuple(paths)))
+        if not isinstance(digests, list) or [type(one) for one in digests] != [str] * len(paths):
+            raise wrong
+        touches.append(_Touch(row["object_id"], tuple(paths), tuple(digests)))
     if not all(isinstance(name, str) for name in document["alone"]):
         raise wrong
     return touches, document["alone"]

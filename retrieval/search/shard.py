@@ -106,7 +106,8 @@ class Shard(Protocol):
         """
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """The rows of these photos; None for one that is not there."""
+        """The rows of these photos, and of gel images of reference touches, which have `touch`; None for one that is
+        not there."""
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Photos in whose object, path and metadata all these words stand, in small letters, and of that object alone
@@ -157,7 +158,12 @@ class FolderShard:
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """As `Shard.rows`."""
         numbers = self.generation.rows.find(ids).tolist()
-        return [None if number < 0 else self.generation.rows[number] for number in numbers]
+        found = [None if number < 0 else self.generation.rows[number] for number in numbers]
+        if self.references is None:
+            return found
+        images = map(self.references.image, ids)
+        # An object without photos is shown by a gel image, which has a row of both kinds.
+        return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`."""

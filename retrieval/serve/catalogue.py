@@ -36,7 +36,10 @@ WHOLE_PX = 4096
 
 def photo_of(opened: Opened, photo: str) -> ListedPhoto:
     """The photo of that id. Raises Problem where the index has none."""
-    return listed_photo(_row(opened, photo))
+    row = _row(opened, photo)
+    if row.get("touch"):
+        raise Problem("unknown", f"{photo!r} is a gel image of a reference touch, and no photo")
+    return listed_photo(row)
 
 
 def _row(opened: Opened, photo: str) -> dict[str, object]:
@@ -81,7 +84,7 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
 
 @router.get("/v1/photos/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
 def photo(request: Request, photo: str, parts: Parts) -> Response:
-    """A photo of the catalogue as it is; one that browsers do not show, as JPEG."""
+    """A photo of the catalogue, or a gel image of a reference touch, as it is; what browsers do not show, as JPEG."""
     opened = parts.generations.current
     row = _row(opened, photo)
     if response := _unchanged(request, row, "whole"):
@@ -108,7 +111,7 @@ def small(
     parts: Parts,
     px: Annotated[int, Query(ge=32, le=1024, description="of the longer side")] = 320,
 ) -> Response:
-    """A photo as a small JPEG."""
+    """A photo, or a gel image of a reference touch, as a small JPEG."""
     opened = parts.generations.current
     row = _row(opened, photo)
     if response := _unchanged(request, row, str(px)):

@@ -252,10 +252,13 @@ def _first_photo(opened: Opened, object_id: str) -> str:
 
 
 def _photo(opened: Opened, photo: str) -> bytes | None:
-    """Its file; None where it is gone, and then the grasps are kept but in no recording."""
+    """Its file; None where it is gone, or where a gel image stands for a photo, and then the grasps are kept but in no
+    recording."""
     (row,) = opened.shard.rows([photo])
     try:
-        return None if row is None else read_bytes(opened.searcher.catalogue / listed_photo(row).path)
+        return (
+            None if row is None or row.get("touch") else read_bytes(opened.searcher.catalogue / listed_photo(row).path)
+        )
     except ImageError:
         return None
 

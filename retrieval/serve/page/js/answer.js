@@ -6,14 +6,15 @@ import { openDetail } from "./detail.js";
 import { feedbackPanel } from "./feedback.js";
 import { growingPanel } from "./growing.js";
 import { anotherGrasp } from "./information.js";
-import { count, percent, verdict } from "./words.js";
+import { count, nearness, percent, verdict } from "./words.js";
 
 const LEAST_SHOWN = 0.0005;
 
 /** The whole panel of an answer. */
 export function answerPanel({ index, answer, id, asked, kept = null }) {
   const parts = shares(answer);
-  const open = (match) => openDetail({ index, photo: match.photo, objectId: match.object_id, asked });
+  const open = ({ photo, object_id: objectId, reference = null }) =>
+    openDetail({ index, photo, objectId, asked, reference });
   return h(
     "div",
     { class: "answer" },
@@ -120,9 +121,21 @@ function card(part, answer, open) {
       "button",
       { type: "button", class: "tile", onclick: () => open(match) },
       image,
+      match.reference?.adds != null && nearestTouch(match.reference),
       text,
       h("span", { class: "unseen" }, ", details"),
     ),
+  );
+}
+
+/** The gel images of the nearest reference touch, small in a corner of the photo. */
+function nearestTouch(reference) {
+  const alt = `, its nearest reference touch: ${nearness(reference)}`;
+  return h(
+    "span",
+    { class: "reference", title: nearness(reference) },
+    reference.touch.map((path) => picture(thumbnailURL(path, 160), "", { loading: "lazy" })),
+    h("span", { class: "unseen" }, alt),
   );
 }
 
@@ -145,6 +158,14 @@ function found(answer) {
       "Before",
       `none of these ${percent(posterior.none_prior)}; each of ${count(posterior.objects, "object")} alike`,
     ]);
+    const { references } = posterior;
+    if (references)
+      rows.push([
+        "Reference touches",
+        `${references.touches.toLocaleString("en")} of ${count(references.objects, "object")}; what they are worth was ` +
+          `fitted on ${count(references.worth.touches, "touch")} of ${count(references.worth.objects, "object")} ` +
+          `(${references.by})`,
+      ]);
     const left = posterior.objects - posterior.judged_objects;
     if (left)
       rows.push(["Not judged", `${count(left, "object")}, which share ${percent(posterior.unjudged_probability)}`]);

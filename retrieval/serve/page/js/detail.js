@@ -4,12 +4,13 @@ import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
 import { agreementTool } from "./agreement.js";
 import { blobURL, finger } from "./tray.js";
-import { count } from "./words.js";
+import { count, nearness } from "./words.js";
 
 const MOST_PHOTOS = 500;
 
-/** Open the dialog on a photo; `asked` holds the touches that were asked about, null in the catalogue. */
-export function openDetail({ index, photo, objectId, asked = null }) {
+/** Open the dialog on a photo; `asked` holds the touches that were asked about, null in the catalogue; `reference` is
+ *  the object's reference touch that is nearest to them, where it has any. */
+export function openDetail({ index, photo, objectId, asked = null, reference = null }) {
   const dialog = h("dialog", { class: "detail", "aria-labelledby": "detail-title" });
   const close = () => dialog.close();
   const title = h("h2", { id: "detail-title", tabindex: "-1" });
@@ -30,7 +31,7 @@ export function openDetail({ index, photo, objectId, asked = null }) {
 
   async function showObject(firstPhoto, name) {
     title.textContent = name;
-    const stage = photoStage(index, asked);
+    const stage = photoStage(index, asked, name === objectId ? reference : null);
     const strip = h("ul", { class: "film", "aria-label": "Photos of this object" });
     const facts = h("div", { class: "facts" });
     const alike = h("div", { class: "alike" });
@@ -66,18 +67,20 @@ export function openDetail({ index, photo, objectId, asked = null }) {
   }
 }
 
-/** The photo, and the touch beside it; a click enlarges either. */
-function photoStage(index, asked) {
+/** The photo, the nearest reference touch and the touch beside it; a click enlarges each. */
+function photoStage(index, asked, reference) {
   const photos = h("div", { class: "frame" });
   const photoFigure = h("figure", { class: "pane" }, photos);
   const element = h("div", { class: "stage" }, photoFigure);
-  const tool = asked && agreementTool(asked);
+  const alone = reference !== null && reference.adds === null; // what is shown is a gel image, and no photo
+  const tool = asked && !alone && agreementTool(asked);
   const caption = h("figcaption", {});
   photoFigure.append(caption);
-  if (asked) element.append(touchPane(index, asked, element));
+  if (reference) element.append(gelPane("the reference touch", referenceGels(index, reference), element));
+  if (asked) element.append(gelPane("the touch", askedGels(index, asked), element));
 
   function show(id) {
-    const image = picture(api.photoURL(id), `Photo ${id}`);
+    const image = picture(api.photoURL(id), alone ? `Gel image ${id}` : `Photo ${id}`);
     photos.replaceChildren(enlarger(image, "the photo", element, photoFigure));
     caption.replaceChildren(h("span", { class: "faint" }, id), tool ? tool.of(id, image, photos) : "");
   }
@@ -101,21 +104,39 @@ function enlarger(image, what, stage, pane) {
   return button;
 }
 
-function touchPane(index, asked, stage) {
+const ofFinger = (index, place) => (index.fingers > 1 ? `, finger ${finger(place)}` : "");
+
+function askedGels(index, asked) {
+  const gels = asked.touches.flatMap((grasp, number) =>
+    grasp.map((blob, place) => ({ src: blobURL(blob), name: `Grasp ${number + 1}${ofFinger(index, place)}` })),
+  );
+  return { gels, choice: "Touch beside the photo", note: null };
+}
+
+function referenceGels(index, reference) {
+  const gels = reference.touch.map((path, place) => ({
+    src: api.photoURL(path),
+    name: `Nearest reference touch${ofFinger(index, place)}`,
+  }));
+  return { gels, choice: "Reference touch beside the photo", note: nearness(reference) };
+}
+
+/** Gel images, of which one is shown. */
+function gelPane(what, { gels, choice, note }, stage) {
   const frame = h("div", { class: "frame" });
   const pane = h("figure", { class: "pane" }, frame);
-  const all = asked.touches.flatMap((grasp, number) => grasp.map((blob, place) => ({ blob, number, place })));
-  const say = ({ number, place }) => `Grasp ${number + 1}${index.fingers > 1 ? `, finger ${finger(place)}` : ""}`;
-  const show = (one) =>
-    frame.replaceChildren(enlarger(picture(blobURL(one.blob), `Gel image: ${say(one)}`), "the touch", stage, pane));
+  const show = ({ src, name }) =>
+    frame.replaceChildren(enlarger(picture(src, `Gel image: ${name}`), what, stage, pane));
   const choose = h(
     "select",
-    { "aria-label": "Touch beside the photo" },
-    all.map((one, place) => h("option", { value: String(place) }, say(one))),
+    { "aria-label": choice },
+    gels.map(({ name }, place) => h("option", { value: String(place) }, name)),
   );
-  choose.addEventListener("change", () => show(all[Number(choose.value)]));
-  show(all[0]);
-  pane.append(h("figcaption", {}, all.length > 1 ? choose : say(all[0])));
+  choose.addEventListener("change", () => show(gels[Number(choose.value)]));
+  show(gels[0]);
+  pane.append(
+    h("figcaption", {}, gels.length > 1 ? choose : gels[0].name, note && h("span", { class: "faint" }, note)),
+  );
   return pane;
 }
 

@@ -57,6 +57,13 @@ export function verdict(answer) {
   }
 }
 
+/** How near a reference touch is, and what it did. */
+export function nearness({ cosine, adds }) {
+  const sign = adds < 0 ? "\u2212" : "+";
+  const did = adds === null ? "no photo: found by touches alone" : `references add ${sign}${Math.abs(adds).toFixed(2)} to the logit`;
+  return `cosine ${cosine.toFixed(2)}; ${did}`;
+}
+
 /** What was said of an answer, as a sentence. */
 export function saidWords(said, objectId) {
   if (said === "right") return "Said to be right";
