@@ -9,7 +9,9 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from retrieval.commands.main import main
+from retrieval.data import views
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import resize
 from retrieval.data.views import VIEWS, Box, find_object, square, strip
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, MatcherConfig
@@ -75,6 +77,53 @@ def test_any_photo_has_a_box_inside_it(image):
     assert np.isfinite(strip(image, list(VIEWS), 8)).all()
 
 
+def fitted(values, ring=6):
+    """As the docstring of `_off_the_ground` has it, map by map: what lies above the plane, and its scatter."""
+    side = len(values)
+    border = np.ones((side, side), bool)
+    border[ring:-ring, ring:-ring] = False
+    y, x = np.mgrid[:side, :side] / side - 0.5
+    plane, kept = np.stack([np.ones_like(x), x, y], axis=2), border
+    for _ in range(4):
+        off = values - plane @ np.linalg.lstsq(plane[kept], values[kept], rcond=None)[0]
+        scatter = 1.4826 * np.median(np.abs(off[kept])) + 1e-4
+        kept = border & (np.abs(off) < 3 * scatter)
+    return off, scatter
+
+
+def test_the_ground_is_the_plane_of_least_squares_through_what_of_the_border_scatters_alike():
+    rng = np.random.default_rng(0)
+    slope = np.linspace(0, 0.2, 128)[None, :, None] * [1, -1, 0.5, 0]
+    maps = (1 + slope + rng.normal(0, [0.01, 0.02, 0.03, 0.0], (128, 128, 4))).astype(np.float32).transpose(2, 0, 1)
+    maps[:, 100:, 40:90] += 0.7  # a thing that lies across the border
+    off, scatter = views._off_the_ground(maps)
+    for one, found, by in zip(maps, off, scatter, strict=True):
+        expected, spread = fitted(one.astype(np.float64))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert by == pytest.approx(spread, rel=1e-4)
+    assert np.abs(off[0, 60:90]).max() < 0.06
+    assert np.abs(off[0, 110:, 50:80]).min() > 0.6
+
+
+@pytest.mark.parametrize("side", [1, 2, 3, 6, 7, 30])
+@pytest.mark.parametrize("middle", [(0, 0), (19, 0), (0, 9), (19, 9), (8, 4)])
+def test_a_square_is_cut_out_pixel_by_pixel_wherever_it_lies(side, middle):
+    image = np.random.default_rng(0).random((10, 20, 3)).astype(np.float32)
+    found = square(image, Box(*middle, middle[0] + 1, middle[1] + 1), side)
+    left, top = (round(each + 0.5 - side / 2) for each in middle)
+    for row in range(side):
+        for column in range(side):
+            there = image[min(max(top + row, 0), 9), min(max(left + column, 0), 19)]
+            np.testing.assert_array_equal(found[row, column], there)
+
+
+def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
+    image = photo()
+    zoom = VIEWS["zoom"](image, Box(90, 80, 140, 150))
+    expected = resize(np.repeat(zoom.mean(axis=2, keepdims=True), 3, axis=2), (48, 48))
+    np.testing.assert_array_equal(strip(image, ("grey",), 48, Box(90, 80, 140, 150)), expected)
+
+
 def test_a_square_goes_on_with_the_edges_pixels():
     image = np.arange(12, dtype=np.float32).reshape(3, 4, 1).repeat(3, 2)
     found = square(image, Box(0, 0, 1, 1), 3)[..., 0]
@@ -83,11 +132,11 @@ def test_a_square_goes_on_with_the_edges_pixels():
 
 def test_views_stand_side_by_side():
     image = photo()
-    views = strip(image, ("whole", "crop", "zoom", "grey"), 64)
-    assert views.shape == (64, 256, 3)
-    np.testing.assert_array_equal(views[:, :64], Preprocessing(photo_px=64).photo(image))
-    crop, zoom, grey = views[:, 64:128], views[:, 128:192], views[:, 192:]
-    blue = [float((view[..., 2] > 0.65).mean()) for view in (views[:, :64], crop, zoom)]
+    seen = strip(image, ("whole", "crop", "zoom", "grey"), 64)
+    assert seen.shape == (64, 256, 3)
+    np.testing.assert_array_equal(seen[:, :64], Preprocessing(photo_px=64).photo(image))
+    crop, zoom, grey = seen[:, 64:128], seen[:, 128:192], seen[:, 192:]
+    blue = [float((view[..., 2] > 0.65).mean()) for view in (seen[:, :64], crop, zoom)]
     assert blue[2] > blue[1] > blue[0]  # windows of 112, 157 and 256 pixels
     np.testing.assert_allclose(grey, zoom.mean(axis=2, keepdims=True).repeat(3, 2), atol=1e-6)
 
@@ -106,10 +155,10 @@ def test_the_zoom_has_one_scale_whatever_the_objects_size():
         assert (np.diff(np.flatnonzero(row > 0.9)) == 8).all()
 
 
-@pytest.mark.parametrize("views", [(), ("whole", "whole"), ("macro",)])
-def test_views_are_known_and_differ(views):
+@pytest.mark.parametrize("names", [(), ("whole", "whole"), ("macro",)])
+def test_views_are_known_and_differ(names):
     with pytest.raises(ConfigError, match="views must be some of whole, crop, zoom, grey"):
-        Preprocessing(views=views)
+        Preprocessing(views=names)
 
 
 def test_what_was_made_before_views_still_matches():

@@ -108,19 +108,22 @@ class Preprocessing:
         box: where its object lies, where that is known.
         """
         check_rgb(image, "photo")
-        return strip(_finite(image, "photo"), self.views, self.photo_px, box)
+        return self._seen(_finite(image, "photo"), box)
 
     def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
         """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
         if not self.reduced:
-            return self.photo(decode_rgb(data, name))
+            return self._seen(decode_rgb(data, name))
         image = decode_rgb(data, name, least_side(self.views, self.photo_px))
         short, box = min(image.shape[:2]), None
         if "crop" in self.views and short < min(picture_size(data, name)):
             box = find_object(image)
             if (more := least_side_of_crop(box, short, self.photo_px)) > short:
                 image, box = decode_rgb(data, name, more), None
-        return self.photo(image, box)
+        return self._seen(image, box)
+
+    def _seen(self, image: RgbImage, box: Box | None = None) -> RgbImage:
+        return strip(image, self.views, self.photo_px, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.

@@ -3,6 +3,7 @@
 scipy's sparse matrices give the same numbers, bit for bit, and importing them takes longer than a query.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -26,18 +27,32 @@ def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     check_rgb(image, "image")
     if min(size) < 1:
         raise BadInput(f"the new size must be at least 1 x 1 pixel, got {size[0]} x {size[1]}")
-    for axis in sorted((0, 1), key=lambda axis: size[axis] / image.shape[axis]):  # shrink before growing
-        if image.shape[axis] != size[axis]:
-            image = _resize_axis(image, axis, size[axis])
+    return resized(image, size)
+
+
+def resized(image: RgbImage, size: tuple[int, int]) -> RgbImage:
+    """As `resize`, of pictures (H, W, C) of any number of channels; nothing is checked."""
+    for axis in axes(image.shape, size):
+        image = _resize_axis(image, axis, size[axis])
     return image
+
+
+def axes(old: Sequence[int], new: Sequence[int]) -> list[int]:
+    """Of an image's two axes those whose length changes, in the order in which they do: shrink before growing."""
+    return [axis for axis in sorted((0, 1), key=lambda axis: new[axis] / old[axis]) if old[axis] != new[axis]]
 
 
 def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
     """Mix rows, or columns where they lie: to turn the image over, so that columns are rows, takes five times as long
     as to mix them."""
     table = np.ascontiguousarray(image).reshape(image.shape[0], -1)
-    columns, weights = _axis_weights(image.shape[axis], length, channels=3 if axis else 1)
-    weights = weights[:, None, :] if axis else weights[:, :, None]
+    columns, weights = axis_weights(image.shape[axis], length)
+    channels = image.shape[2]
+    if axis:
+        columns = (channels * columns[..., None] + np.arange(channels)).reshape(len(columns), -1)
+        weights = np.repeat(weights, channels, axis=1)[:, None, :]
+    else:
+        weights = weights[:, :, None]
     mixed = table.take(columns[0], axis=axis)
     mixed *= weights[0]
     part = np.empty_like(mixed)
@@ -45,14 +60,13 @@ def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
         np.take(table, column, axis=axis, out=part, mode="clip")  # other modes copy once more; all columns are inside
         part *= weight
         mixed += part
-    out: RgbImage = mixed.reshape((-1, length, 3) if axis else (length, -1, 3))
+    out: RgbImage = mixed.reshape((-1, length, channels) if axis else (length, -1, channels))
     return out
 
 
-@lru_cache(maxsize=16)
-def _axis_weights(old: int, new: int, channels: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
-    """Both (n, new * channels): the n old samples that each new one is mixed from, and their weights, of sum 1; for
-    samples that lie `channels` apart, so that each channel has its own."""
+@lru_cache(maxsize=64)
+def axis_weights(old: int, new: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
+    """Both (n, new): the n old samples that each new one is mixed from, and their weights, of sum 1."""
     rows, columns, weights = (_area_weights if new < old else _linear_weights)(old, new)
     order = np.argsort(rows, kind="stable")
     rows, columns = rows[order], columns[order]
@@ -61,8 +75,7 @@ def _axis_weights(old: int, new: int, channels: int) -> tuple[npt.NDArray[np.int
     taken = np.tile(columns[first], (place.max() + 1, 1))  # samples of weight 0 where a new one has fewer
     shares = np.zeros(taken.shape, dtype=np.float32)
     taken[place, rows], shares[place, rows] = columns, weights[order]
-    each = channels * taken[..., None] + np.arange(channels)
-    return each.reshape(len(taken), -1), np.repeat(shares, channels, axis=1)
+    return taken, shares
 
 
 _Triplets = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]

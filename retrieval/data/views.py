@@ -11,12 +11,13 @@ own resolution; `grey` because colour says nothing about what can be felt.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import RgbImage, resize
+from retrieval.data.resize import RgbImage, resized
 
 _CROP_MARGIN = 1.12
 _ZOOM_SHARE = 7 / 16
@@ -53,19 +54,16 @@ def find_object(image: RgbImage) -> Box:
     import cv2  # a query of a touch needs none
 
     height, width = image.shape[:2]
-    linear = np.clip(resize(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
-    lightness = linear.mean(axis=2)
-    colour, logarithm = linear / lightness[..., None], np.log(lightness)
-    off = [_off_the_ground(colour[..., channel]) for channel in range(3)]
-    lighter, spread = _off_the_ground(logarithm)
-    tint = np.array([1, 0, -1], np.float32) / np.float32(np.sqrt(2))
-    shift = np.stack([values for values, _ in off], axis=2)
-    along = shift @ tint
-    free = np.float32(_SHADE_TINT) * np.clip((-lighter - 0.1) / 0.3, 0, 1)
-    shift += (np.sign(along) * np.maximum(np.abs(along) - free, 0) - along)[..., None] * tint
-    by_colour = np.linalg.norm(shift, axis=2) / (np.mean([noise for _, noise in off]) + 0.02)
-    by_light = np.maximum(lighter, _DARKEST_SHADE - lighter) / (spread + 0.05)
-    differs = np.maximum(by_colour / _DIFFERS[0], by_light / _DIFFERS[1]).astype(np.float32)
+    linear = np.clip(resized(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
+    channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # a plane after the other: sums in a tenth of the time
+    lightness = _summed(channels) / 3
+    (red, green, blue, lighter), scatter = _off_the_ground(np.stack([*(channels / lightness), np.log(lightness)]))
+    tint = (red - blue) / np.float32(np.sqrt(2))
+    free = np.float32(_SHADE_TINT) * np.clip((-lighter - np.float32(0.1)) / np.float32(0.3), 0, 1)
+    shift = (np.copysign(np.maximum(np.abs(tint) - free, 0), tint) - tint) / np.float32(np.sqrt(2))
+    by_colour = np.sqrt(_summed(np.square([red + shift, green, blue - shift]))) / float(scatter[:3].mean() + 0.02)
+    by_light = np.maximum(lighter, _DARKEST_SHADE - lighter) / float(scatter[3] + 0.05)
+    differs = np.maximum(by_colour / _DIFFERS[0], by_light / _DIFFERS[1])
     found = _largest_thing(cv2.GaussianBlur(differs, (0, 0), 1.0) > 1)
     if found is None:
         return Box(0, 0, width, height)
@@ -73,20 +71,49 @@ def find_object(image: RgbImage) -> Box:
     return Box(left * width, top * height, right * width, bottom * height)
 
 
-def _off_the_ground(values: Grey) -> tuple[Grey, float]:
-    """By how much values (S, S) lie above a plane through those of the border, and how much these scatter about it."""
-    side = len(values)
-    ring = np.ones((side, side), bool)
-    ring[_RING:-_RING, _RING:-_RING] = False
-    y, x = np.mgrid[:side, :side].astype(np.float32) / side - 0.5
-    plane = np.stack([np.ones_like(x), x, y], axis=2)
-    kept, off, scatter = ring, values, 0.0
+def _summed(channels: NDArray[np.float32]) -> Grey:
+    """Of three, one after the other, as numpy's own sum of a pixel's numbers, in a tenth of its time."""
+    total: Grey = channels[0] + channels[1] + channels[2]
+    return total
+
+
+def _off_the_ground(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """By how much each map of values (n, S, S) lies above a plane through those of its border, and how much these
+    scatter about it (n,)."""
+    ring, planes, products = _border()
+    flat = values.reshape(len(values), -1)
+    border, terms = flat[:, ring], planes[:, ring]
+    weights, scatter = np.zeros((len(values), 3)), np.zeros(len(values))
+    kept = np.ones(border.shape, bool)
     for _ in range(4):
-        weights = np.linalg.lstsq(plane[kept], values[kept], rcond=None)[0]
-        off = values - plane @ weights
-        scatter = 1.4826 * float(np.median(np.abs(off[kept]))) + 1e-4  # the deviation of a normal distribution
-        kept = ring & (np.abs(off) < 3 * scatter)
-    return off, scatter
+        chosen = kept.astype(np.float64)
+        normal, right = (chosen @ products).reshape(-1, 3, 3), (chosen * border) @ terms.T
+        weights[:] = np.linalg.solve(normal, right[..., None])[..., 0]
+        away = np.abs(border - (weights @ terms).astype(np.float32))
+        scatter = 1.4826 * _medians(away, kept) + 1e-4  # the deviation of a normal distribution
+        kept = away < 3 * scatter[:, None]
+    return values - (weights @ planes).astype(np.float32).reshape(values.shape), scatter
+
+
+@lru_cache(maxsize=1)
+def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The places (R,) of the border's pixels; the planes 1, x and y of all pixels (3, S * S); and of the border's the
+    products of any two (R, 9)."""
+    inside = np.zeros((_SIDE, _SIDE), bool)
+    inside[_RING:-_RING, _RING:-_RING] = True
+    ring = np.flatnonzero(~inside)
+    y, x = np.mgrid[:_SIDE, :_SIDE].reshape(2, -1) / _SIDE - 0.5
+    planes = np.stack([np.ones_like(x), x, y])
+    terms = planes[:, ring].T
+    return ring, planes, (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
+
+
+def _medians(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Of those of each row of values (n, R) that are kept, one at least."""
+    ranked = np.sort(np.where(kept, values, np.float32(np.inf)), axis=1)
+    count, rows = kept.sum(axis=1), np.arange(len(values))
+    middle: NDArray[np.float64] = (ranked[rows, (count - 1) // 2].astype(np.float64) + ranked[rows, count // 2]) / 2
+    return middle
 
 
 def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
@@ -95,25 +122,28 @@ def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | No
 
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
-    count, labels, about, middles = cv2.connectedComponentsWithStats(mask)
+    count, _, about, middles = cv2.connectedComponentsWithStats(mask)
     if count < 2:
         return None
     away = middles[1:] / len(differs) - [0.5, 0.55]
     weight = about[1:, cv2.CC_STAT_AREA] * np.exp(-(away**2).sum(axis=1) / 0.08)
-    rows, columns = np.nonzero(np.isin(labels, 1 + np.flatnonzero(weight >= 0.1 * weight.max())))
-    if len(rows) < 0.002 * differs.size:
+    left, top, width, height, area = about[1:][weight >= 0.1 * weight.max()].T
+    if area.sum() < 0.002 * differs.size:
         return None
-    return columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    return left.min(), top.min(), (left + width).max(), (top + height).max()
 
 
 def square(image: RgbImage, box: Box, side: float) -> RgbImage:
-    """The square of `side` pixels about the middle of a box; beyond the photo's edge its last pixels go on."""
+    """The square of `side` pixels about the middle of a box in the photo; beyond the photo's edge its last pixels go
+    on."""
+    import cv2
+
     size = max(round(side), 1)
     left, top = (round(middle - size / 2) for middle in ((box.left + box.right) / 2, (box.top + box.bottom) / 2))
-    height, width = image.shape[:2]
-    rows = np.clip(np.arange(top, top + size), 0, height - 1)
-    columns = np.clip(np.arange(left, left + size), 0, width - 1)
-    return image[rows[:, None], columns]
+    inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
+    above, before = max(-top, 0), max(-left, 0)
+    beyond = above, size - above - inside.shape[0], before, size - before - inside.shape[1]
+    return cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else inside
 
 
 def _crop(image: RgbImage, box: Box) -> RgbImage:
@@ -125,7 +155,8 @@ def _zoom(image: RgbImage, box: Box) -> RgbImage:
 
 
 def _grey(image: RgbImage, box: Box) -> RgbImage:
-    return np.repeat(_zoom(image, box).mean(axis=2, keepdims=True), 3, axis=2)
+    grey: RgbImage = _summed(_zoom(image, box).transpose(2, 0, 1))[..., None] / np.float32(3)
+    return grey
 
 
 VIEWS: dict[str, Callable[[RgbImage, Box], RgbImage]] = {
@@ -134,7 +165,8 @@ VIEWS: dict[str, Callable[[RgbImage, Box], RgbImage]] = {
     "zoom": _zoom,
     "grey": _grey,
 }
-"""Name of a view -> what cuts it out of a photo (H, W, 3), given the object's box."""
+"""Name of a view -> what cuts it out of a photo (H, W, 3), given the object's box: (h, w, 3), or (h, w, 1) of no
+colour."""
 
 
 OVERSAMPLED = 2
@@ -159,4 +191,7 @@ def strip(image: RgbImage, names: Sequence[str], px: int, box: Box | None = None
     """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
     if box is None:
         box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
-    return np.concatenate([resize(VIEWS[name](image, box), (px, px)) for name in names], axis=1)
+    found = np.empty((px, len(names) * px, 3), np.float32)
+    for place, name in enumerate(names):
+        found[:, place * px : (place + 1) * px] = resized(VIEWS[name](image, box), (px, px))
+    return found
