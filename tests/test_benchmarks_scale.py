@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import judge_of
-from tests.benchmarks import needed, scale
+from tests.benchmarks import needed, scale, several
 from tests.benchmarks.common import matcher_of
 from tests.conftest import TINY
 
@@ -116,3 +117,25 @@ def test_candidates_are_four_times_as_many_as_the_touches_that_choose_need():
     """Of touches 1 to 3 the worst needs 5; the two that judge need 20 and 21."""
     line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), asked=3))
     assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
+
+
+def test_two_ways_to_name_candidates_of_several_grasps_are_told_beside_each_other(crowd, tmp_path, monkeypatch):
+    made = IndexStore(tmp_path / "index").write_blocks(crowd.blocks(0, 300, 0), fingerprint={}, kind="flat")
+    sets = several.sets_of(np.array([0, 0, 0, 1, 1, 1, 1, 2]), 3, most=5)
+    assert len(sets) == 5
+    assert all(set(row) <= {0, 1, 2} or set(row) <= {3, 4, 5, 6} for row in sets.tolist())
+    together, each = several.measure(crowd, made, crowd.touches, sets, k=20)
+    assert (together["photos"], together["grasps"], together["sets"], together["judged"]) == (300, 3, 5, 20)
+    assert 20 <= each["judged"] <= 60
+    for figures in (together, each):
+        assert 1 <= figures["needed"] <= figures["worst"] <= 300
+        assert 0 <= figures["low"] <= figures["found"] <= figures["high"] <= 1
+        assert "300 photos, 3 grasps, nearest to " in several.line(figures)
+
+
+def test_the_winner_of_several_grasps_has_the_greatest_sum_of_logits():
+    """Of four photos the third is between both grasps, and the classifier likes it best."""
+    grasps = np.eye(2, dtype=np.float32)
+    photos = np.array([[1, 0], [0, 1], [0.7, 0.7], [0.8, 0]], dtype=np.float32)
+    found = several.places(grasps, photos, lambda rows: np.array([0, 1, 5, 2])[rows])
+    assert found == {"together": 1, "each": 2}  # for the second grasp only one photo is nearer

@@ -190,13 +190,10 @@ def test_a_fit_on_features_reads_no_image(parts, tmp_path, monkeypatch):
 
 
 def expected_pruned(logits, nearness, count):
-    """Two loops: the nearest photos of any grasp of the set by their summed logit, the others below, by nearness."""
-    judged = set()
-    for near in nearness:
-        judged |= set(sorted(range(len(near)), key=lambda column: (-near[column], column))[:count])
+    """The photos nearest to all grasps of the set by their summed logit, the others below, by nearness."""
     mean = nearness.mean(0)
-    rest = [column for column in range(len(mean)) if column not in judged]
-    return sorted(judged, key=lambda column: -logits[column]) + sorted(rest, key=lambda column: -mean[column])
+    nearest = sorted(range(len(mean)), key=lambda column: (-mean[column], column))
+    return sorted(nearest[:count], key=lambda column: -logits[column]) + nearest[count:]
 
 
 @pytest.mark.parametrize("grasps", [1, 2, 3])
@@ -237,8 +234,9 @@ def test_a_model_without_trained_embeddings_judges_every_photo(parts, tmp_path):
 
 
 def test_equally_near_photos_are_taken_by_row():
-    nearness = np.array([[0.5, 0.9, 0.5, 0.5], [0.1, 0.1, 0.1, 0.3]], dtype=np.float32)
-    assert candidates(nearness, 2).tolist() == [0, 1, 3]
+    nearness = np.array([[0.5, 0.25, 0.5, 0.75], [0.25, 0.5, 0.25, 0.25]], dtype=np.float32)
+    assert candidates(nearness, 2).tolist() == [0, 3]
+    assert candidates(nearness[1:], 2).tolist() == [0, 1]
 
 
 def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():

@@ -21,6 +21,7 @@ from retrieval.search import defaults
 from retrieval.search.build import build_index
 from retrieval.search.objects import JudgedObjects
 from retrieval.search.searcher import Searcher
+from retrieval.search.shard import together
 from tests import synthetic
 
 HALF_STEP = 2**-11
@@ -282,18 +283,18 @@ def test_the_classifier_judges_at_least_as_many_photos_as_objects_are_wanted(sea
 
 @pytest.mark.parametrize(("candidates", "completed"), [(5, 1), (2, 1), (2, 20)])
 @torch.inference_mode()
-def test_the_candidates_are_the_nearest_photos_of_each_grasp(
+def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
     candidates, completed, meaning, searcher, matcher, grasps, oracle, monkeypatch
 ):
-    """Plain loops: the best inner products of each grasp, the full network on their union, and on the other photos of
-    the objects that come first by these."""
+    """Plain loops: the best sums of inner products, the full network on these, and on the other photos of the objects
+    that come first by them."""
     monkeypatch.setattr("retrieval.search.shard.COMPLETED", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
-    load, near = checkpoint.config.preprocessing.load_touch, set()
+    load, products = checkpoint.config.preprocessing.load_touch, np.zeros(24)
     for grasp in grasps:
         touch = matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
-        products = generation.embeddings[generation.slots] @ matcher.touch_entry(touch).embedding[0].numpy()
-        near |= {generation.rows[row]["path"] for row in np.argsort(-products)[:candidates]}
+        products += generation.embeddings[generation.slots] @ matcher.touch_entry(touch).embedding[0].numpy()
+    near = {generation.rows[row]["path"] for row in np.argsort(-products)[:candidates]}
     logits = oracle(grasps)
     first = best_by_object({photo: logits[photo] for photo in near}, meaning, 3)
     whole = {name for name, _, _ in first[: max(2, completed)]}
@@ -303,6 +304,24 @@ def test_the_candidates_are_the_nearest_photos_of_each_grasp(
     assert result.index["scored"] == len(judged) < 24
     assert result.posterior["judged_objects"] == len(expected) < 8
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected[:2]]
+
+
+def test_grasps_name_candidates_by_the_sum_of_their_cosines():
+    """A photo between two grasps is nearer to both together than the photo that is nearest to either."""
+    grasps = np.array([[1, 0, 0], [0, 1, 0]], dtype=np.float32)
+    between = np.sqrt(0.5) * grasps.sum(0)
+    np.testing.assert_allclose(together(grasps), [between], atol=1e-7)
+    np.testing.assert_allclose(together(grasps[[0, 0, 1]]), np.array([[2, 1, 0]]) / np.sqrt(5), atol=1e-7)
+    photos = np.array([[0.9, np.sqrt(0.19), 0], [np.sqrt(0.19), 0.9, 0], between], dtype=np.float32)
+    assert (grasps @ photos.T).argmax(1).tolist() == [0, 1]
+    assert (together(grasps) @ photos.T).argmax() == (grasps @ photos.T).sum(0).argmax() == 2
+
+
+def test_of_grasps_that_cancel_out_the_first_names_the_candidates():
+    """The sum's direction would be that of its rounding, or 0 / 0."""
+    grasp = np.array([[0.6, 0.8]], dtype=np.float32)
+    for off in (0, 1e-6):
+        np.testing.assert_array_equal(together(np.concatenate([grasp, off - grasp])), grasp)
 
 
 def test_a_model_without_trained_embeddings_never_runs_a_candidate_stage(catalogue, model, touch, tmp_path, searches):

@@ -17,9 +17,9 @@ SHARE = 0.25
 class PruneRerank(LateFusion):
     """Search as `retrieve query` does: only the nearest photos by embedding are judged by match logit.
 
-    share: of the gallery that is judged. The others stand behind these, in the order of their embeddings. Photos are
-    taken for each grasp of a set and put together, as search does. A model without trained embeddings
-    judges every photo. A code is the half and, behind it, the embedding.
+    share: of the gallery that is judged. The others stand behind these, in the order of their embeddings. Of a set the
+    photos nearest to all its grasps together are judged, as search does. A model without trained embeddings judges
+    every photo. A code is the half and, behind it, the embedding.
     """
 
     def __init__(self, setting: Setting, share: float = SHARE) -> None:
@@ -89,6 +89,5 @@ def behind(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Array:
 
 
 def candidates(nearness: Array, count: int) -> NDArray[np.int64]:
-    """The `count` nearest photos of each grasp, together; equals by row. nearness (G, N)."""
-    nearest = np.argsort(-nearness, axis=1, kind="stable")[:, :count]
-    return np.unique(nearest)
+    """The `count` photos nearest to all grasps together; equals by row. nearness (G, N)."""
+    return np.sort(np.argsort(-nearness.sum(0), kind="stable")[:count])

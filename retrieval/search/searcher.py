@@ -158,12 +158,12 @@ class Searcher:
         Pillow image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like
         any other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
         background: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
-        them what a contact is. top: objects to return. candidates: photos per grasp that the full classifier judges,
-        `top` at least, by default as many as the index was found to need; with no fewer than there are photos, or a
-        model without trained embeddings, it judges all of them and no candidate stage runs. none_prior: probability,
-        before anything is felt, that the catalogue lacks the object. Match logits of several grasps add; what the sum
-        is worth, and how objects and "none of these" get their probabilities, stands in `retrieval.model.posterior`.
-        Only grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
+        them what a contact is. top: objects to return. candidates: photos that the full classifier judges, those
+        nearest to all grasps together and `top` at least, by default as many as the index was found to need; with no
+        fewer than there are photos, or a model without trained embeddings, all of them and no candidate stage runs.
+        none_prior: probability, before anything is felt, that the catalogue lacks the object. Match logits of several
+        grasps add; what the sum is worth, and how objects and "none of these" get their probabilities, stands in
+        `retrieval.model.posterior`. Only grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
         """
         held = self._held()
         require_counts(top, candidates)

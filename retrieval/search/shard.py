@@ -29,6 +29,8 @@ from retrieval.search.references import Near, by_both, open_references
 DEFAULT_CANDIDATES = 1000
 COMPLETED = 20
 """Objects, at least, of which every photo is judged."""
+CANCELLED = 1e-5
+"""Length of a sum of unit embeddings that is rounding alone."""
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
@@ -101,8 +103,8 @@ class Shard(Protocol):
     def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
         """The best `top` objects for these grasps, and what all weigh.
 
-        candidates: photos per grasp that the full classifier judges, in each index folder, `top` at least; None: as
-        many as measured there. Raises NumericalError.
+        candidates: photos that the full classifier judges, in each index folder, `top` at least; None: as many as
+        measured there. Raises NumericalError.
         """
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
@@ -191,15 +193,15 @@ class FolderShard:
         return found
 
     def limit(self, top: int, candidates: int | None) -> int:
-        """Photos that are judged for each grasp: as many as asked for, else as measured on the index, else 1000."""
+        """Photos that are judged: as many as asked for, else as measured on the index, else 1000."""
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
     def _candidates(self, embeddings: Floats, k: int) -> Rows:
-        """Rows to judge, the union over grasps; all of them where the stage would leave nothing out."""
+        """Rows to judge, those nearest to all grasps together; all rows where the stage would leave nothing out."""
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
-        return np.unique(np.concatenate(self.generation.candidates(embeddings, k)))
+        return np.sort(self.generation.candidates(together(embeddings), k)[0])
 
     def _with_near(self, rows: Rows, near: Near | None, most: int) -> Rows:
         """With the photos of at most so many objects whose reference touches are nearest."""
@@ -254,6 +256,15 @@ class FolderShard:
         every = len(rows) == self.generation.count
         logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
         return self.objects.equal_for_equals(rows, logits)
+
+
+def together(embeddings: Floats) -> Floats:
+    """Of grasps (G, d) the unit embedding (1, d) whose cosines order photos as the sums of the grasps' do: match logits
+    add, and so do the cosines that foretell them. Where they cancel out no photo is nearer than another, and the first
+    grasp's stands for all."""
+    total = embeddings.sum(0, keepdims=True, dtype=np.float64)
+    length = float(np.linalg.norm(total))
+    return embeddings[:1] if length < CANCELLED else (total / length).astype(np.float32)
 
 
 class Shards:
