@@ -1,13 +1,15 @@
 """`retrieve frontier` as users meet it: plots, a page, exit codes."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from retrieval.commands.main import main
 from retrieval.lab import reports as frontier_report
+from retrieval.lab.frontier import APPROXIMATIONS
 from retrieval.lab.frontier.points import Panel, Row, Tradeoff
-from retrieval.lab.frontier.report import write_frontier
+from retrieval.lab.frontier.report import figure, write_frontier
 from retrieval.lab.hard_cases import run
 from retrieval.lab.hard_cases.case import HardCase
 
@@ -48,6 +50,20 @@ def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
 def test_a_row_that_was_left_out_says_why_and_has_no_plot(tmp_path):
     (page,) = write_frontier(tmp_path, document(skipped="nothing to measure"))
     assert "Left out: nothing to measure." in page.read_text()
+
+
+def test_the_page_of_performance_says_how_many_approximations_there_are():
+    said = (Path(__file__).parents[1] / "docs" / "performance.md").read_text()
+    assert f"for {len(APPROXIMATIONS)} approximations" in said
+
+
+def test_labels_of_points_that_stand_together_stand_above_and_below():
+    near = (Tradeoff("a", "one", 1.0, seconds=1.0), Tradeoff("a", "other", 0.98, seconds=1.01))
+    far = Tradeoff("a", "third", 0.01, seconds=9.0)
+    (axes,) = figure([Panel("missed", "one query", "%", "all", 0.5, (*near, far), 0.01)]).axes
+    heights = {text.get_text(): text.xyann[1] for text in axes.texts}
+    assert heights["one"] > 0 > heights["other"]
+    assert heights["third"] > 0
 
 
 def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, tmp_path, capsys):

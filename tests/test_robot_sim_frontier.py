@@ -7,9 +7,11 @@ import pytest
 
 from retrieval.lab.contact.closed_forms import Grid, hertz
 from retrieval.lab.contact.closing_jaws import Jaws
-from retrieval.lab.frontier.contact import closing_panel, contact_panels, spring_closing
+from retrieval.lab.frontier.contact import closing_panel, contact_panels, products_panel, spring_closing
+from retrieval.lab.frontier.light import light_panel, sky_panel
 from retrieval.lab.frontier.optics import optics_panel
-from retrieval.lab.frontier.simulation import products_panel, rays_panel, sky_panel
+from retrieval.lab.frontier.rays import gel_panel, limit_panel, photo_panel
+from robot.sim.objects.packets import MOST_STEPS
 
 
 @pytest.fixture(scope="module")
@@ -78,11 +80,36 @@ def test_the_optics_have_a_point_for_each_degree_and_error_falls():
 
 
 def test_shorter_steps_are_nearer_to_equal_ones_and_the_gel_s_is_within_what_it_shows():
-    panel = rays_panel(1, rows=12, steps_mm=(1.6, 0.8, 0.1))
+    panel = gel_panel(1, rows=12, steps_mm=(1.6, 0.8, 0.1))
     long, middle, gels = errors(panel, "")
     assert long > 1.5 * middle > 1e3 * gels > 0
     assert gels < panel.tolerance
     assert panel.default.setting == "0.1 mm"
+
+
+def test_photos_of_shorter_steps_are_nearer_to_those_of_equal_steps_and_the_rig_s_err_less_than_its_camera():
+    panel = photo_panel(1, objects=2, px=64, strides=(16, 4, 1))
+    assert panel.default.name == "as the rig casts, 1 px"
+    long, middle, ours = errors(panel, "as the rig casts")
+    assert long > 2 * middle > 4 * ours
+    assert ours < panel.tolerance
+    assert errors(panel, "equal steps")[-1] == 0
+
+
+def test_few_steps_lose_rays_and_as_many_as_the_rig_s_none():
+    panel = limit_panel(1, objects=2, px=64, limits=(4, 8, 12, MOST_STEPS))
+    *few, ours = errors(panel, "")
+    assert few[0] > few[1] > few[2] > ours == 0
+    assert panel.default.setting == "600 steps"
+
+
+def test_photos_are_the_same_whether_light_is_worked_out_compiled_in_float32_or_in_float64_but_for_a_grey_level():
+    panel = light_panel(1, objects=2, px=64)
+    compiled, arrays, exact = errors(panel, "")
+    assert compiled <= 1
+    assert arrays <= 1
+    assert exact == 0
+    assert panel.default.name == "float32, compiled"
 
 
 def test_the_sky_on_a_finer_grid_is_nearer_to_the_full_one():

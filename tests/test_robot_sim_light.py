@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from retrieval.lab.frontier.light import shaded
 from robot.sim.camera import PinholeCamera, Placement, hidden_sky, look
 from robot.sim.light import GAMMA, Lamps, Surfaces, developed, radiance
 from robot.sim.objects.draw import draw_object
@@ -20,21 +21,9 @@ def surfaces_and_lamps(count=5000, seed=0):
     return surfaces, Lamps(unit[2, 0], np.array([0.9, 0.8, 0.7]), np.array([0.2, 0.25, 0.3]), (1.1, 0.04), 60.0)
 
 
-def shaded_array_by_array(surfaces, lamps):
-    rays, normals, is_object, seen, hidden, colour = (np.asarray(part, np.float64) for part in surfaces)
-    is_object = is_object > 0
-    lit = np.maximum(normals @ lamps.direction, 0) * seen
-    sky = (0.6 + 0.4 * normals[:, 2]) * np.where(is_object, 1, 1 - 0.45 * hidden)
-    half = lamps.direction - rays
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cosine = np.maximum(np.einsum("ij,ij->i", normals, half), 0)
-    shine = np.where(is_object, *lamps.gloss) * cosine**lamps.sharpness * (lit > 0)
-    return colour * (lit[:, None] * lamps.lamp + sky[:, None] * lamps.sky) + shine[:, None] * lamps.lamp
-
-
 def test_radiance_is_that_of_lambert_blinn_and_the_sky():
     surfaces, lamps = surfaces_and_lamps()
-    ours, exact = radiance(surfaces, lamps), shaded_array_by_array(surfaces, lamps)
+    ours, exact = radiance(surfaces, lamps), shaded(surfaces, lamps)
     np.testing.assert_allclose(ours, exact, atol=2e-6, rtol=1e-5)  # sixty times a logarithm of float32
 
 

@@ -24,7 +24,7 @@ Picture = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.intp]
 """Places of pixels in a picture, row by row."""
 
-_NOISE = 1.5
+NOISE = 1.5
 """Grey levels of the sensor's noise."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
@@ -201,16 +201,22 @@ def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraV
 def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
     """(px, px, 3) RGB."""
     px = view.camera.px
+    linear = radiance(*lit(view, lighting, shadow)).reshape(px, px, 3)
+    linear = cv2.GaussianBlur(linear, (0, 0), _LENS_BLUR_PX)
+    noise = NOISE * np.random.default_rng([72, noise_seed]).standard_normal(linear.shape)
+    return developed(linear, noise)
+
+
+def lit(view: CameraView, lighting: Lighting, shadow: bool = True) -> tuple[Surfaces, Lamps]:
+    """What light meets at each pixel, and where it comes from."""
+    px = view.camera.px
     light, own = np.asarray(lighting.direction), _object_normals(view)
     normals = np.zeros((px * px, 3), np.float32)
     normals[:, 2], normals[view.pixels] = 1, own
     seen = _lamp_seen(view, own, light) if shadow else np.ones(px * px, np.float32)
     hidden = hidden_sky(view.is_object.reshape(px, px))
     surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), _reflectance(view, lighting))
-    linear = radiance(surfaces, _lamps(lighting, view.obj.material))
-    linear = cv2.GaussianBlur(linear.reshape(px, px, 3), (0, 0), _LENS_BLUR_PX)
-    noise = _NOISE * np.random.default_rng([72, noise_seed]).standard_normal(linear.shape)
-    return developed(linear, noise)
+    return surfaces, _lamps(lighting, view.obj.material)
 
 
 def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:

@@ -9,7 +9,6 @@ saved once more at a lower quality.
 
 import argparse
 import dataclasses
-import io
 import json
 import time
 from collections.abc import Iterator
@@ -20,18 +19,14 @@ from PIL import Image
 
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
+from retrieval.lab.frontier.large import LOWER, PHOTOS, QUALITY, SIDE, as_jpeg, photographed
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos, one_thread
 from retrieval.model.fusion import judge_of
 from retrieval.search.defaults import shipped_model
-from robot.sim.camera import PinholeCamera
-from robot.sim.objects.draw import draw_object
-from robot.sim.scene import Scene
 from tests.benchmarks.common import Line
 
-PHOTOS, SIDE = 12, 2048
 SIZES = ((1024, 1024), (2048, 2048), (4000, 3000))
-SEED, QUALITY, LOWER = 70_000, 92, 85
 
 
 def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[Line]:
@@ -39,10 +34,10 @@ def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int]
     checkpoint = load_checkpoint(shipped_model())
     tower, plain = checkpoint.config.matcher.tower, checkpoint.config.preprocessing
     reduced = dataclasses.replace(plain, reduced=True)
-    pictures = [_photographed(number, side) for number in range(photos)]
+    pictures = [photographed(number, side) for number in range(photos)]
     with one_thread():
         for size in sizes:
-            files = [_jpeg(picture.resize(size, Image.Resampling.LANCZOS), QUALITY) for picture in pictures]
+            files = [as_jpeg(picture.resize(size, Image.Resampling.LANCZOS), QUALITY) for picture in pictures]
             (whole, whole_s), (less, less_s) = (_seen(files, settings) for settings in (plain, reduced))
             moved = _moved(checkpoint, whole, less)
             ratio = whole_s / less_s
@@ -51,21 +46,9 @@ def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int]
                 f"reduced ({ratio:.1f} times faster); {_said(moved)}"
             )
             yield Line("large", tower, text, {"whole_s": whole_s, "reduced_s": less_s, "ratio": ratio, **moved})
-        files = [[_jpeg(picture, quality) for picture in pictures] for quality in (QUALITY, LOWER)]
+        files = [[as_jpeg(picture, quality) for picture in pictures] for quality in (QUALITY, LOWER)]
         moved = _moved(checkpoint, *(_seen(each, plain)[0] for each in files))
         yield Line("large", tower, f"{side} x {side}, saved again at quality {LOWER}: {_said(moved)}", moved)
-
-
-def _photographed(number: int, side: int) -> Image.Image:
-    camera = PinholeCamera(px=side, focal_px=PinholeCamera.focal_px * side / PinholeCamera.px)
-    scene = Scene(draw_object(SEED, number), camera=camera, seed=number, outputs={"photo"})
-    return Image.fromarray(scene.run()["photo"])
-
-
-def _jpeg(picture: Image.Image, quality: int) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=quality)
-    return buffer.getvalue()
 
 
 def _seen(files: list[bytes], settings: Preprocessing) -> tuple[list[RgbImage], float]:

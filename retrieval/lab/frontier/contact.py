@@ -1,4 +1,5 @@
-"""The simulated rig's approximations: grid and tolerance of the gel's contact, time step of the closing jaws."""
+"""The simulated rig's approximations: grid, tolerance and precision of the gel's contact, time step of the closing
+jaws."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,7 +13,8 @@ from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.points import Panel, Row, Tradeoff, smallest
 from retrieval.lab.frontier.sample import Sample
 from robot.sim.contact.kernels import Floats
-from robot.sim.contact.layer import Contact, Layer, press
+from robot.sim.contact.layer import SINGLE_FROM, Contact, Layer, press
+from robot.sim.contact.scaled_problem import ElasticSurface, Task
 from robot.sim.gel.optics import LedOptics
 from robot.sim.gel.surface import Field, Surface
 from robot.sim.pinch import Hand
@@ -136,6 +138,50 @@ def _at_centres(fine: Floats, factor: int) -> Floats:
     blocks = fine.reshape(rows, factor, cols, factor)
     middle = slice(factor // 2 - 1, factor // 2 + 1)
     return np.asarray(blocks[:, middle, :, middle].mean(axis=(1, 3)))
+
+
+# Products ---------------------------------------------------------------------------------------------------
+
+
+def contact_products(sample: Sample) -> Row:
+    """float32 in the products of the gel's contact."""
+    text = (
+        "A ball with ridges pressed into a layer on the rig's grid: the products of pressure and influence by FFT in "
+        "float32 or in float64, and the solver's tolerance. The rig's contacts, at a tolerance of "
+        f"{SINGLE_FROM:g} or more, take float32."
+    )
+    repeats = sample.scale.repeats
+    panel = products_panel(repeats, rows=48) if sample.scale.quick else products_panel(repeats)
+    return Row("Contact of the gel: float32", text, (panel,))
+
+
+def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3)) -> Panel:
+    """A point for each precision and tolerance: rms error of the surface against float64 at 1e-8 on the same grid."""
+    hand = Hand()
+    grid = hand.grid if rows is None else (rows, rows * 4 // 3)
+    pixel_mm = 15.2 / grid[0]
+    y, x = (pixel_mm * (np.arange(n) - (n - 1) / 2) for n in grid)
+    gap = (y[:, None] ** 2 + x**2) / 30.0 + 0.1 * (1.0 - np.cos(2.0 * math.pi * x / 1.5))
+    exact = _pressed(gap, pixel_mm, 1e-8, False)
+    points, works = list[Tradeoff](), []
+    for single in (False, True):
+        for tolerance in tolerances:
+            works.append(partial(_pressed, gap, pixel_mm, tolerance, single))
+            error = 1e3 * math.sqrt(float(np.mean((works[-1]() - exact) ** 2)))
+            is_default = (tolerance, single) == (hand.tolerance, True)
+            series = "float32" if single else "float64"
+            points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
+    made = timed(points, works, repeats)
+    reference = "float64, tolerance 1e-08"
+    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, made, smallest(made))
+
+
+def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single: bool, force_n: float = 3.0) -> Floats:
+    """(rows, cols) mm of displacement by so much force."""
+    scale = force_n / LAYER.plane_modulus_mpa / pixel_mm**2
+    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single)
+    solution = Task(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()
+    return np.asarray(solution.displacement * scale * pixel_mm)
 
 
 # Closing ---------------------------------------------------------------------------------------------------

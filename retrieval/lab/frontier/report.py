@@ -16,7 +16,9 @@ from retrieval.report.results import at_start
 # Okabe and Ito's palette, and a marker each for who sees no colours.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f4e37", "#222222", "#aa3377")
 _MARKERS = "o^sDvPX<>"
-_LABEL: Any = {"xytext": (7, 5), "textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c"}
+_LABEL: Any = {"textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c"}
+_ABOVE, _BELOW, _NEAR_PX = (7, 5), (7, -10), 20
+"""Where a label stands from its point, in points; below where the one before stands as near as this, in pixels."""
 _FLOOR = 0.5
 """A share of which nothing was seen is drawn at half of the least that could have been."""
 
@@ -158,9 +160,14 @@ def _front(axes: Axes, panel: Panel, floor: float) -> None:
         *_place(best, floor), "*", ms=11, color="#c8382e", mec="white", mew=0.6, clip_on=False, label="recommended"
     )
     step = 1 if len(front) < 8 else 2  # every second point of a long front has its label
+    axes.get_xlim(), axes.get_ylim()  # so that places in pixels are those that will be drawn
+    before = np.full(2, np.inf)
     for point in {id(one): one for one in (*panel.pareto()[::step], best)}.values():
-        label = axes.annotate(point.setting or point.series, _place(point, floor), **_LABEL)
+        at = axes.transData.transform(_place(point, floor))
+        side = _BELOW if np.abs(at - before).max() < _NEAR_PX else _ABOVE
+        label = axes.annotate(point.setting or point.series, _place(point, floor), xytext=side, **_LABEL)
         label.set_in_layout(False)
+        before = at
 
 
 def _place(point: Tradeoff, floor: float) -> tuple[float, float]:

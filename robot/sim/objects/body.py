@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robot.errors import SceneError
 from robot.sim.objects.boxes import clipped
 from robot.sim.objects.formula import record
-from robot.sim.objects.packets import Formula, Worn, first_hits, gradients, hits
+from robot.sim.objects.packets import Formula, Rays, Worn, first_hits, gradients, hits
 from robot.sim.objects.relief import Relief
 from robot.sim.objects.shapes.base import Floats, Points, Shape
 from robot.sim.objects.wall import Level, Wall, bake
@@ -34,6 +34,11 @@ class ClippedRays:
     near_mm: Vectors
     far_mm: Vectors
     step_mm: float
+
+    @property
+    def ways(self) -> Rays:
+        """All but the detail."""
+        return self.origins, self.directions, self.near_mm, self.far_mm
 
 
 class Body(ABC):
@@ -142,7 +147,7 @@ class SdfBody(Body):
         s, t, weight = self.located(x, y, z)
         return base - self.wall.level(step_mm).at(s, t) * weight
 
-    def _worn(self, step_mm: float) -> Worn:
+    def worn(self, step_mm: float) -> Worn:
         """The body as rays see it that ask for detail of `step_mm`."""
         level = self.wall.level(step_mm) if self.wall else _BARE
         return Worn(
@@ -150,15 +155,13 @@ class SdfBody(Body):
         )
 
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
-        return gradients(self._worn(step_mm), points, step_mm)
+        return gradients(self.worn(step_mm), points, step_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
-        worn = self._worn(rays.step_mm)
-        return first_hits(worn, rays.origins, rays.directions, rays.near_mm, rays.far_mm, rays.step_mm)
+        return first_hits(self.worn(rays.step_mm), rays.ways, rays.step_mm)
 
     def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        worn = self._worn(rays.step_mm)
-        return hits(worn, rays.origins, rays.directions, rays.near_mm, rays.far_mm, rays.step_mm)
+        return hits(self.worn(rays.step_mm), rays.ways, rays.step_mm)
 
 
 _BARE = Level(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)

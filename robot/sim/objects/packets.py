@@ -160,37 +160,29 @@ def gradients(worn: Worn, points: Vectors, step_mm: float) -> Vectors:
     return out
 
 
-def first_hits(
-    worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, step_mm: float
-) -> Vectors:
-    """Distance (n,) along rays (n, 3) to the first place where f is 0, looked for from `near` to `far`; inf: none.
-    `step_mm` is the finest detail that matters."""
-    rows = _rows_of(worn)
-    found = _crossed(worn, rows, origins, directions, near, far, step_mm)
+Rays = tuple[Vectors, Vectors, Vectors, Vectors]
+"""Origins and directions (n, 3); from where to where along them a hit is looked for, (n,) mm each."""
+
+
+def first_hits(worn: Worn, rays: Rays, step_mm: float, most_steps: int = MOST_STEPS) -> Vectors:
+    """Distance (n,) along each ray to the first place where f is 0; inf: none. `step_mm` is the finest detail that
+    matters; a ray that has found nothing after `most_steps` is a miss."""
+    origins, directions, near, _ = rays
+    rows, found = _rows_of(worn), _crossed(worn, rays, step_mm, most_steps)
     out = np.full(len(near), np.inf)
     _refine(worn, rows, origins, directions, near, found, out)
     return out
 
 
-def hits(
-    worn: Worn, origins: Vectors, directions: Vectors, near: Vectors, far: Vectors, step_mm: float
-) -> NDArray[np.bool_]:
+def hits(worn: Worn, rays: Rays, step_mm: float, most_steps: int = MOST_STEPS) -> NDArray[np.bool_]:
     """Which rays have such a first hit, (n,)."""
-    return np.asarray(np.isfinite(_crossed(worn, _rows_of(worn), origins, directions, near, far, step_mm)[0]))
+    return np.asarray(np.isfinite(_crossed(worn, rays, step_mm, most_steps)[0]))
 
 
-def _crossed(
-    worn: Worn,
-    rows: tuple[Floats, Floats],
-    origins: Vectors,
-    directions: Vectors,
-    near: Vectors,
-    far: Vectors,
-    step_mm: float,
-) -> Floats:
+def _crossed(worn: Worn, rays: Rays, step_mm: float, most_steps: int) -> Floats:
     """What `_march` finds, (4, n)."""
-    found = np.full((4, len(near)), np.inf, np.float32)
-    _march(worn, rows, origins, directions, near, far, np.float32(0.5 * step_mm), found)
+    found = np.full((4, len(rays[0])), np.inf, np.float32)
+    _march(worn, _rows_of(worn), *rays, np.float32(0.5 * step_mm), most_steps, found)
     return found
 
 
@@ -267,7 +259,7 @@ _ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _ROOM, _STEPS, _LANE_ROWS = 0, 3, 6
 
 
 @compiled
-def _march(worn, rows, origins, directions, near, far, finest, found):  # type: ignore[no-untyped-def]
+def _march(worn, rows, origins, directions, near, far, finest, most_steps, found):  # type: ignore[no-untyped-def]
     """Sphere tracing until f changes sign: `found` is t and f just inside (inf: a miss), t and f just outside.
 
     Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the
@@ -337,7 +329,7 @@ def _march(worn, rows, origins, directions, near, far, finest, found):  # type: 
         end = count
         count = 0
         for i in range(end):
-            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < MOST_STEPS:
+            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < most_steps:
                 if count < i:
                     ray[count] = ray[i]
                     for row in range(_LANE_ROWS):
