@@ -4,7 +4,8 @@ Candidates of several grasps of one object: the k photos nearest to all of them 
 the k nearest of each put together. Catalogues are drawn as `tests.benchmarks.scale` draws them. Every touch of the
 recording begins a set with the next ones of its object. A set's winner is the photo of the greatest sum of match
 logits; it is looked for among the `LOOKED` nearest of either way, whose ends winners stay far away from (the worst
-place is told). Naming and judging are timed on one thread, both ways in turns.
+place is told). Places are those of exact cosines; naming by the index of `--kind` and judging are timed on one thread,
+both ways in turns.
 """
 
 import argparse
