@@ -257,6 +257,13 @@ def test_vectors_of_equal_hash_and_other_bytes_are_told_apart(monkeypatch):
     assert first_of_equals(vectors).tolist() == [0, 1, 0, 3, 1, 5, 3, 3]
 
 
+def test_vectors_that_begin_alike_are_told_apart_by_the_rest():
+    vectors = np.zeros((5, equal.BEGINNING + 4), np.float32)
+    vectors[:, 0] = 1
+    vectors[[1, 3], -1], vectors[4, -2] = 0.5, 0.5
+    assert first_of_equals(vectors).tolist() == [0, 1, 0, 1, 4]
+
+
 def test_zero_and_minus_zero_are_other_bytes():
     vectors = np.array([[1, 0], [1, -0.0], [1, 0]], np.float32)
     assert first_of_equals(vectors).tolist() == [0, 1, 0]

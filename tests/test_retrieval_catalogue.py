@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from retrieval.data import catalogue as module
-from retrieval.data.catalogue import CataloguePhoto, Photos, SkippedPhoto, decode_photo, list_catalogue, read_photo
+from retrieval.data.catalogue import CataloguePhoto, Photos, decode_photo, list_catalogue, read_photo
 from retrieval.data.naming import Naming
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import DatasetError
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from retrieval.data import sources, storage
-from retrieval.data.catalogue import PhotoBytes, SkippedPhoto, list_catalogue, read_photo
+from retrieval.data.catalogue import PhotoBytes, list_catalogue, read_photo
 from retrieval.data.naming import Naming
 from retrieval.data.sources import list_photos
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, DatasetError, StorageError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index

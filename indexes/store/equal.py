@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from indexes.kinds.checks import BLOCK_ROWS
 from indexes.kinds.scores import Floats, Slots
 
+BEGINNING = 16
+"""Components that are compared at first."""
+
 
 def first_of_equals(vectors: Floats, seed: int = 0) -> Slots:
     """For each vector (M,) the first that holds the same bytes. The vectors (M, d) are read block by block.
@@ -31,11 +34,13 @@ def first_of_equals(vectors: Floats, seed: int = 0) -> Slots:
 
 
 def _hashes(vectors: Floats, seed: int) -> NDArray[np.uint64]:
-    """A hash (M,) of the bytes of each vector: its 32-bit words by random odd numbers, summed modulo 2^64."""
-    drawn = np.random.default_rng(seed).integers(2**63, size=vectors.shape[1], dtype=np.uint64)
+    """A hash (M,) of the bytes of each vector: its 32-bit words by random odd numbers, summed modulo 2^64. At first of
+    its beginning alone, which tells embeddings apart."""
+    count = min(vectors.shape[1], BEGINNING) if seed == 0 else vectors.shape[1]
+    drawn = np.random.default_rng(seed).integers(2**63, size=count, dtype=np.uint64)
     factors = drawn * np.uint64(2) + np.uint64(1)
     hashes = np.empty(len(vectors), np.uint64)
     for start in range(0, len(vectors), BLOCK_ROWS):
-        words = np.ascontiguousarray(vectors[start : start + BLOCK_ROWS]).view(np.uint32)
+        words = np.ascontiguousarray(vectors[start : start + BLOCK_ROWS, : len(factors)]).view(np.uint32)
         hashes[start : start + BLOCK_ROWS] = (words * factors).sum(axis=1, dtype=np.uint64)
     return hashes

@@ -11,6 +11,7 @@
       NAME.json           documents; NAME.npy those that are arrays, of no row
     LOCK                  held by the writer
     seen.records          how the files behind the rows looked, of no generation (`indexes.store.seen`)
+    seen.folders          and what folders held that looked so (`indexes.store.seen_folders`)
     unfinished/           what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
 
 A generation is written whole and stands alone: its folder and a CURRENT are an index, wherever they are copied to. One

@@ -20,6 +20,9 @@ from indexes.store.rows import first_equal
 NAME = "seen.records"
 LOOKS = ("bytes", "mtime_ns", "ctime_ns", "inode")
 """How a file looks without being read, each modulo 2^64."""
+SETTLED_NS = 2 * 10**9
+"""What is noted must have been left alone for so long: the coarsest clock of a common disk, FAT's, ticks every two
+seconds."""
 RECORD = np.dtype([("id", "S16"), ("digest", "S16"), ("looks", "<u8", (len(LOOKS),))])
 
 _MAGIC = b"seen 1\n\0"

@@ -17,15 +17,16 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
 
 from indexes.store.regular import read_regular
+from indexes.store.seen_folders import SeenFolders
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
 from retrieval.data.touched import CatalogueTouch, grouped, touch_name
+from retrieval.data.walking import SkippedPhoto, Walk
 from retrieval.errors import DatasetError, ImageError
 
 METADATA_FILE = "metadata.jsonl"
@@ -78,14 +79,6 @@ class Photos(Sequence[CataloguePhoto]):
 
 
 @dataclass(frozen=True)
-class SkippedPhoto:
-    """A file or folder that could not be used, and why."""
-
-    path: str
-    reason: str
-
-
-@dataclass(frozen=True)
 class Catalogue:
     """What a folder holds: photos by id, files that are no photos by name, what was left out, remarks.
 
@@ -125,8 +118,9 @@ class PhotoBytes:
     digest: str
 
 
-def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
-    """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None.
+def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: SeenFolders | None = None) -> Catalogue:
+    """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None. seen:
+    what earlier builds saw there, which takes down what this one sees.
 
     Raises DatasetError: no folder, neither photo nor touch, none that fits the naming, bad metadata.
     """
@@ -134,7 +128,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    found = _Found(Path(os.path.realpath(root)))
+    found = Walk(Path(os.path.realpath(root)), seen)
     found.walk(str(root), "")
     path = root / METADATA_FILE
     try:
@@ -220,63 +214,6 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
         return decode(file.data, file.photo.path)
     except ImageError as error:
         return SkippedPhoto(file.photo.path, error.reason)
-
-
-@dataclass
-class _Found:
-    """Files below the folder `root` as relative posix paths, and what was passed over. followed: where links led."""
-
-    root: Path
-    names: list[str] = field(default_factory=list)
-    skipped: list[SkippedPhoto] = field(default_factory=list)
-    followed: set[Path] = field(default_factory=set)
-
-    def walk(self, folder: str, prefix: str) -> None:
-        """Look through a folder, whose names get this prefix.
-
-        A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
-        """
-        try:
-            entries = sorted(os.scandir(folder), key=attrgetter("name"))
-        except OSError as error:
-            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
-        for entry in entries:
-            name = entry.name
-            if name.startswith("."):
-                continue
-            path = prefix + name
-            if not path.isascii() and not _is_utf8(path):
-                named = os.fsencode(path).decode(errors="backslashreplace")
-                self.skipped.append(SkippedPhoto(named, "the name is not valid UTF-8; rename it"))
-                continue
-            try:
-                is_folder = entry.is_dir()
-            except OSError:  # a link that leads to itself
-                is_folder = False
-            if not is_folder:
-                self.names.append(path)
-            elif entry.is_symlink():
-                self._follow(entry.path, path)
-            else:
-                self.walk(entry.path, path + "/")
-
-    def _follow(self, link: str, path: str) -> None:
-        target = Path(os.path.realpath(link))
-        if target.is_relative_to(self.root) or self.root.is_relative_to(target):
-            self.skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
-        elif target in self.followed:
-            self.skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
-        else:
-            self.followed.add(target)
-            self.walk(link, path + "/")
-
-
-def _is_utf8(path: str) -> bool:
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 # The user's own metadata -----------------------------------------------------------------------------------

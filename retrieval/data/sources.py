@@ -23,18 +23,19 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+from indexes.store.seen_folders import SeenFolders
 from retrieval.data.catalogue import (
     METADATA_FILE,
     Catalogue,
     CataloguePhoto,
     Photos,
-    SkippedPhoto,
     catalogue_of,
     list_catalogue,
 )
 from retrieval.data.images import MAX_BYTES
 from retrieval.data.naming import Naming
 from retrieval.data.storage import FINAL, file_system, is_url, tried
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, DatasetError, ImageError
 
 _PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
@@ -82,10 +83,10 @@ def is_elsewhere(where: str | Path) -> bool:
     return is_url(where) or str(where).endswith((".parquet", ".tar"))
 
 
-def list_photos(where: str | Path, naming: Naming | None = None) -> Catalogue:
+def list_photos(where: str | Path, naming: Naming | None = None, seen: SeenFolders | None = None) -> Catalogue:
     """The photos of a folder, or of a URL as the text above says. Raises DatasetError as `list_catalogue` does."""
     if not is_elsewhere(where):
-        return list_catalogue(Path(where), naming)
+        return list_catalogue(Path(where), naming, seen)
     url, naming = str(where), naming or Naming()
     if url.endswith(".parquet"):
         return _parquet(url, naming)

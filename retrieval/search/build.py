@@ -13,6 +13,7 @@ from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedForma
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
+from indexes.store.seen_folders import SeenFolders
 from indexes.store.tables import Block, Tables
 from indexes.store.unfinished import Unfinished
 from indexes.store.writing import RECALL_QUERIES, Chosen
@@ -59,12 +60,12 @@ def build_index(
 
     objects_from: which object a photo shows (`retrieval.data.naming`); where None, as the index has it, else by folder.
     kind, min_recall, max_ms: what is asked of the search (`retrieval.search.operating`); where all are None, exact
-    search. verify: read every file, also those whose size, times and inode are as an earlier build found them
-    (`retrieval.search.looks`). Where neither the photos' content nor their objects nor what is asked for changed,
-    nothing is written. Photos that cannot be read are skipped and reported. Raises BadInput for a rule that is none,
-    DatasetError where no photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the
-    index as it was. What was embedded until an error, or until the process was killed, is not embedded again by the
-    next build (`indexes.store.unfinished`).
+    search. verify: list every folder and read every file, also those whose size, times and inode are as an earlier
+    build found them (`indexes.store.seen_folders`, `retrieval.search.looks`). Where neither the photos' content nor
+    their objects nor what is asked for changed, nothing is written. Photos that cannot be read are skipped and
+    reported. Raises BadInput for a rule that is none, DatasetError where no photo can be read, and the errors of
+    `indexes.store.folder.IndexStore.write`, which leave the index as it was. What was embedded until an error, or until
+    the process was killed, is not embedded again by the next build (`indexes.store.unfinished`).
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
@@ -74,8 +75,10 @@ def build_index(
     """
     asked = Asked(kind, min_recall, max_ms)
     naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
-    wanted = Wanted(naming, asked, quiet, verify, note)
-    return build_listed(list_photos(folder, naming), checkpoint, out, wanted)
+    wanted, seen = Wanted(naming, asked, quiet, verify, note), SeenFolders(out, known=not verify)
+    report = build_listed(list_photos(folder, naming, seen), checkpoint, out, wanted)
+    seen.write()
+    return report
 
 
 UNNOTED = (

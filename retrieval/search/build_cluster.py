@@ -35,11 +35,12 @@ from indexes.store.files import remove_folder
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos, SkippedPhoto
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.naming import Naming, doubts, per_object
 from retrieval.data.sources import list_photos
 from retrieval.data.storage import is_url
 from retrieval.data.touched import CatalogueTouch
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint

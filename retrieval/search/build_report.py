@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
-from retrieval.data.catalogue import SkippedPhoto
+from retrieval.data.walking import SkippedPhoto
 
 SHOWN, FEW = 20, 5
 """Lines to show on a terminal of what has a reason each, and of what has not."""

@@ -25,10 +25,10 @@ from retrieval.data.catalogue import (
     CataloguePhoto,
     PhotoBytes,
     Photos,
-    SkippedPhoto,
     decode_photo,
     read_photo,
 )
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, one_thread

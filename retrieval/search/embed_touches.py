@@ -16,9 +16,10 @@ from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
 from indexes.store.tables import Tables
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos, SkippedPhoto
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.images import decode_rgb
 from retrieval.data.touched import CatalogueTouch
+from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, ImageError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features

@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
-from indexes.store.seen import LOOKS, Looks, Seen
+from indexes.store.seen import LOOKS, SETTLED_NS, Looks, Seen
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.sources import Fetched
 
-SETTLED_NS = 2 * 10**9
-"""A file must have been left alone for so long: the coarsest clock of a common disk, FAT's, ticks every two seconds."""
 LEAST_RUN = 256
 """Photos in a row that are worth being taken over as they lie; each such run ends a batch of photos to encode."""
 

@@ -1,0 +1,85 @@
+"""The files of a folder and of those below it, by name; links are followed without going round in a circle."""
+
+import os
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+
+from indexes.store.seen_folders import SeenFolders
+from retrieval.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class SkippedPhoto:
+    """A file or folder that could not be used, and why."""
+
+    path: str
+    reason: str
+
+
+@dataclass
+class Walk:
+    """Files below the folder `root` as relative posix paths, and what was passed over. seen: what earlier builds saw in
+    its folders; followed: where links led."""
+
+    root: Path
+    seen: SeenFolders | None = None
+    names: list[str] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    followed: set[Path] = field(default_factory=set)
+
+    def walk(self, folder: str, prefix: str) -> None:
+        """Look through a folder, whose names get this prefix.
+
+        A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
+        """
+        look = b"" if self.seen is None else self.seen.look(folder)  # before what is in it
+        if self.seen is not None and (known := self.seen.names(prefix, look)) is not None:
+            self.names += [prefix + name for name in known]
+            return
+        try:
+            entries = sorted(os.scandir(folder), key=attrgetter("name"))
+        except OSError as error:
+            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
+        first, plain = len(self.names), True
+        for entry in entries:
+            name = entry.name
+            if name.startswith("."):
+                continue
+            path = prefix + name
+            if not path.isascii() and not _is_utf8(path):
+                named = os.fsencode(path).decode(errors="backslashreplace")
+                self.skipped.append(SkippedPhoto(named, "the name is not valid UTF-8; rename it"))
+                plain = False
+                continue
+            try:
+                is_folder = entry.is_dir()
+            except OSError:  # a link that leads to itself
+                is_folder = False
+            plain &= not is_folder and not entry.is_symlink()
+            if not is_folder:
+                self.names.append(path)
+            elif entry.is_symlink():
+                self._follow(entry.path, path)
+            else:
+                self.walk(entry.path, path + "/")
+        if self.seen is not None and plain:
+            self.seen.note(prefix, look, [path[len(prefix) :] for path in self.names[first:]])
+
+    def _follow(self, link: str, path: str) -> None:
+        target = Path(os.path.realpath(link))
+        if target.is_relative_to(self.root) or self.root.is_relative_to(target):
+            self.skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
+        elif target in self.followed:
+            self.skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
+        else:
+            self.followed.add(target)
+            self.walk(link, path + "/")
+
+
+def _is_utf8(path: str) -> bool:
+    try:
+        path.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
