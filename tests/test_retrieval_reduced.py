@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data import preprocessing
-from retrieval.data.images import decode_rgb
+from retrieval.data.images import decode, decode_rgb
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ImageError
 from retrieval.model.config import Config
@@ -31,11 +31,11 @@ def decoded(monkeypatch):
     sizes = []
 
     def noted(*given):
-        image = decode_rgb(*given)
+        image = decode(*given)
         sizes.append(image.shape[:2])
         return image
 
-    monkeypatch.setattr(preprocessing, "decode_rgb", noted)
+    monkeypatch.setattr(preprocessing, "decode", noted)
     return sizes
 
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError, features
 
 from indexes.store.regular import read_regular
-from retrieval.data.resize import RgbImage
+from retrieval.data.resize import RgbImage, Samples, to_unit
 from retrieval.errors import BadInput, ImageError
 
 HEIC_EXTENSIONS = frozenset({".heic", ".heif", ".hif"})
@@ -95,6 +95,11 @@ def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbIm
     Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
     several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
     """
+    return to_unit(decode(data, name, least))
+
+
+def decode(data: bytes, name: str | Path, least: int | None = None) -> Samples:
+    """As `decode_rgb`, in the 8 bits of the file where it has no more and nothing was laid on white."""
     with _opened(data, name) as image:
         _reduce(image, least)
         check_pixels(image.size, name)
@@ -102,8 +107,8 @@ def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbIm
         orientation = _orientation(image)
         # Byte 24 of a PNG file is its bit depth.
         bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
-        rgb = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
-        return np.ascontiguousarray(_upright(rgb, orientation))
+        samples = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
+        return _upright(samples, orientation)
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
@@ -196,7 +201,7 @@ def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
         with _quiet:
             image.load()
             rgb = _eight_bit_rgb(image, name)
-        return np.ascontiguousarray(_upright(rgb, _orientation(image)))
+        return to_unit(_upright(rgb, _orientation(image)))
     except ImageError:
         raise
     except Exception as error:  # a file behind it that is damaged, or closed by now
@@ -235,11 +240,11 @@ def _tiff_tag(image: Image.Image, tag: int, default: tuple[int, ...]) -> tuple[i
     return tuple(value) if isinstance(value, tuple | list) else (int(value),)
 
 
-def _eight_bit_rgb(image: Image.Image, name: str | Path) -> RgbImage:
+def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
     if image.mode not in _EIGHT_BIT_MODES:
         raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
     if not image.has_transparency_data:
-        return to_float(np.asarray(image.convert("RGB")))
+        return np.array(image if image.mode == "RGB" else image.convert("RGB"))
     samples = to_float(np.asarray(image.convert("RGBA")))
     return _on_white(samples[..., :3], samples[..., 3:])
 
@@ -294,10 +299,11 @@ def _orientation(image: Image.Image) -> int:
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _upright(image: RgbImage, orientation: int) -> RgbImage:
+def _upright(image: Samples, orientation: int) -> Samples:
     """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) turn."""
     if orientation >= 5:
         image = image.swapaxes(0, 1)
     rows = -1 if orientation in (3, 4, 7, 8) else 1
     columns = -1 if orientation in (2, 3, 6, 7) else 1
-    return image[::rows, ::columns]
+    upright: Samples = np.ascontiguousarray(image[::rows, ::columns])  # type: ignore[assignment]
+    return upright

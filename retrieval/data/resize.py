@@ -3,8 +3,9 @@
 scipy's sparse matrices give the same numbers, bit for bit, and importing them takes longer than a query.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,10 @@ from retrieval.errors import BadInput
 
 RgbImage = npt.NDArray[np.float32]
 """(H, W, 3) float32, red first, 0..1 (-1..1 after a background was subtracted)."""
+Samples: TypeAlias = npt.NDArray[np.uint8] | RgbImage
+"""A picture (H, W, C) of 8 bits, 0..255, or in float32."""
+Resize: TypeAlias = Callable[[Samples, tuple[int, int]], RgbImage]
+"""`resized`, or what gives the same faster."""
 
 
 def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
@@ -30,8 +35,15 @@ def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     return resized(image, size)
 
 
-def resized(image: RgbImage, size: tuple[int, int]) -> RgbImage:
+def to_unit(image: Samples) -> RgbImage:
+    """The picture in float32, 0..1."""
+    unit: RgbImage = image if image.dtype == np.float32 else np.divide(image, 255, dtype=np.float32)  # type: ignore[assignment]
+    return unit
+
+
+def resized(samples: Samples, size: tuple[int, int]) -> RgbImage:
     """As `resize`, of pictures (H, W, C) of any number of channels; nothing is checked."""
+    image = to_unit(samples)
     for axis in axes(image.shape, size):
         image = _resize_axis(image, axis, size[axis])
     return image

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import RgbImage, resized
+from retrieval.data.resize import Resize, RgbImage, Samples, resized, to_unit
 
 _CROP_MARGIN = 1.12
 _ZOOM_SHARE = 7 / 16
@@ -44,7 +44,7 @@ class Box(NamedTuple):
     bottom: float
 
 
-def find_object(image: RgbImage) -> Box:
+def find_object(image: Samples, resize: Resize = resized) -> Box:
     """Where the one object of a photo (H, W, 3) lies that stands before a plain ground; the whole photo if none does.
 
     The ground is what the photo's border shows: planes of colour and lightness, fitted without what sticks out. An
@@ -54,7 +54,7 @@ def find_object(image: RgbImage) -> Box:
     import cv2  # a query of a touch needs none
 
     height, width = image.shape[:2]
-    linear = np.clip(resized(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
+    linear = np.clip(resize(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
     channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # a plane after the other: sums in a tenth of the time
     lightness = _summed(channels) / 3
     (red, green, blue, lighter), scatter = _off_the_ground(np.stack([*(channels / lightness), np.log(lightness)]))
@@ -133,7 +133,7 @@ def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | No
     return left.min(), top.min(), (left + width).max(), (top + height).max()
 
 
-def square(image: RgbImage, box: Box, side: float) -> RgbImage:
+def square(image: Samples, box: Box, side: float) -> Samples:
     """The square of `side` pixels about the middle of a box in the photo; beyond the photo's edge its last pixels go
     on."""
     import cv2
@@ -143,23 +143,24 @@ def square(image: RgbImage, box: Box, side: float) -> RgbImage:
     inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
     above, before = max(-top, 0), max(-left, 0)
     beyond = above, size - above - inside.shape[0], before, size - before - inside.shape[1]
-    return cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else inside
+    whole: Samples = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else inside
+    return whole
 
 
-def _crop(image: RgbImage, box: Box) -> RgbImage:
+def _crop(image: Samples, box: Box) -> Samples:
     return square(image, box, _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top))
 
 
-def _zoom(image: RgbImage, box: Box) -> RgbImage:
+def _zoom(image: Samples, box: Box) -> Samples:
     return square(image, box, _ZOOM_SHARE * min(image.shape[:2]))
 
 
-def _grey(image: RgbImage, box: Box) -> RgbImage:
-    grey: RgbImage = _summed(_zoom(image, box).transpose(2, 0, 1))[..., None] / np.float32(3)
+def _grey(image: Samples, box: Box) -> Samples:
+    grey: RgbImage = _summed(to_unit(_zoom(image, box)).transpose(2, 0, 1))[..., None] / np.float32(3)
     return grey
 
 
-VIEWS: dict[str, Callable[[RgbImage, Box], RgbImage]] = {
+VIEWS: dict[str, Callable[[Samples, Box], Samples]] = {
     "whole": lambda image, box: image,
     "crop": _crop,
     "zoom": _zoom,
@@ -187,11 +188,11 @@ def least_side_of_crop(box: Box, short: int, px: int) -> int:
     return math.ceil(OVERSAMPLED * px / float(share))
 
 
-def strip(image: RgbImage, names: Sequence[str], px: int, box: Box | None = None) -> RgbImage:
+def strip(image: Samples, names: Sequence[str], px: int, box: Box | None = None, resize: Resize = resized) -> RgbImage:
     """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
     if box is None:
-        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
+        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image, resize)
     found = np.empty((px, len(names) * px, 3), np.float32)
     for place, name in enumerate(names):
-        found[:, place * px : (place + 1) * px] = resized(VIEWS[name](image, box), (px, px))
+        found[:, place * px : (place + 1) * px] = resize(VIEWS[name](image, box), (px, px))
     return found

@@ -15,6 +15,8 @@ from typing import Any
 import cv2
 import torch
 
+from retrieval.data.images import read_bytes
+from retrieval.data.photo_resize import resize_photo
 from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
@@ -66,7 +68,11 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
     encoding, without an index.
     """
     checkpoint = load_checkpoint(shipped_model())
-    see = checkpoint.config.preprocessing.load_photo
+    photo_of = checkpoint.config.preprocessing.photo_of
+
+    def see(path: Path) -> RgbImage:
+        return photo_of(read_bytes(path), path, resize_photo)
+
     with tempfile.TemporaryDirectory() as name:
         images, build = _ready(Path(name), checkpoint, photos, photo_px)
         paths = sorted((Path(name) / "catalog").rglob("*.jpg"))
