@@ -8,9 +8,9 @@
 
 All in turns. With one thread everything is held on one core, so that what decodes takes its time from the step, and CPU
 time is told: it is the same while other programs run. With two threads it is the clock. `--ranks`: two processes of one
-thread, as `torchrun` starts them, in turns with one process of two. Without `--recording` pictures are drawn;
-`--pictures` (of `collect --photos-only` or `--touches-only`) trains the tower of preset `relief` too, whose pictures
-are turned, shifted, lit and made noisy for each step.
+thread, as `torchrun` starts them, in turns with one process of two and with one of one. Without `--recording` pictures
+are drawn; `--pictures` (of `collect --photos-only` or `--touches-only`) trains the tower of preset `relief` too, whose
+pictures are turned, shifted, lit and made noisy for each step.
 """
 
 import argparse
@@ -216,36 +216,53 @@ def running_on(threads: int) -> Iterator[None]:
 
 
 def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = ROUNDS) -> Iterator[Line]:
-    """Two processes of one thread against one of two, started in turns; each tells the median of its steps."""
-    start = {"two": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]}
-    start["one"] = [sys.executable]
+    """Two processes of one thread against one of two, and one of one, started in turns; each tells the medians of its
+    steps. By the clock where nothing else runs; while other programs run, teams of threads wait for one another, and
+    CPU time tells the most that two can reach, who wait for each other besides."""
+    two = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    start = {"two": (two, 1), "one": ([sys.executable], 2), "alone": ([sys.executable], 1)}
     for tower in towers:
-        seconds: dict[str, list[float]] = {"two": [], "one": []}
+        told: dict[str, list[list[float]]] = {name: [] for name in start}
         for _ in range(rounds):
-            for name, words in start.items():
+            for name, (words, threads) in start.items():
                 words = [*words, "-m", "tests.benchmarks.training", "--rank", "--tower", tower]
                 words += ["--recording", str(recording), "--precision", precision]
-                threads = {"OMP_NUM_THREADS": "1" if name == "two" else "2"}
-                done = subprocess.run(words, env=os.environ | threads, capture_output=True, text=True, check=True)
-                seconds[name].append(float(done.stdout.split()[-1]))
-        each = np.array(seconds["one"]) / np.array(seconds["two"])
-        ratio = float(np.median(seconds["one"]) / np.median(seconds["two"])), float(each.min()), float(each.max())
+                settings = os.environ | {"OMP_NUM_THREADS": str(threads)}
+                done = subprocess.run(words, env=settings, capture_output=True, text=True, check=True)
+                told[name].append([float(word) for word in done.stdout.split()[-2:]])
+        clock, cpu = ({name: np.array(each)[:, which] for name, each in told.items()} for which in (0, 1))
+        ratio, by_cpu = _times(clock["one"], clock["two"]), _times(cpu["alone"], cpu["two"])
+        seconds = {name: float(np.median(each)) for name, each in clock.items()}
+        spent = {name: float(np.median(each)) for name, each in cpu.items()}
         yield Line(
             "ranks",
             tower,
-            f"a step takes {duration(float(np.median(seconds['two'])))} on two processes of one thread, "
-            f"{duration(float(np.median(seconds['one'])))} on one of two: {as_text(ratio)} its rate",
-            {f"{name}_s": float(np.median(taken)) for name, taken in seconds.items()} | {"ratio": ratio[0]},
+            f"a step takes {duration(seconds['two'])} on two processes of one thread, {duration(seconds['one'])} on "
+            f"one of two: {as_text(ratio)} its rate; CPU time {duration(spent['two'])} of each of the two, "
+            f"{duration(spent['alone'])} of one of one thread: {as_text(by_cpu)} its rate at most",
+            {f"{name}_s": each for name, each in seconds.items()}
+            | {f"{name}_cpu_s": each for name, each in spent.items()}
+            | {"ratio": ratio[0], "ratio_cpu": by_cpu[0]},
         )
 
 
+def _times(slow: np.ndarray, fast: np.ndarray) -> tuple[float, float, float]:
+    """By the medians, and the least and most of single rounds."""
+    each = slow / fast
+    return float(np.median(slow) / np.median(fast)), float(each.min()), float(each.max())
+
+
 def as_rank(config: Config, recording: Path, steps: int = STEPS, repetitions: int = REPETITIONS) -> None:
-    """Print the median seconds of a step, on the first rank."""
+    """Print the median seconds of a step, by the clock and by this process's CPU time, on the first rank."""
     distributed.start()
+    taken = []
     with tempfile.TemporaryDirectory() as name, matching(config, recording, Path(name)) as (_, works):
-        times = in_turns({"kept": lambda: works["kept"].steps(steps)}, repetitions, time.perf_counter)
+        for _ in range(1 + repetitions):  # the first is not counted
+            start = time.perf_counter(), time.process_time()
+            works["kept"].steps(steps)
+            taken.append([time.perf_counter() - start[0], time.process_time() - start[1]])
         if not distributed.rank():
-            print(times.median("kept") / steps)
+            print(*np.median(taken[1:], axis=0) / steps)
     distributed.stop()
 
 
