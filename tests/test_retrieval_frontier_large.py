@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from retrieval.data import preprocessing
-from retrieval.data.images import decode_rgb
+from retrieval.data.images import decode
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.lab.frontier import large
 from retrieval.lab.frontier.large import as_jpeg, decoders, photographed, reduced
@@ -24,12 +24,12 @@ def test_each_point_decodes_the_file_at_its_fraction_and_the_last_as_a_training_
     sizes = []
 
     def noted(*given):
-        image = decode_rgb(*given)
+        image = decode(*given)
         sizes.append(image.shape[:2])
         return image
 
     for module in (large, preprocessing):
-        monkeypatch.setattr(module, "decode_rgb", noted)
+        monkeypatch.setattr(module, "decode", noted)
     *fixed, (needed, see) = decoders(SETTINGS)
     for _, at in fixed:
         at(file)

@@ -9,9 +9,10 @@ from itertools import cycle
 import numpy as np
 from PIL import Image
 
-from retrieval.data.images import decode_rgb, picture_size
+from retrieval.data.images import decode, picture_size
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
+from retrieval.data.views import strip
 from retrieval.lab.frontier.clock import timed
 from retrieval.lab.frontier.points import Panel, Row, Tradeoff, missed, smallest
 from retrieval.lab.frontier.sample import Array, Sample
@@ -54,7 +55,8 @@ def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, See]]:
     plain, needed = (dataclasses.replace(settings, reduced=each) for each in (False, True))
 
     def at(fraction: int, data: bytes) -> RgbImage:
-        return plain.photo(decode_rgb(data, _NAME, min(picture_size(data, _NAME)) // fraction))
+        image = decode(data, _NAME, min(picture_size(data, _NAME)) // fraction)
+        return strip(image, settings.views, settings.photo_px)
 
     fixed = "a fixed fraction"
     yield Tradeoff(fixed, "whole", 0.0, is_default=not settings.reduced), lambda data: plain.photo_of(data, _NAME)
