@@ -166,11 +166,11 @@ def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queri
             "self_check": 64,
         }
         try:
-            made = store.write_blocks(_rows_of(generation), **how)
+            made = store.write_blocks(rows_of(generation), **how)
         except ParameterError as error:  # too few vectors for codes
             size.kinds[kind] = {"refused": str(error)}
             continue
-        figures = {"structure_s": time.perf_counter() - start} | _opened(folder) | _disk(made)
+        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(made)
         size.kinds[kind] = figures | _operating_point(crowd, made, touches, winners, asked)
         size.kinds[kind] |= _growth(crowd, store, made, size.photos)
         point = size.kinds[kind]
@@ -178,7 +178,7 @@ def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queri
     return size
 
 
-def _rows_of(generation: Generation) -> Iterator[Block]:
+def rows_of(generation: Generation) -> Iterator[Block]:
     """The rows of a generation, for a new one to take over."""
     return (Block(generation.rows[start : start + BLOCK]) for start in range(0, generation.count, BLOCK))
 
@@ -191,7 +191,7 @@ def _row(number: int) -> dict[str, Any]:
 
 def _build(crowd: Crowd, store: IndexStore, size: Size) -> Generation:
     """Stream the catalogue to the disk; the time to make it up is not counted."""
-    made, most, before = 0.0, 0.0, _anonymous_mb()
+    made, most, before = 0.0, 0.0, anonymous_mb()
 
     def blocks() -> Iterator[Block]:
         nonlocal made, most
@@ -203,7 +203,7 @@ def _build(crowd: Crowd, store: IndexStore, size: Size) -> Generation:
             if block is None:
                 return
             yield block
-            most = max(most, _anonymous_mb() - before)
+            most = max(most, anonymous_mb() - before)
 
     start = time.perf_counter()
     generation = store.write_blocks(blocks(), fingerprint={}, kind="flat", self_check=64)
@@ -279,18 +279,18 @@ def _growth(crowd: Crowd, store: IndexStore, made: Generation, photos: int) -> d
         "self_check": 64,
     }
     start = time.perf_counter()
-    store.write_blocks(chain(_rows_of(made), fresh), **how)
+    store.write_blocks(chain(rows_of(made), fresh), **how)
     return {"add_s": time.perf_counter() - start}
 
 
-def _opened(folder: Path) -> dict[str, float]:
+def opened(folder: Path) -> dict[str, float]:
     """Seconds to open the index in a process of its own, and the memory it then holds beside the mapped files."""
     done = subprocess.run([sys.executable, "-c", PROBE, str(folder)], check=True, capture_output=True, text=True)
     seconds, memory = map(float, done.stdout.split())
     return {"open_s": seconds, "memory_mb": memory}
 
 
-def _disk(made: Generation) -> dict[str, float]:
+def on_disk(made: Generation) -> dict[str, float]:
     structure = made.manifest.files.get("vectors.faiss", {"bytes": 0})["bytes"]
     return {
         "disk_mb": sum(file["bytes"] for file in made.manifest.files.values()) / 2**20,
@@ -298,7 +298,7 @@ def _disk(made: Generation) -> dict[str, float]:
     }
 
 
-def _anonymous_mb() -> float:
+def anonymous_mb() -> float:
     with Path("/proc/self/status").open() as lines:
         return int(next(line for line in lines if line.startswith("RssAnon")).split()[1]) / 1024
 
