@@ -11,6 +11,9 @@
     python -m tests.shipped verdicts FOLDER              fit the posterior and the gel check of the shipped checkpoint
                                                          again, on its validation objects and as many training ones,
                                                          collected into FOLDER/verdicts
+    python -m tests.shipped references FOLDER            fit what reference touches are worth to the shipped checkpoint,
+                                                         on its validation objects, collected into FOLDER/references;
+                                                         with --fingers 1 to the one for one finger
     python -m tests.shipped score FOLDER                 collect other objects into FOLDER/recording, and evaluate the
                                                          shipped checkpoint on them: FOLDER/report; with --fingers 1
                                                          that for one finger, in FOLDER/report-one-finger
@@ -23,6 +26,7 @@ import dataclasses
 import functools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,12 +40,13 @@ from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import load_config
 from retrieval.model.encode import default_device, one_thread
+from retrieval.model.references import fit_references
 from retrieval.model.stored import HALVES_OF
 from retrieval.search import defaults
 from retrieval.training import distil
-from retrieval.training.batches import FrozenFeatures
+from retrieval.training.batches import FrozenFeatures, recorded_features
 from retrieval.training.features import Features, by_image, encode_recording
-from retrieval.training.judgement import with_verdicts
+from retrieval.training.judgement import asked_touches, with_verdicts
 from retrieval.training.train import labelled_pairs
 
 # Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
@@ -51,8 +56,8 @@ RIG, TOUCH_RIG = (Path(__file__).with_name(name) for name in ("shipped_rig.toml"
 PRESET = "relief"
 VALIDATION = 100
 """Objects that choose the checkpoint and calibrate it."""
-VERDICT_GRASPS = 4
-"""Of each object on which the posterior and the gel check are fitted."""
+VERDICT_GRASPS, REFERENCE_GRASPS = 4, 8
+"""Of each object on which the posterior and the gel check are fitted, and what references are worth."""
 FOREIGN = 8000
 """Pictures that are no gels, from which its check of touches learns: more than a training's own."""
 DISTIL_STEPS = 4000
@@ -79,19 +84,27 @@ def main(argv: list[str] | None = None) -> int:
     pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
     verdicts = jobs.add_parser("verdicts", help="fit its posterior and its gel check again, and nothing else of it")
     verdicts.add_argument("folder", type=Path)
+    worth = jobs.add_parser("references", help="fit what reference touches are worth, and nothing else of it")
+    worth.add_argument("folder", type=Path)
     score = jobs.add_parser("score", help="judge it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, pruner, score):
+    for job in (make, pruner, worth, score):
         job.add_argument(
             "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
         )
-    for job in (make, verdicts, score):
+    for job in (make, verdicts, worth, score):
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    run = {"make": make_shipped, "distil": distil_shipped, "verdicts": judge_shipped, "score": score_shipped}
+    run = {
+        "make": make_shipped,
+        "distil": distil_shipped,
+        "verdicts": judge_shipped,
+        "references": tell_shipped,
+        "score": score_shipped,
+    }
     return run[arguments.job](arguments)
 
 
@@ -165,20 +178,49 @@ def judge_shipped(arguments: argparse.Namespace) -> int:
     """All weights stay; of the recording that `make` would collect only the objects that are looked at are made."""
     shipped = load_checkpoint(defaults.shipped_model())
     assert shipped.split is not None
-    recording = arguments.folder / "verdicts"
     names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
+    grasps = collect_of(arguments.folder / "verdicts", names, VERDICT_GRASPS, arguments.jobs)
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
+    return 0
+
+
+def tell_shipped(arguments: argparse.Namespace) -> int:
+    """All weights and the posterior stay."""
+    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
+    assert shipped.split is not None
+    names = shipped.split.validation
+    grasps = collect_of(arguments.folder / "references", names, REFERENCE_GRASPS, arguments.jobs)
+    if arguments.fingers == 1:
+        grasps = [each_finger(grasp)[0] for grasp in grasps]
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    device = default_device()
+    with FrozenFeatures(shipped.config, device, by_image(grasps, features, device)) as source:
+        found = recorded_features(shipped.matcher, source, grasps, what="references", quiet=False)
+    asked = asked_touches(shipped.matcher, grasps, *found)
+    assert asked is not None
+    made = same_codes(dataclasses.replace(shipped, references=fit_references(asked)), shipped)
+    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
+    return 0
+
+
+def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:
+    """Of the world that `make` collects, these objects."""
     robot.collect.collect(
         functools.partial(robot.rig.load_rig, str(RIG), seed=SEED_TRAINED),
         recording,
         objects=names,
         seed=SEED_TRAINED,
-        settings=robot.collect.CollectSettings(grasps=VERDICT_GRASPS),
-        jobs=arguments.jobs,
+        settings=robot.collect.CollectSettings(grasps=grasps),
+        jobs=jobs,
     )
-    grasps = load_grasps(recording)
-    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
-    return 0
+    return load_grasps(recording)
+
+
+def same_codes(made: Checkpoint, before: Checkpoint) -> Checkpoint:
+    """A checkpoint with the towers and the head of the one before: an index of that one keeps its halves."""
+    halves_of = [*before.provenance.get(HALVES_OF, []), before.digest]
+    return dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
 
 
 def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
@@ -203,10 +245,7 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     training = dataclasses.replace(shipped.config.training, **paths)
     pairs = labelled_pairs(dataclasses.replace(shipped.config, training=training))
     train = train.joined(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
-    made = taught(shipped, train, validation, arguments.steps)
-    # An index of the one before is given new embeddings from its halves.
-    halves_of = [*shipped.provenance.get(HALVES_OF, []), shipped.digest]
-    made = dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
+    made = same_codes(taught(shipped, train, validation, arguments.steps), shipped)
     store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
