@@ -136,11 +136,13 @@ def fit_references(*parts: FeltTouches, seed: int = 0) -> ReferenceWorth | None:
 
     parts: as `retrieval.model.posterior.fit_posterior` takes them. References are of an object's first half of touches,
     of many touches of the first quarter, at most `MOST_REFERENCES`; the last half asks. Where there are enough, so, no
-    touch is asked beside its neighbour.
+    touch is asked beside its neighbour. All is asked once more of one reference of each object, so that what is fitted
+    holds between: fitted to three alone, one is believed too much.
     """
-    asked = [found for part in parts if part.codes.shape[1] and (found := _asked(part)) is not None]
-    if not asked:
+    many = [found for part in parts if part.codes.shape[1] and (found := _asked(part, MOST_REFERENCES)) is not None]
+    if not many:
         return None
+    asked = [*many, *(found for part in parts if part.codes.shape[1] and (found := _asked(part, 1)) is not None)]
     seen = [part for part in asked if part.with_photos]
     weight = _weight(seen, seed) if seen else None
     beside = None
@@ -151,18 +153,19 @@ def fit_references(*parts: FeltTouches, seed: int = 0) -> ReferenceWorth | None:
         fit_posterior(*(part.alone for part in asked), seed=seed),
         weight,
         beside,
-        sum(len(part.alone.photo_owner) for part in asked),
-        sum(len(part.alone.touch_owner) for part in asked),
+        sum(len(part.alone.photo_owner) for part in many),
+        sum(len(part.alone.touch_owner) for part in many),
     )
 
 
-def _asked(part: FeltTouches) -> _Asked | None:
+def _asked(part: FeltTouches, most: int) -> _Asked | None:
+    """With at most so many references of each object."""
     judged = part.judged
     rows = [np.flatnonzero(judged.touch_owner == name) for name in np.unique(judged.touch_owner)]
     rows = [mine for mine in rows if len(mine) > 1]
     if len(rows) < LEAST_OBJECTS:
         return None
-    shown = [_spread(mine[: max(len(mine) // 4, min(MOST_REFERENCES, len(mine) // 2))]) for mine in rows]
+    shown = [_spread(mine[: max(len(mine) // 4, min(MOST_REFERENCES, len(mine) // 2))], most) for mine in rows]
     asking = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
     owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
     cosines = part.codes[asking] @ part.codes[np.concatenate(shown)].T
@@ -176,9 +179,9 @@ def _asked(part: FeltTouches) -> _Asked | None:
     )
 
 
-def _spread(rows: Numbers) -> Numbers:
-    """At most `MOST_REFERENCES` of the rows, evenly spaced."""
-    places = np.linspace(0, len(rows) - 1, min(MOST_REFERENCES, len(rows)))
+def _spread(rows: Numbers, most: int) -> Numbers:
+    """At most so many of the rows, evenly spaced."""
+    places = np.linspace(0, len(rows) - 1, min(most, len(rows)))
     return np.asarray(rows[places.round().astype(np.int64)])
 
 
