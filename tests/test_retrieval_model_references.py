@@ -89,3 +89,18 @@ def test_too_few_objects_or_touches_or_numbers_teach_nothing():
     assert fit_references(felt(touches=1)) is None
     given = felt()
     assert fit_references(dataclasses.replace(given, codes=given.codes[:, :0])) is None
+
+
+@pytest.mark.parametrize("references", [1, 3])
+def test_one_reference_is_believed_no_more_and_three_no_less_than_they_tell(references):
+    """On other objects: how sure the best is said to be, and how often it is right."""
+    worth = fit_references(felt(objects=80, touches=8, noise=0.2, photos=False))
+    given = felt(objects=80, touches=8, noise=0.2, photos=False, seed=1)
+    codes = given.codes.reshape(80, 8, -1)
+    shown, asking = codes[:, :references].reshape(80 * references, -1), codes[:, 4:].reshape(320, -1)
+    near = nearness(asking @ shown.T, np.arange(80) * references)
+    ratios = np.array([worth.alone.log_ratio(row, 1) for row in near])
+    shares = np.exp(ratios - ratios.max(1, keepdims=True))
+    told = (shares.max(1) / shares.sum(1)).mean()
+    right = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
+    assert told == pytest.approx(right, abs=0.1)
