@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search import defaults
 from tests import shipped
 
 
@@ -14,3 +16,13 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_objects_it_never_saw(tmp_
     measures = json.loads((tmp_path / "report" / "results.json").read_text())["methods"]["late_fusion"]["measures"]
     assert measures["guesses_k5"]["objects"] == 7
     assert measures["guesses_k5"]["value"][0] > 0.4  # chance 0.2
+
+
+@pytest.mark.parametrize("fingers", defaults.SHIPPED)
+def test_the_shipped_checkpoints_know_what_a_touch_is_worth_beside_and_without_a_photo(fingers):
+    made = load_checkpoint(defaults.shipped_model(fingers))
+    references = made.references
+    assert references.objects == len(made.split.validation) == 100
+    apart, equal = references.alone.log_ratio([-0.2, 0.9], 1)
+    assert apart < 0 < equal  # a touch that is nothing like it speaks against the object
+    assert references.weight * references.beside.slope > 1
