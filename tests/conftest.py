@@ -94,6 +94,24 @@ def own(catalogue: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
+def touches(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Path, ...]]]:
+    """Three touches of each of the catalogue's objects, by object."""
+    return synthetic.write_queries(tmp_path_factory.mktemp("touches"), synthetic.make_objects(8, seed=9), 3)
+
+
+@pytest.fixture
+def touched(own: Path, touches: dict[str, list[tuple[Path, ...]]]) -> Path:
+    """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
+    names = sorted(touches)[:4]
+    for name in names:
+        for number, files in enumerate(touches[name][:2]):
+            synthetic.put_touch(own, name, number, files)
+    for photo in (own / names[2]).glob("*.jpg"):
+        photo.unlink()
+    return own
+
+
+@pytest.fixture(scope="session")
 def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
     """The gel images (a, b) of one grasp of the catalogue's first object."""
     objects = synthetic.make_objects(1, seed=9)

@@ -7,6 +7,7 @@ width, 3), `px` is (width, height). Everything is a function of its seeds.
 """
 
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -455,6 +456,13 @@ def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_obj
             photo = draw_photo(obj, _CATALOGUE + 1000 * seed + number)
             (Path(folder) / obj.object_id / f"{number + 1}.jpg").write_bytes(_jpeg(photo))
     return Path(folder)
+
+
+def put_touch(catalogue: Path, object_id: str, number: int, files: Sequence[Path]) -> None:
+    """Lay the gel images of a touch beside an object's photos."""
+    (catalogue / object_id).mkdir(exist_ok=True)
+    for finger, path in zip("ab", files, strict=True):
+        shutil.copy(path, catalogue / object_id / f"touch_{number}_{finger}.png")
 
 
 def write_queries(

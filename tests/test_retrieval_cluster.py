@@ -102,12 +102,10 @@ def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
     assert held.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
 
 
-def test_reference_touches_answer_over_ray_as_in_the_folder(ray, own, tmp_path):
-    touches = referenced.write_touches(tmp_path / "touches")
-    catalogue = referenced.put_touches(own, touches)
+def test_reference_touches_answer_over_ray_as_in_the_folder(ray, touched, touches, tmp_path):
     model = referenced.a_model(tmp_path / "felt.safetensors")
-    build_index(catalogue, model, tmp_path / "index", quiet=True)
-    build_cluster(catalogue, model, tmp_path / "cluster", 2, quiet=True)
+    build_index(touched, model, tmp_path / "index", quiet=True)
+    build_cluster(touched, model, tmp_path / "cluster", 2, quiet=True)
     with (
         Searcher.open(tmp_path / "cluster", shards=deployments(ray, wait_s=120.0).open) as ours,
         Searcher.open(tmp_path / "index") as theirs,

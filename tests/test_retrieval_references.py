@@ -20,24 +20,12 @@ from retrieval.search.searcher import Searcher
 from retrieval.search.shard import FolderShard
 from tests import synthetic
 from tests.documents import ROOT, text_of
-from tests.referenced import MEANING, NAMES, WORTH, a_model, put, put_touches, write_touches
+from tests.referenced import MEANING, NAMES, WORTH, a_model
 
 
 @pytest.fixture
 def felt_model(tmp_path):
     return a_model(tmp_path / "felt.safetensors")
-
-
-@pytest.fixture(scope="module")
-def touches(tmp_path_factory):
-    """Three touches of each of the catalogue's objects, by object."""
-    return write_touches(tmp_path_factory.mktemp("touches"))
-
-
-@pytest.fixture
-def touched(own, touches):
-    """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
-    return put_touches(own, touches)
 
 
 def answered(catalogue, model, index, files, **asked):
@@ -186,7 +174,7 @@ def test_only_new_touches_are_encoded_again(touched, felt_model, tmp_path, touch
     }
     again = build_index(touched, felt_model, index, quiet=True)
     assert (again.written, again.references["encoded"]) == (False, 0)
-    put(touched, NAMES[5], 0, touches[NAMES[5]][0])
+    synthetic.put_touch(touched, NAMES[5], 0, touches[NAMES[5]][0])
     more = build_index(touched, felt_model, index, quiet=True)
     assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
 
@@ -194,7 +182,7 @@ def test_only_new_touches_are_encoded_again(touched, felt_model, tmp_path, touch
 def test_without_the_touches_the_index_is_what_it_was_before_them(own, felt_model, tmp_path, touches):
     index = tmp_path / "index"
     before = answered(own, felt_model, index, touches[NAMES[0]][2])
-    put(own, NAMES[0], 0, touches[NAMES[0]][0])
+    synthetic.put_touch(own, NAMES[0], 0, touches[NAMES[0]][0])
     assert answered(own, felt_model, index, touches[NAMES[0]][2]).results != before.results
     (own / NAMES[0] / "touch_0_a.png").unlink()
     (own / NAMES[0] / "touch_0_b.png").unlink()
@@ -233,7 +221,7 @@ def test_the_catalogues_own_touches_tell_what_they_are_worth_where_the_model_doe
     catalogue = synthetic.write_catalogue(tmp_path / "catalog", objects, 1)
     for name, own in synthetic.write_queries(tmp_path / "felt", objects, 2).items():
         for number, files in enumerate(own):
-            put(catalogue, name, number, files)
+            synthetic.put_touch(catalogue, name, number, files)
     report = build_index(catalogue, model, tmp_path / "index", quiet=True)
     assert report.references["by"] == "the catalogue's own touches"
     told = IndexStore(tmp_path / "index").open().manifest.about["reference_worth"]["worth"]

@@ -9,18 +9,8 @@ from retrieval.data.dataset import load_grasps
 from retrieval.search.build import build_index
 from robot.recording.folder import RecordingWriter
 from tests.browser import address, ask, chromium, page, serious
-from tests.referenced import NAMES, a_model, put_touches, write_touches
+from tests.referenced import NAMES, a_model
 from tests.serving import problem, service
-
-
-@pytest.fixture(scope="module")
-def touches(tmp_path_factory):
-    return write_touches(tmp_path_factory.mktemp("touches"))
-
-
-@pytest.fixture
-def touched(own, touches):
-    return put_touches(own, touches)
 
 
 @pytest.fixture

@@ -139,10 +139,13 @@ def fit_references(*parts: FeltTouches, seed: int = 0) -> ReferenceWorth | None:
     touch is asked beside its neighbour. All is asked once more of one reference of each object, so that what is fitted
     holds between: fitted to three alone, one is believed too much.
     """
-    many = [found for part in parts if part.codes.shape[1] and (found := _asked(part, MOST_REFERENCES)) is not None]
+    coded = [part for part in parts if part.codes.shape[1]]
+    many, one = (
+        [found for part in coded if (found := _asked(part, most)) is not None] for most in (MOST_REFERENCES, 1)
+    )
     if not many:
         return None
-    asked = [*many, *(found for part in parts if part.codes.shape[1] and (found := _asked(part, 1)) is not None)]
+    asked = [*many, *one]
     seen = [part for part in asked if part.with_photos]
     weight = _weight(seen, seed) if seen else None
     beside = None

@@ -1,6 +1,7 @@
 """Reference touches of an opened index: what they say of its objects, and which of them is nearest."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -49,7 +50,7 @@ class References:
         order = np.flatnonzero(numbers >= 0)  # an object whose photos are all broken has no number
         order = order[np.argsort(numbers[order], kind="stable")]
         self._touches = [touches[row].paths for row in order]
-        self._images = {path: (one, place) for one in touches for place, path in enumerate(one.paths)}
+        self._all = touches
         self._codes: Floats = touch_codes(halves[order], hidden)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
         self._hidden, self._alone = hidden, np.zeros(objects.count, np.bool_)
@@ -63,6 +64,11 @@ class References:
         one, place = self._images[path]
         told = {"object_id": one.object_id, "digest": one.digests[place], "metadata": {}, "touch": True}
         return {"id": path, "path": path, **told}
+
+    @cached_property
+    def _images(self) -> dict[str, tuple[_Touch, int]]:
+        """Touch and finger of each gel image; a query needs none of it."""
+        return {path: (one, place) for one in self._all for place, path in enumerate(one.paths)}
 
     def near(self, halves: Floats) -> Near:
         """C (count,) of the grasps with these halves (G, half) with every object; NaN where it has no reference."""

@@ -28,42 +28,27 @@ from tests.benchmarks.scale import Crowd, anonymous_mb, collected, crowd_of, on_
 ASKED = 40
 
 
-class Peak:
-    """The most that this process held beside mapped files, above what it held before."""
-
-    def __init__(self) -> None:
-        self._before, self._most = anonymous_mb(), 0.0
-
-    @property
-    def mb(self) -> float:
-        return self._most
-
-    @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Look ten times a second."""
-        done = threading.Event()
-
-        def look() -> None:
-            while not done.wait(0.1):
-                self._most = max(self._most, anonymous_mb() - self._before)
-
-        thread = threading.Thread(target=look)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
-
-
 @contextmanager
 def timed(what: str) -> Iterator[None]:
-    """Print seconds and memory of a part."""
-    peak, wall, cpu = Peak(), time.perf_counter(), time.process_time()
-    with peak.watched():
+    """Print seconds of a part, and the most that this process held meanwhile beside mapped files, above what it held
+    before."""
+    before, most, done = anonymous_mb(), 0.0, threading.Event()
+
+    def look() -> None:
+        nonlocal most
+        while not done.wait(0.1):
+            most = max(most, anonymous_mb() - before)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    wall, cpu = time.perf_counter(), time.process_time()
+    try:
         yield
+    finally:
+        done.set()
+        thread.join()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    print(f"{what}: {duration(wall)}, CPU {duration(cpu)}, at most {peak.mb:,.0f} MB of memory", flush=True)
+    print(f"{what}: {duration(wall)}, CPU {duration(cpu)}, at most {most:,.0f} MB of memory", flush=True)
 
 
 def bare(crowd: Crowd, photos: int) -> Iterator[Block]:
