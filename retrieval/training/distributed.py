@@ -202,16 +202,12 @@ class _Normalise(torch.autograd.Function):
             _, along, total = torch.ops.aten.native_batch_norm_backward(
                 own, seen, None, None, None, mean, scale, True, ctx.eps, [False, True, True]
             )
-        shift, slope = _sum(torch.stack([total, along])) / count
+        sums = torch.stack([total, along])
+        dist.all_reduce(sums)
+        shift, slope = sums / count
         by = (weight * scale)[:, None, None]
         normal = functional.batch_norm(seen, mean, variance, eps=ctx.eps)
         moved = torch.zeros_like(gradient)
         flat = torch.addcmul(-by * shift[:, None, None], normal, -by * slope[:, None, None])
         torch.addcmul(flat, own, by, out=moved[: ctx.rows])
         return moved, along, total, None, None, None, None, None
-
-
-def _sum(values: Tensor) -> Tensor:
-    """Over all ranks."""
-    dist.all_reduce(values)
-    return values
