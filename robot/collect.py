@@ -32,6 +32,7 @@ from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.rig import Rig
+from robot.storage import decoded
 from robot.workers import Jobs, Work
 
 RigMaker = Callable[[], Rig]
@@ -324,7 +325,7 @@ class RecordedTouches(Mapping[str, GraspFrames]):
     def _decoded(self, column: str) -> npt.NDArray[np.uint8] | None:
         if column not in self._images:
             return None
-        pixels = cv2.imdecode(np.frombuffer(self._images[column], np.uint8), cv2.IMREAD_COLOR)
+        pixels = decoded(self._images[column])
         assert pixels is not None, "it was encoded by robot.grasping.attempt"
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
 

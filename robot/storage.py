@@ -105,6 +105,17 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     raise RecordingError(f"{column} must be a PNG or JPEG file; its first bytes are {data[:4]!r}")
 
 
+def decoded(data: bytes, way: int | None = None) -> npt.NDArray[Any] | None:
+    """The pixels of a picture file's content, colours blue first; None for what is no picture. way: as cv2.imdecode
+    takes it, colours with 8 bits each where it is left out."""
+    import cv2
+
+    pixels: npt.NDArray[Any] | None = None
+    with contextlib.suppress(cv2.error):  # of no bytes at all, and of a header that claims too many pixels
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if way is None else way)
+    return pixels
+
+
 def read_regular(path: str | Path) -> bytes:
     """The bytes of a regular file. Raises OSError, whose `strerror` says what stands there instead: a pipe would block,
     a device may be read for ever."""

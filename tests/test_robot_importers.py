@@ -253,6 +253,11 @@ def test_of_a_hostile_source_not_every_reason_is_kept(tmp_path):
     assert recording.info["skipped"]["another reason"] == 980
 
 
+def test_a_path_longer_than_a_disk_takes_costs_its_own_grasp(tmp_path):
+    recording = run([item(0), item(1, photo=tmp_path / ("a" * 5000))], tmp_path / "out")
+    assert recording.info["skipped"] == {"its photo is missing": 1}
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_a_picture_that_is_cut_off_is_not_imported(tmp_path, suffix):
     cut = encoded(suffix, 1)[:-9]
@@ -323,6 +328,7 @@ def test_a_published_split_is_kept_and_one_that_tears_objects_apart_is_told(tmp_
 def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
     assert name_of("mug", "01") == "mug-01"
     strange = [name_of("my mug", "1"), name_of("my/mug", "1"), name_of("..", "1"), name_of("é" * 300), name_of("", "")]
+    strange += [name_of("caf\udce9"), name_of("caf\ud800")]  # a file's name that is no UTF-8; what JSON may escape
     assert len(set(strange)) == len(strange)
     assert all(each[0].isalnum() and len(each) <= 128 for each in strange)
 

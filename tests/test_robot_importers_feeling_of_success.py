@@ -76,6 +76,19 @@ def test_a_grasp_that_lacks_a_picture_or_a_name_is_skipped(source, data, tmp_pat
     }
 
 
+def test_what_says_neither_yes_nor_no_is_not_taken_for_a_yes(source, data, tmp_path):
+    for name, value in (("i1", "False"), ("i3", np.nan), ("i4", np.array([1, 0]))):
+        data[name].attrs["is_gripping"] = value
+    data.file.close()
+    assert changed(source, tmp_path) == {"its object_name or is_gripping is missing": 3}
+
+
+def test_a_number_longer_than_python_reads_is_a_name_like_others(source, data, tmp_path):
+    data.create_group("i" + "9" * 5000)
+    data.file.close()
+    assert changed(source, tmp_path) == {"its object_name or is_gripping is missing": 1}
+
+
 @pytest.mark.parametrize(
     "wrong", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 4), np.uint8), 3]
 )

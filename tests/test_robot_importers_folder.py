@@ -1,6 +1,7 @@
 """Pictures of one's own, by patterns and by files of pairs; what holds of every importer is in test_robot_importers."""
 
 import json
+import os
 
 import pytest
 from hypothesis import given
@@ -87,6 +88,38 @@ def test_of_two_touches_with_the_same_words_the_first_is_taken_and_the_other_tol
     assert recording.info["skipped"] == {"another touch has the same words in its path": 1}
 
 
+def test_objects_on_another_disk_are_found_through_links_and_no_link_is_followed_in_a_circle(source, tmp_path):
+    picture(tmp_path / "disk/cup/touch_1.png", 5)
+    picture(tmp_path / "disk/cup/photo_1.jpg", 6)
+    (tmp_path / "disk/back").symlink_to(tmp_path / "disk")
+    for name, target in (("cup", tmp_path / "disk/cup"), ("again", source), ("same", source / "mug")):
+        (source / name).symlink_to(target)
+    recording = import_folder(source, tmp_path / "out")
+    assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can", "cup"}
+
+
+def test_a_folder_that_cannot_be_listed_is_told_and_no_object_is_missing_in_silence(source, tmp_path, monkeypatch):
+    scandir = os.scandir
+
+    def refused(folder):
+        if os.fspath(folder).endswith("tin can"):
+            raise PermissionError(13, "Permission denied", folder)
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", refused)
+    with pytest.raises(ImporterError, match="tin can cannot be listed: Permission denied"):
+        import_folder(source, tmp_path / "out")
+
+
+def test_a_folder_whose_name_is_no_utf8_costs_its_own_grasps(source, tmp_path):
+    strange = os.fsdecode(b"caf\xe9")
+    picture(source / strange / "touch_1.png", 5)
+    picture(source / strange / "photo_1.jpg", 6)
+    recording = import_folder(source, tmp_path / "out")
+    assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can"}
+    assert list(recording.info["skipped"].values()) == [1]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -97,6 +130,7 @@ def test_of_two_touches_with_the_same_words_the_first_is_taken_and_the_other_tol
         ({"touch": "{object}/{1}"}, "must be letters"),
         ({"touch": "{object}/*", "photo": "{object}/*"}, "fits both patterns"),
         ({"pairs": "gone.csv"}, "is not there"),
+        ({"pairs": "g" * 5000}, "is not there"),
     ],
 )
 def test_wrong_patterns_are_refused_in_a_sentence(source, tmp_path, options, said):
@@ -165,6 +199,16 @@ def test_a_line_that_is_no_json_costs_its_own_grasp(source, tmp_path):
     recording = import_folder(source, tmp_path / "out", pairs=name)
     assert told(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
     assert recording.info["skipped"] == {"its line is not a JSON object": 2}
+
+
+def test_what_json_alone_can_say_costs_its_own_grasp(source, tmp_path):
+    """A number beyond every float, half of a character, a name too long for a disk."""
+    wrong = [row(2, force_n=10**400), row(2, object="\ud800"), row(2, photo="a" * 5000)]
+    name = write_pairs(source, "jsonl", [row(1), *wrong, row(10)])
+    recording = import_folder(source, tmp_path / "out", pairs=name)
+    assert told(recording) == [("mug-1", "mug"), ("mug-5", "mug")]
+    assert recording.info["skipped"]["force_n, opening_mm, time_s must be numbers"] == 1
+    assert recording.info["skipped"]["its photo is missing"] == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"object,photo\nmug,x.jpg\n", b"\xff\xfe\x00", b"object\x00,photo", b"[]\n"])

@@ -3,6 +3,7 @@
 import json
 import sys
 import tracemalloc
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -14,12 +15,16 @@ from robot.importers.episodes import Episode
 from robot.importers.lerobot import import_lerobot
 from robot.recording.folder import read_recording
 from tests import synthetic
-from tests.miniatures import pixels
+from tests.miniatures import encoded, pixels
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from tests.miniatures import lerobot
+from tests.miniatures.lerobot import RIGHT
 
 pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
 
@@ -114,6 +119,8 @@ def test_a_recording_comes_back_from_its_export(tmp_path, monkeypatch):
         ({"codebase_version": "v2.1"}, "must be of LeRobot's version 3, and is of v2.1; convert it with lerobot"),
         ({"video_path": "/etc/{video_key:999999999}"}, "video_path of info.json must be videos/"),
         ({"fps": None}, "must say fps"),
+        ({"fps": 10**400}, "must say fps"),
+        ({"fps": 0}, "fps of info.json must be above 0 and finite, got 0"),
         ({"features": []}, "of these: none"),
         ({"features": {"../touch": {"dtype": "video"}, "photo": {"dtype": "video"}}}, "no camera with a path"),
     ],
@@ -129,6 +136,54 @@ def test_a_video_that_is_missing_costs_its_episodes_and_is_told(source, tmp_path
     (source / f"videos/{lerobot.LEFT}/chunk-000/file-000.mp4").unlink()
     with pytest.raises(ImporterError, match="no grasp could be imported: skipped 4: its video is missing"):
         import_lerobot(source, tmp_path / "out")
+
+
+def rewrite(path, change):
+    """Every row of a Parquet file as `change` makes it of its number and itself."""
+    rows = pq.read_table(path).to_pylist()
+    pq.write_table(pa.Table.from_pylist([change(number, row) for number, row in enumerate(rows)]), path)
+
+
+def of_size(height, width):
+    return lambda number: encoded(".png", number, (height + number % 2, width))
+
+
+def of_absurd_size(number):
+    png = bytearray(encoded(".png", number))
+    png[16:24] = 2 * (10**5).to_bytes(4, "big")
+    png[29:33] = crc32(png[12:29]).to_bytes(4, "big")
+    return bytes(png)
+
+
+@pytest.mark.parametrize(
+    ("picture", "said"), [(of_size(20, 30), "differ in size"), (of_absurd_size, "cannot be decoded")]
+)
+def test_stored_pictures_that_make_no_film_cost_their_episode(source, tmp_path, picture, said):
+    rewrite(
+        source / "data/chunk-000/file-000.parquet",
+        lambda number, row: (
+            row | ({RIGHT: {"bytes": picture(number), "path": None}} if row["episode_index"] == 1 else {})
+        ),
+    )
+    (reason,) = import_lerobot(source, tmp_path / "out").info["skipped"]
+    assert said in reason
+
+
+@pytest.mark.parametrize("start", [float("inf"), -1e30])
+def test_an_episode_that_begins_at_no_time_is_skipped(source, tmp_path, start):
+    key = f"videos/{lerobot.LEFT}/from_timestamp"
+    rewrite(
+        source / "meta/episodes/chunk-000/file-000.parquet",
+        lambda number, row: row | ({key: start} if number == 1 else {}),
+    )
+    assert import_lerobot(source, tmp_path / "out").info["skipped"] == {"its video cannot be decoded": 1}
+
+
+def test_moments_that_are_no_numbers_count_as_unsaid(source, tmp_path):
+    features = json.loads((source / "meta/info.json").read_text())["features"]
+    change(source, features=features | {"moment": {"dtype": "int64"}})
+    rewrite(source / "data/chunk-000/file-000.parquet", lambda number, row: row | {"moment": [1]})
+    assert len(import_lerobot(source, tmp_path / "out").grasps) == lerobot.GRASPS
 
 
 @pytest.mark.parametrize("package", ["pyarrow", "av"])

@@ -1,9 +1,12 @@
 """Open-X-Tactile: what is its own; what holds of every importer stands in test_robot_importers."""
 
 import json
+import re
 import shutil
 import sys
+import zipfile
 from contextlib import suppress
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -168,6 +171,48 @@ def test_ends_of_episodes_that_do_not_rise_within_the_steps_are_refused(tmp_path
     open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
     with pytest.raises(ImporterError, match="episode_ends must rise to at most 7, the number of steps"):
         import_open_x_tactile(tmp_path / "src", tmp_path / "out")
+
+
+def test_names_that_a_store_holds_as_bytes_are_text(tmp_path):
+    (tmp_path / "src").mkdir()
+    more = {"meta/object_id": np.array([b"mug", "n\u00e4gel".encode()]), "meta/outcome": np.array([b"held", b""])}
+    open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
+    recording = import_open_x_tactile(tmp_path / "src", tmp_path / "out")
+    assert [(grasp.object_id, grasp.outcome) for grasp in recording.grasps] == [("mug", "held"), ("nägel", None)]
+
+
+@pytest.mark.parametrize("key", ["force_n", "pose", "grasped"])
+def test_numbers_that_a_store_holds_as_text_are_refused(tmp_path, key):
+    (tmp_path / "src").mkdir()
+    values = np.array([["1"], ["2"]] if key == "pose" else ["1", "2"])
+    open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **{f"meta/{key}": values})
+    with pytest.raises(ImporterError, match=f"meta/{key} has the type <U1"):
+        import_open_x_tactile(tmp_path / "src", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("at", "value"), [(6, 1), (8, 99)])
+def test_a_zip_that_is_locked_or_packed_in_a_way_that_nobody_knows_is_refused(store, tmp_path, at, value):
+    """Byte 6 of a file's header says whether it is encrypted, byte 8 how it is packed."""
+    path = Path(shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store))
+    data = bytearray(path.read_bytes())
+    for head, shift in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
+        for found in re.finditer(re.escape(head), bytes(data)):
+            data[found.start() + at + shift] = value
+    path.write_bytes(data)
+    with pytest.raises(ImporterError, match=r"cannot be (read|opened)"):
+        import_open_x_tactile(path.parent, tmp_path / "out")
+
+
+def test_a_zip_whose_packed_bytes_are_damaged_is_refused(store, tmp_path):
+    path = Path(shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store))
+    with zipfile.ZipFile(path) as archive:
+        (info,) = [each for each in archive.infolist() if each.filename == "meta/episode_ends/.zarray"]
+    data = bytearray(path.read_bytes())
+    start = info.header_offset + 30 + len(info.filename)
+    data[start : start + info.compress_size] = b"\xff" * info.compress_size
+    path.write_bytes(data)
+    with pytest.raises(ImporterError, match="cannot be read"):
+        import_open_x_tactile(path.parent, tmp_path / "out")
 
 
 def test_a_tar_is_to_be_unpacked_and_zarr_to_be_installed(source, tmp_path, monkeypatch):

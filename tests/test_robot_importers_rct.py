@@ -56,9 +56,11 @@ def test_pictures_that_lie_elsewhere_are_found_where_the_options_say(source, tmp
     assert len(recording.grasps) == rct.GRASPS + 1  # the row of a position without a folder has another's picture
 
 
-@pytest.mark.parametrize("pattern", ["tactile/{material}/{z_frame}", "/etc/{sensor}", "../{sensor}", ""])
+@pytest.mark.parametrize("pattern", ["tactile/{material}/{z_frame}", "/etc/{sensor}", "../{sensor}", "", "a**b", "."])
 def test_a_pattern_of_other_words_or_out_of_the_folder_is_refused(source, tmp_path, pattern):
-    with pytest.raises(ImporterError, match=r"braces of touch may hold|touch must be a path below"):
+    with pytest.raises(
+        ImporterError, match=r"braces of touch may hold|touch must be a path below|a pattern must be a path"
+    ):
         import_rct(source, tmp_path / "out", touch=pattern)
 
 

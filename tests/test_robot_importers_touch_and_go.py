@@ -40,6 +40,11 @@ def test_frames_of_a_run_are_evenly_spread_and_all_of_them_are_taken_for_0(sourc
     assert frames(import_touch_and_go(source, tmp_path / "all", frames=0)) == [2, 3, 4, 5, 6, 7]
 
 
+def test_a_negative_number_of_frames_is_refused(source, tmp_path):
+    with pytest.raises(ImporterError, match="frames must be 1 or more of each run, or 0 for all, got -1"):
+        import_touch_and_go(source, tmp_path / "out", frames=-1)
+
+
 def test_photo_and_touch_are_of_one_moment_and_the_untouched_gel_is_a_frame_that_no_line_names(source, tmp_path):
     recording = import_touch_and_go(source, tmp_path / "out")
     grasp = next(grasp for grasp in recording.grasps if grasp.grasp_id == f"{SECOND}-0000000011")

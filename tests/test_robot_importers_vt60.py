@@ -71,6 +71,13 @@ def test_the_touch_that_is_the_untouched_frame_itself_is_skipped(source, tmp_pat
     assert "skipped 1: its touch is the no-contact frame itself, such as 03_ball-01-4" in recording.notes
 
 
+def test_a_touch_that_is_a_link_to_nowhere_costs_its_own_grasp(source, tmp_path):
+    touch = next((source / "touch/03_ball").rglob("touch_*.jpg"))
+    touch.unlink()
+    touch.symlink_to("nowhere")
+    assert import_vt60(source, tmp_path / "out").info["skipped"]["its touch a is missing"] == 1
+
+
 def test_photos_without_touches_are_told(recording):
     assert "skipped 1: photos of an object that was not touched, such as 03_ball/07" in recording.notes
 

@@ -6,7 +6,6 @@ else a slow film would be a sensor whose pictures are too old. Nothing runs betw
 further each time it is read, however long that takes.
 """
 
-import contextlib
 import math
 import time
 from abc import abstractmethod
@@ -26,7 +25,7 @@ from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording.folder import INFO_FILE, read_recording
 from robot.settings import build
-from robot.storage import object_of
+from robot.storage import decoded, object_of
 
 _KEPT = 8
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
@@ -261,7 +260,7 @@ def _recorded_pairs(folder: Path) -> list[_Pair]:
 
 
 def _named_pairs(folder: Path) -> list[_Pair]:
-    files = sorted(folder.iterdir())
+    files = dict.fromkeys(sorted(folder.iterdir()))
     colours = [each for each in files if each.suffix.lower() in _SUFFIXES and not each.name.endswith(DEPTH_SUFFIX)]
     depths = [each.with_name(each.stem + DEPTH_SUFFIX) for each in colours]
     return [_Pair(colour, depth if depth in files else None) for colour, depth in zip(colours, depths, strict=True)]
@@ -286,9 +285,7 @@ def _depth_m(path: Path) -> npt.NDArray[np.float32]:
 def _pixels(path: Path, way: int) -> npt.NDArray[Any]:
     if not path.is_file():  # to read from a pipe, say, might never end
         raise DeviceError(f"{path} must be a picture, but is no file")
-    pixels = None
-    with contextlib.suppress(cv2.error):
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), way)
+    pixels = decoded(path.read_bytes(), way)
     if pixels is None:
         raise DeviceError(f"{path} must be a picture, but cannot be decoded")
-    return np.asarray(pixels)
+    return pixels

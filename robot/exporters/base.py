@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from robot.errors import ImporterError, RecordingError
 from robot.importers.base import Progress, whole_picture
 from robot.recording.folder import RecordedGrasp, Recording
-from robot.storage import PART, storage_errors, sync_folder
+from robot.storage import PART, decoded, storage_errors, sync_folder
 
 Picture = NDArray[np.uint8]
 """(H, W, 3), red first."""
@@ -185,8 +185,8 @@ class Steps:
 def read_picture(path: Path) -> Picture:
     """A whole PNG or JPEG file as pixels. Raises RecordingError."""
     try:
-        image = cv2.imdecode(np.frombuffer(whole_picture("picture", path), np.uint8), cv2.IMREAD_COLOR)
-    except (ImporterError, cv2.error):
+        image = decoded(whole_picture("picture", path))
+    except ImporterError:
         image = None
     if image is None:
         raise RecordingError(f"{path} is missing, damaged or cut off; run `retrieve check`, and take its line out")

@@ -171,7 +171,7 @@ def whole_picture(column: str, source: Source) -> bytes:
     """The content of a PNG or JPEG file that is there to its end. Raises ImporterError, which says no file's name."""
     what = column.replace("_", " ")
     made = source() if callable(source) else source
-    if isinstance(made, str | Path) and not Path(made).is_file():
+    if isinstance(made, str | Path) and not os.path.isfile(made):
         raise ImporterError(f"its {what} is missing")
     try:
         data, suffix = file_content(column, made)
@@ -248,8 +248,9 @@ def name_of(*parts: str) -> str:
     joined = "-".join(parts)
     if GRASP_ID.fullmatch(joined):
         return joined
-    plain = re.sub("[^A-Za-z0-9._-]", "-", joined)[:100].lstrip("._-") or "grasp"
-    return f"{plain}-{sha256('/'.join(parts).encode()).hexdigest()[:8]}"
+    plain = re.sub(r"[^A-Za-z0-9._-]", "-", joined)[:100].lstrip("._-") or "grasp"
+    # Names of unknown coding and what JSON escapes may hold what UTF-8 cannot.
+    return f"{plain}-{sha256('/'.join(parts).encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 @dataclass(frozen=True)

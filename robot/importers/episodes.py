@@ -74,6 +74,8 @@ def _most_pressed(steps: Iterator[Step]) -> dict[str, Step]:
     rest = [touch.astype(np.int16) for touch in first[1]]
     best, most = first, 0.0
     for step in steps:
+        if [touch.shape for touch in step[1]] != [still.shape for still in rest]:
+            raise ImporterError("the gel images of its episode differ in size")
         pressed = sum(float(np.abs(touch - still).mean()) for touch, still in zip(step[1], rest, strict=True))
         if pressed > most:
             best, most = _copied(step), pressed

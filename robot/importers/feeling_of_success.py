@@ -21,7 +21,18 @@ from typing import Any
 import numpy.typing as npt
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Progress, Skip, import_items, library, name_of, numbered
+from robot.importers.base import (
+    DataSet,
+    Images,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    library,
+    name_of,
+    natural,
+    numbered,
+)
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -113,7 +124,7 @@ def _groups(h5py: Any, file: Any) -> Iterator[Any]:
     except _BROKEN:
         yield Skip("its file is not HDF5, or is cut off", "")
         return
-    for name in sorted(names, key=lambda name: int(name[1:])):
+    for name in sorted(names, key=natural):
         group = _own(h5py, data, name)
         yield group if isinstance(group, h5py.Group) else Skip("a grasp is no group", "")
 
@@ -133,7 +144,7 @@ def _attributes(group: Any) -> tuple[str | None, bool | None]:
         return None, None
     text = name.decode(errors="replace") if isinstance(name, bytes) else str(name) if name is not None else ""
     try:
-        return text.strip() or None, None if grasped is None else bool(grasped)
+        return text.strip() or None, bool(grasped) if grasped in (0, 1) else None
     except ValueError:
         return None, None
 

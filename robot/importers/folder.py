@@ -8,7 +8,8 @@ pictures, `{sequence}` for grasps of one sitting, any other word in braces for w
 what does not matter; none of them crosses a "/". A pattern need not name the ending. Words that two patterns share
 must agree: with `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch has the photo of its own
 number. Where an object has several photos that agree, its touches are dealt to them in turn. `background`, a pattern
-too, finds the no-contact frames: `rest_{finger}.png` one a finger, `{object}/rest.png` one an object.
+too, finds the no-contact frames: `rest_{finger}.png` one a finger, `{object}/rest.png` one an object. Links to
+folders elsewhere are followed.
 
 `pairs` names a file below the folder instead: CSV with a header, or JSONL, a grasp a line, with `object`, `photo` and
 `touch` (or `touch_a`, `touch_b`), and where they are known `background` (or `touch_a_before`, ...), `sequence`,
@@ -25,7 +26,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from string import ascii_lowercase
-from typing import Any
+from typing import Any, NoReturn
 
 from robot.errors import ImporterError, RecordingError
 from robot.importers.base import DataSet, Images, Item, Progress, Skip, import_items, name_of, natural
@@ -218,12 +219,30 @@ class _Agreeing:
 
 
 def _pictures(src: Path) -> Iterator[str]:
-    """The pictures below a folder, by path from it, hidden ones left out, in the order of their numbers."""
-    for folder, below, files in os.walk(src):
-        below[:] = sorted((name for name in below if not name.startswith(".")), key=natural)
+    """The pictures below a folder, by path from it, hidden ones left out, in the order of their numbers. A link to a
+    folder is followed where it leads out of `src`, and each target once. Raises ImporterError."""
+    root, followed = Path(os.path.realpath(src)), set[Path]()
+
+    def is_walked(path: str) -> bool:
+        if not os.path.islink(path):
+            return True
+        target = Path(os.path.realpath(path))
+        if target in followed or target.is_relative_to(root) or root.is_relative_to(target):
+            return False
+        followed.add(target)
+        return True
+
+    for folder, below, files in os.walk(src, onerror=_refuse, followlinks=True):
+        shown = sorted((name for name in below if not name.startswith(".")), key=natural)
+        below[:] = [name for name in shown if is_walked(os.path.join(folder, name))]
         for name in sorted(files, key=natural):
             if name.lower().endswith(_ENDINGS) and not name.startswith("."):
                 yield (Path(folder) / name).relative_to(src).as_posix()
+
+
+def _refuse(error: OSError) -> NoReturn:
+    """A folder that cannot be listed would be an object that is silently missing."""
+    raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
 
 def _shared(src: Path, path: str) -> Shared:
@@ -238,7 +257,7 @@ class _Listed:
 
     def __init__(self, src: Path, pairs: str) -> None:
         self.src, self._file = src, src / pairs
-        if not self._file.is_file():
+        if not os.path.isfile(self._file):
             raise ImporterError(f"{self._file} must be a CSV or JSONL file of pairs, and is not there")
         first = next((row for row in self._rows() if isinstance(row, dict)), None)
         if first is None or not (self._fingers(first) and {"object_id", "photo"} <= first.keys()):
@@ -312,5 +331,5 @@ def _inside(path: str) -> bool:
 def _numbers(row: Mapping[str, Any]) -> dict[str, float] | None:
     try:
         return {name: float(row[name]) for name in _NUMBERS if row.get(name) not in (None, "")}
-    except ValueError:
+    except (ValueError, OverflowError):
         return None

@@ -14,6 +14,7 @@ Its task counts as its object, and an episode is a sequence, unless the episodes
 """
 
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,14 +23,13 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from robot.errors import ImporterError
 from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of
 from robot.importers.episodes import ENDINGS, Episode, Picture, Step
 from robot.recording.folder import Recording
-from robot.storage import content_of, object_of
+from robot.storage import content_of, decoded, object_of
 
 DATA_SET = DataSet(
     source="LeRobot data set",
@@ -110,8 +110,10 @@ class _Source:
             raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera with a path for a name")
         try:
             self._fps = float(self.info["fps"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ImporterError(f"{src}: info.json must say fps") from error
+        if not 0 < self._fps < math.inf:
+            raise ImporterError(f"{src}: fps of info.json must be above 0 and finite, got {self._fps:g}")
         self._has_moments = isinstance(features, dict) and "moment" in features
         self._films: dict[str, tuple[Path, Any]] = {}
 
@@ -180,6 +182,8 @@ class _Source:
             ]
         except ImporterError:
             return None
+        if not all(isinstance(moment, int) for moment in said):
+            return None
         known = len(set(said)) == len(said) == row["length"] and set(said) <= set(range(len(_MOMENTS)))
         return [_MOMENTS[moment] for moment in said] if known and 1 in said else None
 
@@ -227,7 +231,7 @@ class _Source:
                     if frame.time >= end:
                         return
                     yield frame.to_ndarray(format="rgb24")
-        except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+        except (av.error.FFmpegError, OSError, ValueError, IndexError, OverflowError) as error:
             self._films.pop(key, None)
             raise ImporterError("its video cannot be decoded") from error
 
@@ -249,7 +253,7 @@ class _Source:
             ):
                 for cell in batch.column(0).to_pylist():
                     data = cell.get("bytes") if isinstance(cell, dict) else None
-                    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+                    image = decoded(data) if data else None
                     if image is None:
                         raise ImporterError("a picture of its episode cannot be decoded")
                     yield np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

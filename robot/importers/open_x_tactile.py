@@ -46,6 +46,7 @@ DATA_SET = DataSet(
     ),
 )
 _TACTILE = re.compile(r"data/(?P<side>\w+?)_tactile_data_(?P<group>\w+)")
+_NAMES = ("object_id", "grasp_id", "sequence_id")
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 
 
@@ -114,7 +115,7 @@ class _Task:
         if not 1 <= self.fingers <= 26:
             raise ImporterError(f"{store.path}: a touch must have 1 to 26 areas, got {self.fingers}")
         self._moments = self._known_moments()
-        self._lines = {key: self._line(key) for key in ("object_id", "grasp_id", "sequence_id", *_FIELDS)}
+        self._lines = {key: self._line(key) for key in (*_NAMES, *_FIELDS)}
 
     def _is_image(self, name: str) -> bool:
         found = _TACTILE.fullmatch(name)
@@ -128,11 +129,14 @@ class _Task:
         return moments if known and "during" in moments else None
 
     def _line(self, key: str) -> Any:
-        """An array of meta along episodes; None where there is none."""
+        """An array of meta along episodes, bytes as text; None where there is none. Raises ImporterError."""
         if f"meta/{key}" not in self.store.names():
             return None
-        values = self.store.array(f"meta/{key}", ndim=2 if key == "pose" else 1, kind="UfiSb").all()
-        return values if len(values) == len(self.ends) else None
+        kind = "US" if key == "outcome" else "USiuf" if key in _NAMES else "iufb"
+        values = self.store.array(f"meta/{key}", ndim=2 if key == "pose" else 1, kind=kind).all()
+        if len(values) != len(self.ends):
+            return None
+        return np.char.decode(values, "utf-8", "replace") if values.dtype.kind == "S" else values
 
     def sensors(self) -> list[str]:
         """Names of the sensors, as its arrays say."""

@@ -116,9 +116,13 @@ def _items(src: Path, table: Path, touch: str, photo: str, sensor: str) -> Itera
 
 
 def _find(src: Path, pattern: str, row: dict[str, str]) -> Path | None:
-    """The first file that the pattern names for a row; None where there is none."""
+    """The first file that the pattern names for a row; None where there is none. Raises ImporterError."""
     filled = _PLACE.sub(lambda place: row[place[1]], pattern)
-    return next((path for path in sorted(src.glob(filled)) if path.is_file()), None)
+    try:
+        found = sorted(src.glob(filled))
+    except (ValueError, IndexError) as error:  # of "a**b" and of "."
+        raise ImporterError(f"a pattern must be a path with * in it, got {pattern!r}: {error}") from error
+    return next((path for path in found if path.is_file()), None)
 
 
 def _force(text: str) -> dict[str, float]:

@@ -68,6 +68,8 @@ class _Run:
 
 def import_touch_and_go(src: Path, out: Path, progress: Progress | None = None, *, frames: int = 5) -> Recording:
     """Import the labelled frames below `src`. Raises ImporterError where label.txt names none."""
+    if frames < 0:
+        raise ImporterError(f"frames must be 1 or more of each run, or 0 for all, got {frames}")
     src = Path(src)
     labels = src / "label.txt"
     if not labels.is_file():

@@ -22,7 +22,7 @@ import numpy as np
 from robot.errors import ImporterError
 from robot.importers.base import DataSet, Item, Progress, Published, Skip, folders, import_items, name_of, numbered
 from robot.recording.folder import Recording
-from robot.storage import content_of
+from robot.storage import content_of, decoded
 
 DATA_SET = DataSet(
     source="VisGel",
@@ -135,8 +135,8 @@ class _Pressed:
 def _small(path: Path) -> np.ndarray | None:
     """Grey levels at an eighth of the size; None for what is no picture."""
     try:
-        return cv2.imdecode(np.frombuffer(content_of(path, ImporterError), np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    except (ImporterError, cv2.error):
+        return decoded(content_of(path, ImporterError), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    except ImporterError:
         return None
 
 

@@ -123,7 +123,7 @@ def _items(src: Path, objects: list[_Object], untouched: Path | None) -> Iterato
             if not photos:
                 yield Skip("its object has no photo", name)
                 continue
-            if untouched and filecmp.cmp(touch, untouched, shallow=False):
+            if untouched and touch.is_file() and filecmp.cmp(touch, untouched, shallow=False):
                 yield Skip("its touch is the no-contact frame itself", name)
                 continue
             photo = photos[number % len(photos)]

@@ -124,7 +124,7 @@ class Store:
                 with open(self.path / name, "rb") as file:
                     text = file.read(_MOST_JSON)
             found = json.loads(text)
-        except (OSError, KeyError, ValueError, RecursionError, zipfile.BadZipFile) as error:
+        except Exception as error:  # zipfile lets out what zlib, bz2 and lzma raise
             raise ImporterError(f"{self.path.name}/{name} cannot be read: {error}") from error
         if not isinstance(found, dict):
             raise ImporterError(f"{self.path.name}/{name} must be a JSON object")
