@@ -13,11 +13,16 @@ LEAST = 200
 
 class Faults:
     """In front of the server's application. refuse: every so many-th request; tear: every so many-th upload, of which
-    all but the last half arrives, as if the sender had died. None: none. refused, torn: how many were."""
+    all but the last half arrives, as if the sender had died. None: none. refused, torn: how many were.
+
+    conditions: whether uploads may be made on one ("honoured"), or the server has never heard of it: "unknown" to it,
+    it refuses them as S3 does what it has not; "ignored", it takes them for plain ones. conditional: how many came.
+    """
 
     def __init__(self, application):
         self.application, self.refuse, self.tear = application, None, None
-        self.requests = self.uploads = self.refused = self.torn = 0
+        self.conditions = "honoured"
+        self.requests = self.uploads = self.refused = self.torn = self.conditional = 0
         self._lock = threading.Lock()
 
     def __call__(self, environ, start):
@@ -35,6 +40,14 @@ class Faults:
         if refused:
             start("503 Slow Down", [("Content-Type", "application/xml")])
             return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
+        if environ["REQUEST_METHOD"] == "PUT" and (asked := CONDITIONS & environ.keys()):
+            self.conditional += 1
+            if self.conditions == "unknown":
+                start("501 Not Implemented", [("Content-Type", "application/xml")])
+                return [b"<Error><Code>NotImplemented</Code><Message>A header is not implemented.</Message></Error>"]
+            if self.conditions == "ignored":
+                for name in asked:
+                    del environ[name]
         if torn:
             environ["wsgi.input"], environ["CONTENT_LENGTH"] = io.BytesIO(body[: size // 2]), str(size // 2)
             for name in [name for name in environ if "CHECKSUM" in name or name in ("HTTP_CONTENT_MD5", TRAILER)]:
@@ -43,6 +56,7 @@ class Faults:
 
 
 TRAILER = "HTTP_X_AMZ_TRAILER"
+CONDITIONS = {"HTTP_IF_MATCH", "HTTP_IF_NONE_MATCH"}
 
 
 @contextmanager

@@ -334,6 +334,29 @@ def test_of_two_builds_at_once_the_one_that_comes_second_is_told(build, store, c
         assert opened.query(touch).index["searched"] == 1.0
 
 
+def test_of_two_first_builds_that_both_looked_one_makes_the_cluster_and_the_other_adds_to_it(
+    build, store, catalogue, tmp_path, requests, embedded, monkeypatch
+):
+    """The second switches between the last look of the first and its switch."""
+    mine, theirs = (changed(catalogue, tmp_path / name, times) for name, times in (("mine", 1), ("theirs", 2)))
+
+    def meanwhile(name, path, *_):
+        if name == "pipe_file" and path.endswith("/CLUSTER.json"):
+            requests.rule = None
+            with monkeypatch.context() as elsewhere:
+                elsewhere.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # another machine
+                build(theirs)
+
+    requests.rule = meanwhile
+    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+        build(mine)
+    with Searcher.open(URL) as opened:
+        assert opened.described.photos == 26
+    embedded.clear()
+    report = build(mine)
+    assert (report.generation, report.photos, embedded) == ("cluster-000002", 25, [])
+
+
 # Bad input ------------------------------------------------------------------------------------------------------------
 
 
@@ -401,6 +424,80 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
             assert [match.photo for match in ours.results] == [match.photo for match in theirs.results]
     again = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
     assert (again.written, again.embedded) == (False, 0)
+
+
+@pytest.fixture
+def switches(s3_server, cluster):
+    """Two builds that have both looked at a cluster on S3, one that was there or none: what each would put, and a
+    function that has the first switch, the second doing so between the first one's last look and its request."""
+    s3_server.refuse = s3_server.tear = None
+    s3.put(cluster, "photos/else")
+    manifest = read_cluster(cluster)
+    mine, theirs = (dataclasses.replace(manifest, about={"catalogue": name}) for name in ("mine", "theirs"))
+
+    def switch(url, before):
+        first, second = StoredCluster(url), StoredCluster(url)
+        if before:
+            first.switch(None, manifest)
+        seen, put, left = first.manifest(), first._system.pipe_file, [theirs]
+
+        def meanwhile(path, content, **how):
+            if left:
+                second.switch(seen, left.pop())
+            put(path, content, **how)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(first._system, "pipe_file", meanwhile)
+            first.switch(seen, mine)
+
+    yield switch, mine, theirs
+    s3_server.conditions = "honoured"
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("before", [False, True], ids=["created", "replaced"])
+def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_server):
+    switch, _, theirs = switches
+    url = f"s3://photos/raced-{before}"
+    with pytest.raises(StorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
+        switch(url, before)
+    assert StoredCluster(url).manifest() == cluster_file(theirs)
+    assert s3_server.conditional >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("conditions", ["unknown", "ignored"])
+def test_a_store_without_conditional_writes_is_looked_at_before_the_switch(conditions, switches, s3_server):
+    """Between that look and the switch it cannot be helped: the second to switch stays."""
+    switch, mine, theirs = switches
+    s3_server.conditions = conditions
+    url = f"s3://photos/{conditions}"
+    switch(url, True)
+    stored = StoredCluster(url)
+    assert stored.manifest() == cluster_file(mine)
+    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+        stored.switch(b"an older one", theirs)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_server):
+    _, mine, theirs = switches
+    stored = StoredCluster("s3://photos/torn")
+    stored.switch(None, theirs)
+    seen, put, failures = stored.manifest(), stored._system.pipe_file, ["torn", "not answered"]
+
+    def failing(path, content, **how):
+        torn = failures and failures.pop(0) == "torn"
+        put(path, content[:100] if torn else content, **how)
+        if not torn:
+            raise OSError("the line was cut")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stored._system, "pipe_file", failing)
+        stored.switch(seen, mine)
+    assert (stored.manifest(), failures) == (cluster_file(mine), [])
 
 
 @pytest.mark.slow

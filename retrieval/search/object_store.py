@@ -14,12 +14,13 @@ Both lie in the user's cache and may be deleted at any time: a build takes up wh
 it again.
 """
 
+import errno
 import hashlib
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from indexes.errors import AGAIN, CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
 from indexes.store import cluster as folders
@@ -83,16 +84,7 @@ class StoredCluster:
     def manifest(self) -> bytes | None:
         """What its manifest holds; None without one. Raises StorageError."""
 
-        def whole(path: str) -> bytes | None:
-            try:
-                data: bytes = self._system.cat_file(path, start=0, end=MOST_BYTES + 1)
-            except FileNotFoundError:
-                return None
-            if len(data) > MOST_BYTES:
-                raise ValueError(f"a manifest has at most {MOST_BYTES} bytes")
-            return data
-
-        return self._try(folders.NAME, whole)
+        return self._try(folders.NAME, self._content)
 
     def parsed(self, manifest: bytes | None) -> ClusterManifest:
         """A manifest that was read here. Raises NoIndex where there is none, CorruptIndex and UnsupportedFormat."""
@@ -163,21 +155,34 @@ class StoredCluster:
     def switch(self, before: bytes | None, manifest: ClusterManifest) -> None:
         """Put the manifest in its place: this cluster answers from now on. before: what was there when the build began.
 
-        Raises StorageError, where another build has put its own meanwhile too.
+        Raises StorageError, where another build has put its own meanwhile too: a store with conditional writes refuses
+        even what was put between the last look and this.
         """
         content = cluster_file(manifest)
-        if self.manifest() not in (before, content):
+
+        def put(path: str) -> bool:
+            condition = self._unchanged(path)  # asked first: what is read then is no older than what it stands for
+            there = self._content(path)
+            if there == content:  # by a try that was not answered
+                return True
+            torn = there is not None and content.startswith(there)
+            if there != before and not torn:
+                return False
+            try:
+                self._system.pipe_file(path, content, **condition)
+            except OSError as error:
+                if error.errno != errno.ENOSYS:
+                    raise
+                self._system.pipe_file(path, content)
+            if self._content(path) != content:
+                raise OSError("it was torn on its way")
+            return True
+
+        if not self._try(folders.NAME, put):
             raise StorageError(
                 f"{self.url}: another build put its own cluster there meanwhile; run the same command again, which "
                 "embeds nothing twice"
             )
-
-        def put(path: str) -> None:
-            self._system.pipe_file(path, content)
-            if self._system.cat_file(path) != content:
-                raise OSError("it was torn on its way")
-
-        self._try(folders.NAME, put)
 
     def discard(self, names: Iterable[str]) -> None:
         """Delete generations, as `generations` names them, each manifest first."""
@@ -215,13 +220,37 @@ class StoredCluster:
 
         return self._try(name, sizes)
 
-    def _size(self, path: str) -> int:
-        """Of a file, as the store says now; -1 where it is not there."""
+    def _info(self, path: str) -> dict[str, Any] | None:
+        """What the store says of a file now; None where it is not there."""
         self._system.invalidate_cache()
         try:
-            return int(self._system.info(path)["size"])
+            found: dict[str, Any] = self._system.info(path)
         except FileNotFoundError:
-            return -1
+            return None
+        return found
+
+    def _size(self, path: str) -> int:
+        """Of a file; -1 where it is not there."""
+        found = self._info(path)
+        return -1 if found is None else int(found["size"])
+
+    def _content(self, path: str) -> bytes | None:
+        """Of a cluster's manifest; None where it is not there."""
+        try:
+            data: bytes = self._system.cat_file(path, start=0, end=MOST_BYTES + 1)
+        except FileNotFoundError:
+            return None
+        if len(data) > MOST_BYTES:
+            raise ValueError(f"a manifest has at most {MOST_BYTES} bytes")
+        return data
+
+    def _unchanged(self, path: str) -> dict[str, Any]:
+        """With what `pipe_file` is refused where this file is another one by then: what fsspec has for a file that is
+        not there, and what S3 has for one that is; nothing for other stores."""
+        found = self._info(path)
+        if found is None:
+            return {"mode": "create"}
+        return {"IfMatch": found["ETag"]} if "s3" in self._system.protocol and found.get("ETag") else {}
 
     def _digest(self, name: str) -> str:
         def digest(path: str) -> str:
