@@ -71,3 +71,13 @@ def test_on_a_terminal_there_is_a_bar_that_stops_whatever_happens(monkeypatch, c
     assert out == ""
     assert "train" in err
     assert "3/5" in err
+
+
+def test_on_a_narrow_terminal_the_bar_gives_way_and_the_figures_stay(monkeypatch, capsys):
+    monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    with Bar("collect", 120, "grasps") as bar:
+        bar.advance(115, note="19 of 20 objects, 71% of 155 attempts accepted")
+    shown = capsys.readouterr().err
+    assert "115/120" in shown
+    assert "19 of 20 objects, 71% of 155 attempts accepted" in shown
