@@ -34,7 +34,7 @@ from retrieval.data.catalogue import (
 )
 from retrieval.data.images import MAX_BYTES
 from retrieval.data.naming import Naming
-from retrieval.data.storage import FINAL, file_system, is_url, tried
+from retrieval.data.storage import FINAL, file_system, is_inside, is_url, tried
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, DatasetError, ImageError
 
@@ -133,11 +133,10 @@ def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming
     """A catalogue of photos, each with its object's name where the file gives one."""
     found, skipped, seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
     for photo, object_id in photos:
-        parts = PurePosixPath(photo.path.removeprefix("/")).parts
         name = object_id or naming.object_of(photo.path)
         if photo.path in seen:
             skipped.append(SkippedPhoto(photo.path, "comes twice"))
-        elif not parts or ".." in parts or photo.path.startswith("/") or "\0" in photo.path:
+        elif not is_inside(photo.path):
             skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
         elif not name:
             skipped.append(SkippedPhoto(photo.path, f"does not fit --objects-from {naming.text}"))

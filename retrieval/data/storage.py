@@ -3,7 +3,7 @@
 import tarfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 from retrieval.errors import BadInput, StorageError
@@ -23,6 +23,15 @@ def is_url(where: str | Path) -> bool:
 def place_of(where: str | Path) -> str | Path:
     """A URL as it is, anything else as a path."""
     return where if is_url(where) else Path(where)
+
+
+def is_inside(path: object) -> bool:
+    """Whether `path` is text that names a file below the folder or archive that it is relative to, wherever that lies:
+    paths in indexes, archives and tables come from anyone, and one with ".." would lead to other files of the user."""
+    if not isinstance(path, str) or "\0" in path:
+        return False
+    parts = PurePosixPath(path).parts
+    return bool(parts) and not path.startswith("/") and ".." not in parts
 
 
 def file_system(url: str) -> tuple[Any, str]:

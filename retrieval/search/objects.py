@@ -4,7 +4,6 @@ logits of photos to what each object's logit is, which are best, and a sample of
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
+from retrieval.data.storage import is_inside
 from retrieval.model.posterior import Posterior
 
 Floats = NDArray[np.float32]
@@ -36,8 +36,7 @@ def listed_photo(row: dict[str, Any]) -> ListedPhoto:
     object_id, path, metadata = (row.get(name) for name in ("object_id", "path", "metadata"))
     if not (isinstance(object_id, str) and isinstance(path, str) and isinstance(metadata, dict)):
         raise CorruptIndex(f"row {row['id']!r} must have an object_id, a path and metadata; {AGAIN}")
-    parts = PurePosixPath(path)
-    if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\0" in path:
+    if not is_inside(path):
         raise CorruptIndex(f"row {row['id']!r} must name a photo inside the catalogue, names {path!r}; {AGAIN}")
     return ListedPhoto(object_id, path, metadata)
 

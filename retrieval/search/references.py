@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
+from retrieval.data.storage import is_inside
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import Floats, Numbers, ReferenceWorth, nearness, touch_codes
@@ -141,7 +141,7 @@ def _checked(document: Any, where: object) -> tuple[list[_Touch], list[str]]:
     touches = []
     for row in document["touches"]:
         paths, digests = (row.get("touch"), row.get("digests")) if isinstance(row, dict) else (None, None)
-        if not isinstance(paths, list) or not isinstance(row.get("object_id"), str) or not all(map(_is_inside, paths)):
+        if not isinstance(paths, list) or not isinstance(row.get("object_id"), str) or not all(map(is_inside, paths)):
             raise wrong
         if not isinstance(digests, list) or [type(one) for one in digests] != [str] * len(paths):
             raise wrong
@@ -149,11 +149,3 @@ def _checked(document: Any, where: object) -> tuple[list[_Touch], list[str]]:
     if not all(isinstance(name, str) for name in document["alone"]):
         raise wrong
     return touches, document["alone"]
-
-
-def _is_inside(path: object) -> bool:
-    """Whether it names a file inside the catalogue."""
-    if not isinstance(path, str) or "\0" in path:
-        return False
-    parts = PurePosixPath(path)
-    return bool(parts.parts) and not parts.is_absolute() and ".." not in parts.parts
