@@ -98,7 +98,7 @@ def save_checkpoint(
         "references": references.to_dict() if references else None,
         "provenance": dict(provenance),
     }
-    state = {name: tensor.detach().cpu().contiguous() for name, tensor in matcher.state_dict().items()}
+    state = matcher.state_dict()
     if float16:
         state = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
         if over := [name for name, tensor in state.items() if not bool(torch.isfinite(tensor).all())]:
@@ -214,7 +214,9 @@ def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a JSON header as one safetensors file with a checksum over both, atomically."""
+    """Write tensors, of any device and layout, and a JSON header as one safetensors file with a checksum over both,
+    atomically."""
+    state = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
     content = {"format": FORMAT, "software": __version__, **header}
     # Over both, as the format itself takes a flipped bit in a weight or a setting for what it is.
     text = json.dumps({**content, "sha256": tensors_digest(state, json.dumps(content))}, allow_nan=False)

@@ -31,7 +31,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.training.fit import Plan, fit, one_ahead
+from retrieval.training.fit import Plan, fit, one_ahead, optimizer_tensors, restore_optimizer
 from retrieval.training.kept import KeptImages
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
@@ -112,7 +112,7 @@ def train_relief(
         raise Interrupted(f"stopped at step {training.step} of {iterations}; --resume goes on from here")
     report = training.report()
     about = {"tower": config.matcher.tower, "tower_output": config.matcher.tower_output}
-    write_tensors(out, _contiguous(training.tower.state_dict()), about | dataclasses.asdict(report))
+    write_tensors(out, training.tower.state_dict(), about | dataclasses.asdict(report))
     state.unlink(missing_ok=True)
     return report
 
@@ -263,10 +263,8 @@ class ReliefTraining:
     def _save(self, path: Path) -> None:
         both = self._modules()
         tensors = {f"model.{name}": tensor for name, tensor in both.state_dict().items()}
-        for name, parameter in both.named_parameters():
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                tensors[f"optimizer.{name}.{key}"] = value
-        write_tensors(path, _contiguous(tensors), {"step": self.step, **self._identity()})
+        tensors |= optimizer_tensors(both, self.optimizer)
+        write_tensors(path, tensors, {"step": self.step, **self._identity()})
 
     def resume(self, path: Path) -> None:
         """Take over a state. Raises CheckpointError where there is none, or one of another training."""
@@ -275,13 +273,7 @@ class ReliefTraining:
             raise CheckpointError(f"{path} is of another training; resume with the same pictures and settings")
         both = self._modules()
         both.load_state_dict({name: tensors[f"model.{name}"] for name in both.state_dict()})
-        for name, parameter in both.named_parameters():
-            prefix = f"optimizer.{name}."
-            kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-            if kept:
-                self.optimizer.state[parameter] = {
-                    key: value if key == "step" else value.to(self.device) for key, value in kept.items()
-                }
+        restore_optimizer(both, self.optimizer, tensors)
         self.step = header["step"]
 
 
@@ -336,10 +328,6 @@ def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> 
     if len(readings) < 2 or readings.std() == 0 or wanted.std() == 0:
         return 0.0
     return float(np.corrcoef(readings, wanted)[0, 1])
-
-
-def _contiguous(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:

@@ -51,7 +51,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
-from retrieval.training.fit import Plan, fit, one_ahead
+from retrieval.training.fit import Plan, fit, one_ahead, optimizer_tensors, restore_optimizer
 from retrieval.training.judgement import with_verdicts
 from retrieval.training.step import batch_loss, pair_logits, shuffle_fingers
 
@@ -291,10 +291,8 @@ class Trainer:
     def _save_state(self) -> None:
         frozen = FROZEN if self.config.training.freeze_towers else ()  # these stand in the checkpoint beside it
         state = {name: tensor for name, tensor in self.matcher.state_dict().items() if not name.startswith(frozen)}
-        tensors = {f"model.{name}": tensor.cpu().contiguous() for name, tensor in state.items()}
-        for name, parameter in self.matcher.named_parameters():
-            for key, value in self.optimizer.state.get(parameter, {}).items():
-                tensors[f"optimizer.{name}.{key}"] = value.cpu().contiguous()
+        tensors = {f"model.{name}": tensor for name, tensor in state.items()}
+        tensors |= optimizer_tensors(self.matcher, self.optimizer)
         best = self.best if self.validation is not None else None
         write_tensors(state_path(self.out), tensors, {"step": self.step, "best": best, **self._identity()})
 
@@ -312,13 +310,7 @@ class Trainer:
         self.matcher.load_state_dict(
             {name: tensors.get(f"model.{name}", kept[name]) for name in self.matcher.state_dict()}
         )
-        for name, parameter in self.matcher.named_parameters():
-            prefix = f"optimizer.{name}."
-            kept = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-            if kept:
-                self.optimizer.state[parameter] = {
-                    key: value if key == "step" else value.to(self.device) for key, value in kept.items()
-                }
+        restore_optimizer(self.matcher, self.optimizer, tensors)
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
     def _own_checkpoint(self) -> Checkpoint:
