@@ -114,6 +114,11 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(quick, tmp_path, m
         train_relief(folder, out, CONFIG, iterations=8, quiet=True)
     with pytest.raises(CheckpointError, match="another training"):
         train_relief(folder, out, CONFIG, iterations=9, resume=True, quiet=True)
+    others = write_pictures(tmp_path / "others")
+    labels = (others / "metadata.jsonl").read_text()
+    (others / "metadata.jsonl").write_text(labels.replace('"sharpness": 0.3', '"sharpness": 0.9'))  # as many of them
+    with pytest.raises(CheckpointError, match="another training"):
+        train_relief(others, out, CONFIG, iterations=8, resume=True, quiet=True)
     train_relief(folder, out, CONFIG, iterations=8, resume=True, quiet=True)
     whole, parts = (read_tensors(tmp_path / f"{name}.safetensors")[0] for name in ("whole", "parts"))
     for name, tensor in whole.items():

@@ -1,8 +1,10 @@
 """Pictures with what is known of the objects they show, as `retrieve collect --photos-only` and `--touches-only` make
 them; the format stands in robot.sim.pictures."""
 
+import hashlib
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,15 @@ def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
     if not pictures:
         raise DatasetError(f"{folder} holds no picture yet; run the same `retrieve collect` again")
     return kind, pictures
+
+
+def labels_digest(pictures: Iterable[LabelledPicture]) -> str:
+    """SHA-256 over the names of the pictures' files and over what is known of the objects, in this order: equal for the
+    same folder read again, wherever it lies. Pictures themselves are not read."""
+    digest = hashlib.sha256()
+    for each in pictures:
+        digest.update(json.dumps([each.file.name, each.finger, each.object_id, each.families, each.sizes]).encode())
+    return digest.hexdigest()
 
 
 def _picture(folder: Path, number: int, line: str) -> LabelledPicture:

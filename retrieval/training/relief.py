@@ -23,7 +23,7 @@ from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import ImageCache
 from retrieval.data.images import to_float
-from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, load_labelled
+from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, labels_digest, load_labelled
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
 from retrieval.model.checkpoint import beside, read_tensors, require_writable, write_tensors
@@ -125,6 +125,7 @@ class ReliefTraining:
         self.device, seed = default_device(), config.training.seed
         objects = sorted({picture.object_id for picture in pictures})
         held_out = max(1, min(round(VALIDATION * len(objects)), MOST_VALIDATED))
+        self.labels = labels_digest(pictures)
         chosen = set(np.random.default_rng([seed, 1]).permutation(objects)[:held_out].tolist())
         self.pictures = [picture for picture in pictures if picture.object_id not in chosen]
         self.validation = [picture for picture in pictures if picture.object_id in chosen]
@@ -255,7 +256,8 @@ class ReliefTraining:
         )
 
     def _identity(self) -> dict[str, Any]:
-        return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": len(self.pictures)}
+        """What must be the same for a training to be resumed."""
+        return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
 
     def _modules(self) -> nn.ModuleDict:
         return nn.ModuleDict({"tower": self.tower, "head": self.head})
