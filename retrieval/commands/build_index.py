@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,7 +10,12 @@ from indexes import KINDS
 from retrieval.commands.options import Json, Model
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
+from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError
+
+if TYPE_CHECKING:
+    from retrieval.model.checkpoint import Checkpoint
+    from retrieval.search.build_report import BuildReport
 
 PREVIEWED = 16
 """Photos of the catalogue, evenly chosen, that a preview shows."""
@@ -70,21 +75,13 @@ def build_index(
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
-    from indexes.errors import NoIndex
-    from retrieval.data.sources import is_elsewhere
-    from retrieval.data.storage import is_url
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
     from retrieval.search import build, build_cluster, defaults
-    from retrieval.search.object_store import StoredCluster, is_cluster, read_cluster
+    from retrieval.search.object_store import StoredCluster
 
-    folder = Path(out).resolve()
-    sheet = folder.with_name(f"{folder.name}-views.png")
-    if preview:
-        require_ours(sheet, PREVIEW)
-        for place, is_far in ((catalogue, is_elsewhere), (out, is_url)):
-            if is_far(place):
-                raise BadInput(f"--preview shows photos of a folder of this machine beside it; {place} is none")
+    sheet = _sheet(catalogue, out) if preview else None
+    shards = _shards(shards, out, of_shards=bad_share is not None or cluster)
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
     checkpoint = load_checkpoint(path)
@@ -95,12 +92,6 @@ def build_index(
         "max_ms": max_ms,
         "verify": verify,
     }
-    if shards is None and is_cluster(out):
-        with suppress(NoIndex):
-            shards = read_cluster(out).of
-        shards = shards or 1  # the first behind a URL
-    if shards is None and (bad_share is not None or cluster):
-        raise BadInput("--bad-share and --cluster are for a catalogue in shards; give --shards too")
     run = None
     if cluster:
         from retrieval.cluster.building import by_ray
@@ -123,17 +114,52 @@ def build_index(
         say(f"for queries without PyTorch, once: {made}")
     for line in report.lines():
         say(line)
-    if preview:
-        from indexes.store.folder import IndexStore
-        from retrieval.report.views import write_views
-
-        first = IndexStore(folder / report.shards[0]["folder"] if report.shards else folder)
-        rows = first.open(verify=False).rows
-        chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
-        write_views([Path(catalogue) / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
-        say(f"views: {len(chosen)} photos in {sheet}")
+    if sheet is not None:
+        _write_views(sheet, Path(catalogue), Path(out), report, checkpoint)
     if json:
         print_json(report.to_dict())
     if report.without_photo:
         count = len(report.without_photo)
         raise RetrievalError(f"the index is written, but {count} object(s) have no photo that can be read; see above")
+
+
+def _sheet(catalogue: str, out: str) -> Path:
+    """The picture that a preview is written to. Raises BadInput where it cannot be, before anything is built."""
+    from retrieval.data.sources import is_elsewhere
+
+    folder = Path(out).resolve()
+    sheet = folder.with_name(f"{folder.name}-views.png")
+    require_ours(sheet, PREVIEW)
+    for place, is_far in ((catalogue, is_elsewhere), (out, is_url)):
+        if is_far(place):
+            raise BadInput(f"--preview shows photos of a folder of this machine beside it; {place} is none")
+    return sheet
+
+
+def _shards(asked: int | None, out: str, *, of_shards: bool) -> int | None:
+    """How many shards to build: as many as asked for, else as many as `out` has; None for one index folder.
+
+    of_shards: whether an option was given that shards alone have. Raises BadInput where there are none then.
+    """
+    from indexes.errors import NoIndex
+    from retrieval.search.object_store import is_cluster, read_cluster
+
+    if asked is None and is_cluster(out):
+        with suppress(NoIndex):
+            return read_cluster(out).of
+        return 1  # the first one behind a URL
+    if asked is None and of_shards:
+        raise BadInput("--bad-share and --cluster are for a catalogue in shards; give --shards too")
+    return asked
+
+
+def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
+    """Write what the model sees of some photos of the index, or of its first shard."""
+    from indexes.store.folder import IndexStore
+    from retrieval.report.views import write_views
+
+    first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
+    rows = first.open(verify=False).rows
+    chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
+    write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
+    say(f"views: {len(chosen)} photos in {sheet}")
