@@ -408,6 +408,25 @@ def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
     assert f"{option[0]} is of matchers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["frontier", "--out", "f", "--stability", "--quick"], "--quick is of the frontier; --stability runs every"),
+        (["frontier", "--out", "f", "--stability", "--only", "closing"], "--only is of the frontier"),
+        (["collect", "--out", "r", "--dry-run", "--preview"], "--preview is of a collection; --dry-run moves and"),
+        (["serve", "--index", "i", "--replicas", "2"], "--replicas is for shards that Ray holds; give --cluster too"),
+        (["serve", "--index", "i", "--least-share", "0"], "--least-share is for shards that Ray holds"),
+        (["serve", "--index", "i", "--no-history", "--history", "h"], "--history names where to keep what"),
+        (["build-index", "catalog/", "--bad-share", "0.1"], "give --shards too"),
+        (["build-index", "catalog/", "--cluster"], "give --shards too"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_wrong_use(words, said, workplace, capsys):
+    assert main(words) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(path.name for path in workplace.iterdir()) == ["a.png", "b.png", "catalog"]
+
+
 def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
     main(["build-index", "catalog/", "--model", str(model)])
     query = [sys.executable, "-m", "retrieval", "query", "--gelsight", "a.png", "b.png", "--index", "index"]

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from retrieval.commands.options import refuse
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
 from retrieval.console.progress import Bar, CollectBar
@@ -39,6 +40,8 @@ def collect(
 ) -> None:
     """Collect a recording with a rig on its own; goes on where it was stopped."""
     if dry_run:
+        ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
+        refuse("is of a collection; --dry-run moves and records nothing", **ignored)
         _rehearse(rig, objects, seed)
         return
     if photos_only or touches_only:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import Json, Model, Values
+from retrieval.commands.options import Json, Model, Values, refuse
 from retrieval.console.output import print_json
 from retrieval.errors import RetrievalError
 from retrieval.lab.frontier import APPROXIMATIONS
@@ -34,6 +34,8 @@ def frontier(
     from retrieval.lab import reports
 
     if stability:
+        ignored = {"recording": recording, "model": model, "only": only, "quick": quick}
+        refuse("is of the frontier; --stability runs every hard case, and takes --out and --json", **ignored)
         document = reports.report_stability(out)
     else:
         document = reports.report_frontier(out, model=model, recording=recording, only=only or (), quick=quick)

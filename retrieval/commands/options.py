@@ -84,6 +84,14 @@ class Command(TyperCommand):
         return super().parse_args(ctx, joined + args)
 
 
+def refuse(why: str, **given: object) -> None:
+    """Raise BadInput for the first of these options that was given: it would be ignored, and `why` says so. An option
+    that was left out is None or False."""
+    for name, value in given.items():
+        if value is not None and value is not False:
+            raise BadInput(f"--{name.replace('_', '-')} {why}")
+
+
 def read_split(path: Path | None) -> "Split | None":
     """The split of objects that `--split` names. Raises BadInput."""
     if path is None:

@@ -2,17 +2,18 @@
 
 import os
 import webbrowser
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from retrieval.commands.options import refuse
 from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.cluster.serving import Held
     from retrieval.search.opening import OpenShards
     from retrieval.serve.service import LiveRig
     from robot.recording.folder import RecordingWriter
@@ -52,16 +53,22 @@ def serve(
     cluster: Annotated[
         bool, typer.Option("--cluster", help="Ray holds the shards of a cluster: that of RAY_ADDRESS, else one here")
     ] = False,
-    replicas: Annotated[int, typer.Option(help="of --cluster: processes that hold the same shard")] = 1,
+    replicas: Annotated[
+        int | None, typer.Option(help="of --cluster: processes that hold the same shard (default: 1)")
+    ] = None,
     most_replicas: Annotated[
         int | None, typer.Option(help="of --cluster: to how many they grow while requests wait (default: they do not)")
     ] = None,
     shard_wait: Annotated[
-        float, typer.Option(metavar="SECONDS", help="of --cluster: how long a shard is waited for")
-    ] = 5.0,
+        float | None,
+        typer.Option(metavar="SECONDS", help="of --cluster: how long a shard is waited for (default: 5)"),
+    ] = None,
     least_share: Annotated[
-        float, typer.Option(metavar="SHARE", help="of --cluster: of the catalogue, that an answer must have searched")
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            metavar="SHARE", help="of --cluster: of the catalogue, that an answer must have searched (default: 1, all)"
+        ),
+    ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
     no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
 ) -> None:
@@ -75,6 +82,16 @@ def serve(
     from retrieval.data.storage import is_url
     from retrieval.search import defaults
 
+    if no_history:
+        refuse("names where to keep what --no-history keeps nowhere; give one of them", history=history)
+    if not cluster:
+        refuse(
+            "is for shards that Ray holds; give --cluster too",
+            replicas=replicas,
+            most_replicas=most_replicas,
+            shard_wait=shard_wait,
+            least_share=least_share,
+        )
     path, why = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({why})")
@@ -96,10 +113,14 @@ def serve(
         recorder = _recorder(settings.history, path, closed) if settings.history else None
         held = None
         if cluster:
-            from retrieval.cluster.serving import Held
-
-            how = Held(replicas, most_replicas, wait_s=shard_wait, least_share=least_share)
-            held = _held(path, closed, how, not no_verify)
+            how: dict[str, Any] = {
+                "replicas": replicas,
+                "most_replicas": most_replicas,
+                "wait_s": shard_wait,
+                "least_share": least_share,
+            }
+            given = {name: value for name, value in how.items() if value is not None}
+            held = _held(path, closed, given, not no_verify)
         app = create_app(settings, _live_rig(rig, path), recorder, trials, held)
 
         def started(bound: int) -> None:
@@ -111,16 +132,18 @@ def serve(
         run(app, started)
 
 
-def _held(index: str | Path, closed: ExitStack, how: "Held", verify: bool) -> "OpenShards":
-    """Opens shards on Ray, which is joined or started. Raises BadInput where there is no cluster to hold."""
-    from retrieval.cluster.serving import Deployments
+def _held(index: str | Path, closed: ExitStack, how: Mapping[str, Any], verify: bool) -> "OpenShards":
+    """What opens shards on Ray, which is joined or started. how: fields of `Held` that were given. Raises BadInput
+    where there is no cluster to hold."""
+    from retrieval.cluster.serving import Deployments, Held
     from retrieval.cluster.session import connected
     from retrieval.search.object_store import is_cluster
 
     if not is_cluster(index):
         raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
+    settings = Held(**how)
     ray = closed.enter_context(connected())
-    deployments = Deployments(ray, how, verify)
+    deployments = Deployments(ray, settings, verify)
     closed.callback(deployments.close)
     return deployments.open
 

@@ -13,6 +13,7 @@ from retrieval.commands.options import (
     LabelledPhotos,
     LabelledTouches,
     read_split,
+    refuse,
     training_config,
 )
 from retrieval.console.output import say
@@ -62,10 +63,8 @@ def train(
     if (cluster and task != "match") or (workers is not None and not cluster):
         raise BadInput("--cluster trains matchers (--task match), and --workers says on how many ranks")
     if task == "grasp-success":
-        for name, value in {"config": config, "split": split, "resume": resume, "cache": cache, **inits}.items():
-            if value:
-                option = "--" + name.replace("_", "-")
-                raise BadInput(f"{option} is of matchers; --task grasp-success takes --iterations and --seed")
+        others = {"config": config, "split": split, "resume": resume, "cache": cache, **inits}
+        refuse("is of matchers; --task grasp-success takes --iterations and --seed", **others)
         _train_gate(recording, out, iterations, seed)
         return
     if task == "relief":

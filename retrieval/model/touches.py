@@ -106,7 +106,8 @@ def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str
         if len(grasp) != fingers:
             raise BadInput(
                 f"{of}this model takes {fingers} gel image(s) for one {what}; got {len(grasp)}: "
-                f"{', '.join(image.name for image in grasp)} ({_NESTED})"
+                f"{', '.join(image.name for image in grasp)} ({_NESTED}; on the command line each grasp has a "
+                "--gelsight of its own)"
             )
     return named
 
