@@ -1,7 +1,9 @@
 """Identify objects by touch: from the gel images of a grasp, find the catalogue photo of the object in the hand.
 
-The layers run one way: data -> model -> training, search -> methods -> evaluation -> report -> lab, serve -> commands.
-Public names are imported when they are used, so `import retrieval` costs nothing.
+Public names are imported when they are used, so `import retrieval` costs nothing. The layers run one way:
+
+    errors, version, console, metrics -> data -> model -> training, search -> cluster -> methods -> evaluation -> report
+    -> adaptation, lab, serve -> commands
 
 >>> import retrieval
 >>> with retrieval.open("index") as searcher:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.documents import CONTRIBUTING, table_rows
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("indexes", "robot", "retrieval")
 # Only these know the rigs: the reader of recordings, what shows a rig on the page, the commands around a rig, and what
@@ -61,7 +63,7 @@ def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_image
         assert not packages_of(path) & {"torch", "cv2", "PIL"}, path
 
 
-def test_only_the_dataset_reader_the_commands_and_the_lab_touch_robot():
+def test_only_the_dataset_reader_the_rig_of_the_service_the_commands_and_the_lab_touch_robot():
     touching = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
     assert not [path for path in touching if not path.startswith(MAY_TOUCH_ROBOT)]
     assert "retrieval/data/dataset.py" in touching
@@ -78,6 +80,17 @@ def test_the_layers_of_retrieval_run_one_way():
             parts = name.split(".")
             if parts[0] == "retrieval" and len(parts) > 1 and parts[1] in layer_of:
                 assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
+
+
+def test_the_layers_are_as_contributing_and_the_package_say():
+    rows = table_rows(CONTRIBUTING)
+    first = next(number for number, row in enumerate(rows) if row[0] == "layers of `retrieval/`") + 2
+    told = [tuple(cell.strip("`") for cell in row[0].split(", ")) for row in rows[first : first + len(LAYERS) - 1]]
+    assert told == [*LAYERS[:-1]]  # but for __main__, which only starts the command line
+    in_package = ast.get_docstring(ast.parse((ROOT / "retrieval/__init__.py").read_text("utf-8")))
+    assert " -> ".join(", ".join(names) for names in told) in " ".join(in_package.split())
+    for place in MAY_TOUCH_ROBOT:
+        assert f"`{place}`" in CONTRIBUTING.read_text("utf-8")
 
 
 def run_blocked(code, blocked):
