@@ -346,6 +346,25 @@ def test_settings_are_checked(kind):
                 kind.parameters_from({name: value})
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "least"),
+    [("neighbours", 1, 2), ("neighbours", 2**31, 2), ("ef_construction", 2**31, 1), ("ef_search", 2**31, 1)],
+)
+def test_what_faiss_cannot_count_is_refused(name, value, least):
+    """With one link a node FAISS ends the process."""
+    with pytest.raises(ParameterError, match=f"{name} must be a whole number of at least {least} and at most 2147"):
+        load_kind("hnsw").parameters_from({name: value})
+
+
+def test_the_broadest_search_there_is_may_look_further():
+    """One slot in forty is live, so that the first round finds too few."""
+    vectors = unit(400)
+    index = load_kind("hnsw").build(vectors).tuned(ef_search=2**31 - 1)
+    live = np.arange(400) % 40 == 7
+    slots = index.search(vectors[:50], 2, live)[1]
+    assert np.array_equal(slots, load_kind("exact").build(vectors).search(vectors[:50], 2, live)[1])
+
+
 def test_parameters_of_another_kind_are_refused():
     with pytest.raises(ParameterError, match="flat takes Parameters; got int"):
         load_kind("flat").build(unit(5), 3)

@@ -111,6 +111,16 @@ def test_every_depth_is_reached(name, depth):
         assert max(conditions(hard_gaps()[name], layer, contact, True)) <= 1e-5
 
 
+def test_what_is_farther_than_numbers_can_tell_is_not_there():
+    """Means over blocks and steps down the gradient overflow among gaps of 1e300 mm."""
+    far = np.random.default_rng(0).random((60, 50)) < 0.5
+    layer = Layer(0.3, 0.5, 1e-6)
+    with np.errstate(all="raise", under="ignore"):
+        contact, bare = (press(np.where(far, gap, 0.0), 0.1, layer, force_n=10.0) for gap in (1e300, math.inf))
+    assert contact.converged
+    assert np.array_equal(contact.pressure_mpa, bare.pressure_mpa)
+
+
 @settings(max_examples=60)
 @given(data=st.data())
 def test_any_small_map_is_solved(data):

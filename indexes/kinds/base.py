@@ -1,6 +1,7 @@
 """The contract of a vector index, and the checks that every kind shares."""
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -21,12 +22,14 @@ Ladder: TypeAlias = tuple[str, tuple[int, ...]]
 class Parameters:
     """Settings of a kind; None means "chosen from the data when the index is built"."""
 
-    def check(self, *names: str) -> None:
-        """Each named setting is None or a whole number of at least 1, or `ParameterError`."""
+    def check(self, *names: str, least: int = 1, most: float = math.inf) -> None:
+        """Each named setting is None or a whole number from `least` to `most`, or `ParameterError`."""
         for name in names:
             value = getattr(self, name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-                raise ParameterError(f"{name} must be a whole number of at least 1; got {value!r}")
+            is_whole = isinstance(value, int) and not isinstance(value, bool)
+            if value is not None and not (is_whole and least <= value <= most):
+                limit = f" and at most {most}" if most < math.inf else ""
+                raise ParameterError(f"{name} must be a whole number of at least {least}{limit}; got {value!r}")
 
 
 class VectorIndex(ABC):

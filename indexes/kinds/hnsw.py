@@ -7,6 +7,9 @@ from indexes.kinds import base
 from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
+MOST = 2**31 - 1
+"""FAISS counts links and breadths in 32 bits. With a single link a node it ends the process."""
+
 
 @dataclass(frozen=True)
 class HNSWParameters(base.Parameters):
@@ -17,7 +20,8 @@ class HNSWParameters(base.Parameters):
     ef_search: int = 64
 
     def __post_init__(self) -> None:
-        self.check("neighbours", "ef_construction", "ef_search")
+        self.check("neighbours", least=2, most=MOST)
+        self.check("ef_construction", "ef_search", most=MOST)
 
 
 class HNSWIndex(FaissIndex):
@@ -46,6 +50,7 @@ class HNSWIndex(FaissIndex):
         super()._add_missing()
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        breadth = max(fetch, self.parameters.ef_search * effort)
+        # FAISS makes room for the whole breadth at once, and no more than all can be found.
+        breadth = min(self.covered, max(fetch, self.parameters.ef_search * effort))
         rough, found = self._structure.search(queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth))
         return rough, found

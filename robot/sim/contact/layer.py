@@ -109,6 +109,7 @@ def press(
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
     with np.errstate(over="ignore"):  # what is that far away is not there
         scaled = (gap - lowest) / pixel_mm / scale
+        scaled[scaled > _SCALED_RANGE[1]] = math.inf
     load = None if force_n is None else 1.0
     solution = Task(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
     return _contact(solution, surface, layer, pixel_mm, scale, lowest)
