@@ -31,6 +31,7 @@ from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, judge
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
+from robot.recording.grasp import check_name
 from robot.rig import Rig
 from robot.storage import decoded
 from robot.workers import Jobs, Work
@@ -119,6 +120,8 @@ def collect(
         raise RobotConfigError("at least one object must be collected, got none")
     if len(set(names)) != len(names):
         raise RobotConfigError("objects must have different names; one was given twice")
+    for name in names:
+        check_name("an object's name", name)
     with rig:
         attempt = settings.attempt or rig.attempt
         info = _info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))

@@ -2,6 +2,7 @@
 
 import threading
 import time
+import weakref
 from types import SimpleNamespace
 
 import cv2
@@ -167,11 +168,16 @@ class FakeRealSense:
         return frames
 
 
+class _Freed(SimpleNamespace):
+    """What can be seen to end, and a device that points to it crashes."""
+
+
 class FakeFreenect2:
     """The module pylibfreenect2 with one camera or several, and pipelines that this build has and can run."""
 
     def __init__(self, serials=(b"k1",), pipelines=("OpenGLPacketPipeline", "CpuPacketPipeline"), broken=()):
         self.serials, self.events = serials, []
+        self.needed = []
         self.taken = self.released = 0
         self.silent = self.fails = False
         self.FrameType = SimpleNamespace(Color=1, Ir=2, Depth=4)
@@ -186,19 +192,28 @@ class FakeFreenect2:
         return name
 
     def Freenect2(self):
-        return SimpleNamespace(
+        made = _Freed(
             enumerateDevices=lambda: len(self.serials),
             getDeviceSerialNumber=self.serials.__getitem__,
             openDevice=self._open,
         )
+        self.needed = [weakref.ref(made)]
+        return made
+
+    def _listen(self, listener):
+        self.needed.append(weakref.ref(listener))
+
+    def _note(self, *event):
+        assert all(each() is not None for each in self.needed), "the package would read memory that is free"
+        self.events.append(event)
 
     def _open(self, serial, pipeline):
         assert serial in self.serials
         self.events.append(("open", serial, pipeline))
-        note = {name: lambda *args, name=name: self.events.append((name, *args)) for name in ("start", "stop", "close")}
+        note = {name: lambda *args, name=name: self._note(name, *args) for name in ("start", "stop", "close")}
         return SimpleNamespace(
-            setColorFrameListener=lambda listener: None,
-            setIrAndDepthFrameListener=lambda listener: None,
+            setColorFrameListener=self._listen,
+            setIrAndDepthFrameListener=self._listen,
             getIrCameraParams=lambda: SimpleNamespace(fx=364.5, fy=364.6, cx=259.0, cy=202.4),
             getColorCameraParams=lambda: SimpleNamespace(fx=1081.0, fy=1081.0, cx=959.5, cy=539.5),
             **note,
@@ -206,7 +221,7 @@ class FakeFreenect2:
 
     def SyncMultiFrameListener(self, types):
         assert types == 5
-        return SimpleNamespace(hasNewFrame=lambda: not self.silent, waitForNewFrame=self._wait, release=self._release)
+        return _Freed(hasNewFrame=lambda: not self.silent, waitForNewFrame=self._wait, release=self._release)
 
     def _wait(self):
         assert self.taken == self.released, "none newer comes before the last set is released"

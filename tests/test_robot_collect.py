@@ -541,6 +541,13 @@ def test_settings_out_of_range_are_refused_before_a_folder_is_made(tmp_path, opt
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize("name", ["", " ", "a\nb", "caf\udce9"])
+def test_an_object_without_a_name_that_can_be_recorded_is_refused_before_anything_moves(tmp_path, name):
+    with pytest.raises(RecordingError, match="an object's name must be a non-empty printable string"):
+        run(tmp_path / "r", names=["round-0", name])
+    assert not (tmp_path / "r").exists()
+
+
 @pytest.mark.parametrize(
     "setting",
     [{"outputs": ("photo",)}, {"settle_s": -1.0}, {"travel_mm_s": 0.0}, {"jpeg_quality": 101}, {"table_share": 1.1}],

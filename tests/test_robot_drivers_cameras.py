@@ -213,7 +213,7 @@ def test_every_set_of_frames_is_released_whatever_happens(install):
     assert freenect.taken == freenect.released == 5 + 2 * 4  # five to warm up; each read passes over what waited
 
 
-def test_a_kinect_is_started_stopped_and_closed_in_order(install):
+def test_a_kinect_is_started_stopped_and_closed_in_order_while_what_it_points_to_is_there(install):
     freenect = install(FakeFreenect2())
     with kinect():
         pass

@@ -206,6 +206,16 @@ def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
         ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
+def test_what_other_systems_hide_beside_pictures_is_none(folder, pairs, clock):
+    """A Mac leaves such a file beside each picture that it copies."""
+    for hidden in (folder / "._0.png", pairs / "._view1.png"):
+        hidden.write_bytes(b"Mac OS X")
+    with ImagesSensor(finger="a", path=str(folder), clock=clock) as gel:
+        assert gel.settings()["pictures"] == len(LEVELS)
+    with camera(pairs) as eye:
+        assert int(eye.read().colour[0, 0, 1]) == 1
+
+
 def test_a_pipe_that_bears_a_pictures_name_is_refused_unread(folder, clock):
     """Reading it would wait for ever for somebody who writes into it."""
     (folder / "0.png").unlink()

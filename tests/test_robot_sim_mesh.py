@@ -266,6 +266,16 @@ def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     assert cube.areas.sum() == pytest.approx(24)
 
 
+def test_hidden_files_beside_meshes_are_none_and_two_of_one_name_are_refused(tmp_path):
+    stl(tmp_path / "cube.stl", 20 * CORNERS, CUBE)
+    (tmp_path / "._cube.stl").write_bytes(b"Mac OS X")
+    rig = load_rig("sim", seed=0, meshes=str(tmp_path))
+    assert [name.split("-")[0] for name in rig.object_ids(1)] == ["mesh.cube"]
+    stl(tmp_path / "cube.STL", 25 * CORNERS, CUBE)
+    with pytest.raises(RobotConfigError, match=r"must not hold two meshes of one name, got 'mesh\.cube-.*; rename one"):
+        rig.object_ids(2)
+
+
 def test_a_rig_of_meshes_grasps_them_and_goes_on_with_the_same_files_only(tmp_path):
     folder, make_rig = tmp_path / "meshes", functools.partial(load_rig, "sim", seed=0, meshes=str(tmp_path / "meshes"))
     folder.mkdir()

@@ -175,7 +175,7 @@ class ImagesSensor(_PacedSensor):
     _files: Sequence[Path] = ()
 
     def _open(self) -> tuple[int, float]:
-        self._files = [each for each in sorted(self.path.iterdir()) if each.suffix.lower() in _SUFFIXES]
+        self._files = [each for each in _shown(self.path) if each.suffix.lower() in _SUFFIXES]
         return len(self._files), 0.0
 
     def _decode(self, number: int) -> npt.NDArray[np.uint8]:
@@ -260,10 +260,15 @@ def _recorded_pairs(folder: Path) -> list[_Pair]:
 
 
 def _named_pairs(folder: Path) -> list[_Pair]:
-    files = dict.fromkeys(sorted(folder.iterdir()))
+    files = dict.fromkeys(_shown(folder))
     colours = [each for each in files if each.suffix.lower() in _SUFFIXES and not each.name.endswith(DEPTH_SUFFIX)]
     depths = [each.with_name(each.stem + DEPTH_SUFFIX) for each in colours]
     return [_Pair(colour, depth if depth in files else None) for colour, depth in zip(colours, depths, strict=True)]
+
+
+def _shown(folder: Path) -> list[Path]:
+    """What lies there, sorted; hidden files, such as other systems put beside pictures, are left out."""
+    return sorted(each for each in folder.iterdir() if not each.name.startswith("."))
 
 
 def _intrinsics(path: Path) -> Intrinsics | None:

@@ -3,6 +3,7 @@
 import hashlib
 import math
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -167,7 +168,10 @@ class SimRig(Rig):
         """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
         if count > _MOST_OBJECTS:
             raise RobotConfigError(f"the simulated rig has at most {_MOST_OBJECTS} objects a seed, got {count}")
-        return [self._object(index).object_id for index in range(count)]
+        names = [self._object(index).object_id for index in range(count)]
+        if self._meshes and (twice := sorted(name for name, times in Counter(names).items() if times > 1)):
+            raise RobotConfigError(f"{self._meshes} must not hold two meshes of one name, got {twice[0]!r}; rename one")
+        return names
 
     def prepare(self, object_id: str, number: int) -> None:
         """Stand the object on the table, turned and placed at random, under new light."""
@@ -259,7 +263,8 @@ def _mesh_files(folder: str) -> list[Path]:
     """Raises RobotConfigError for a folder that is none."""
     if not Path(folder).is_dir():
         raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
-    return sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in (".stl", ".obj", ".ply"))
+    kinds = (".stl", ".obj", ".ply")
+    return sorted(each for each in Path(folder).iterdir() if each.suffix.lower() in kinds and each.name[0] != ".")
 
 
 def _mesh_digest(folder: str) -> str:

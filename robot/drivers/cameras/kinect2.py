@@ -3,7 +3,8 @@
 Facts used (libfreenect2, pylibfreenect2): depth is float in mm, 0 or infinite where unknown; `Registration.apply` gives
 depth without lens distortion and the colour of each of its pixels (BGRX, black where there is none); the parameters of
 the infrared camera are then the intrinsics, and are known after start(); every set of frames must be released, and none
-newer comes before that; opening a serial number that is not there crashes the process, so it is looked for first.
+newer comes before that; opening a serial number that is not there crashes the process, so it is looked for first; a
+device points to its listener and belongs to its Freenect2, and both end with the last name that Python has for them.
 """
 
 import contextlib
@@ -117,13 +118,15 @@ class Kinect2(Camera):
 
     def _close(self) -> None:
         device, self._device = self._device, None
-        self._listener = self._registration = self._freenect = None
-        if device is not None:
-            with vendor_errors("kinect2 cannot be stopped"):
-                try:
-                    device.stop()
-                finally:
-                    device.close()
+        try:
+            if device is not None:
+                with vendor_errors("kinect2 cannot be stopped"):
+                    try:
+                        device.stop()
+                    finally:
+                        device.close()
+        finally:
+            self._listener = self._registration = self._freenect = None
 
     def _settings(self) -> dict[str, Any]:
         return dict(self._has)
