@@ -2,30 +2,46 @@
 
 What is sent are names; a photo is read, embedded and written by one process on one machine. A process that is lost is
 replaced, and its shard is taken up where it was left: by the codes that are in its folder, which all machines must see.
+
+Where Ray has graphics cards, each process has one of them to itself, and the towers run there.
 """
 
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from indexes.errors import IndexesError, LockedIndex
 from retrieval.cluster.session import connected
+from retrieval.console.output import say
 from retrieval.errors import RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import default_device
 from retrieval.search.build_cluster import Run, ShardBuilt, ShardJob, build_shard
 
 ENDING_S, FAILURES = 60.0, 3
 """Within which a process that was given up lets go of its shard; how often all may fail without a shard between."""
 
 
-class ShardBuilder:
-    """A process of the pool, with the model."""
+class Pool(NamedTuple):
+    """So many processes at once, and what each asks Ray for: processors, and a graphics card or none."""
 
-    def __init__(self, model: Path) -> None:
+    processes: int
+    cpus: int
+    cards: int
+
+
+class ShardBuilder:
+    """A process of the pool, with the model; on a graphics card where Ray has given it one."""
+
+    def __init__(self, model: Path, has_card: bool) -> None:
         self._checkpoint = load_checkpoint(model)
+        if has_card:
+            torch.backends.cudnn.allow_tf32 = False  # an index may have codes of both: they are to be the same
+            self._checkpoint.matcher.to(default_device())
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Build the shards of these jobs. What is wrong with one is its answer, for another try would say it again."""
@@ -45,17 +61,16 @@ class ShardBuilder:
 
 
 def by_ray(cpus: int | None = None, workers: int | None = None) -> Run:
-    """Builds shards on a Ray cluster (`retrieval.cluster.session`). workers: processes at once, at most; None: as many
-    as there are processors for, each with one."""
+    """Builds shards on a Ray cluster (`retrieval.cluster.session`). workers: processes at once, at most; None: one for
+    each graphics card of the cluster, or for each processor where it has none."""
 
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuilt]:
         left, failures = {job.folder: job for job in jobs}, 0
         with connected(cpus) as ray:
             ray.data.DataContext.get_current().enable_progress_bars = False
-            most = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
             while left:
                 try:
-                    for answer in _answers(ray, list(left.values()), checkpoint, min(len(left), most)):
+                    for answer in _answers(ray, list(left.values()), checkpoint, workers):
                         if isinstance(answer, Exception):
                             raise answer
                         del left[answer.folder]
@@ -75,15 +90,33 @@ def by_ray(cpus: int | None = None, workers: int | None = None) -> Run:
 
 
 def _answers(
-    ray: Any, jobs: Sequence[ShardJob], checkpoint: Checkpoint, processes: int
+    ray: Any, jobs: Sequence[ShardJob], checkpoint: Checkpoint, workers: int | None
 ) -> Iterator[ShardBuilt | RetrievalError | IndexesError]:
-    items = [{"job": job} for job in jobs]
+    items, pool = [{"job": job} for job in jobs], pool_of(ray)
     built = ray.data.from_items(items, override_num_blocks=len(items)).map_batches(
         ShardBuilder,
         batch_size=1,
-        compute=ray.data.ActorPoolStrategy(min_size=1, max_size=processes),
-        num_cpus=1,
-        fn_constructor_args=(checkpoint.path.resolve(),),
+        compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(len(items), workers or pool.processes)),
+        num_cpus=pool.cpus,
+        num_gpus=pool.cards,
+        fn_constructor_args=(checkpoint.path.resolve(), bool(pool.cards)),
     )
     for row in built.iter_rows():
         yield row["built"]
+
+
+def pool_of(ray: Any) -> Pool:
+    """A process for each graphics card of a Ray cluster, with its share of its machine's processors, which read and
+    decode; for each processor where there is no card, or none that PyTorch can use there."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    having = [node for node in nodes if node.get("GPU", 0) >= 1]
+    if having and ray.get(ray.remote(num_cpus=0, num_gpus=1)(_sees_card).remote()):
+        share = min(int(node.get("CPU", 1) / node["GPU"]) for node in having)
+        return Pool(sum(int(node["GPU"]) for node in having), max(1, share), 1)
+    if having:
+        say("Ray has graphics cards, but PyTorch cannot use them there: processors embed")
+    return Pool(max(1, int(sum(node.get("CPU", 0) for node in nodes))), 1, 0)
+
+
+def _sees_card() -> bool:
+    return default_device().type == "cuda"

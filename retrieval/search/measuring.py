@@ -1,5 +1,6 @@
 """What searches find of a catalogue, and how long they take: the measurements that an operating point is chosen by."""
 
+import copy
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -116,7 +117,8 @@ class WinnerBench(Bench):
         used, self._first, places = np.unique(slots, return_index=True, return_inverse=True)
         super().__init__(len(halves), vectors[used])
         self.steps = candidate_steps(self.count)
-        self._head, self._halves, self._clock = checkpoint.matcher.head, halves, clock
+        # Judged, and timed, as searches do: on the processor, wherever the towers run.
+        self._head, self._halves, self._clock = copy.deepcopy(checkpoint.matcher.head).cpu(), halves, clock
         self._touches, self._queries = _queries(checkpoint, self.count)
         self.queries = len(self._queries)
         self._winners, self.exhaustive_ms = self._find_winners(places, quiet)
@@ -192,8 +194,8 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
     Raises BadInput where `can_measure` says that there are none."""
     if checkpoint.queries is None or checkpoint.matcher.pruner is None:
         raise BadInput(f"{checkpoint.path} must keep touches to measure with, and a pruner; train it again")
-    halves = torch.from_numpy(checkpoint.queries[:count].astype(np.float32))
-    return halves, checkpoint.matcher.pruner.touch(halves).numpy()
+    halves, pruner = torch.from_numpy(checkpoint.queries[:count].astype(np.float32)), checkpoint.matcher.pruner
+    return halves, pruner.touch(halves.to(next(pruner.parameters()).device)).cpu().numpy()
 
 
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
