@@ -39,6 +39,7 @@ pytestmark = [
 ]
 
 LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
+MADE = []
 SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 
 
@@ -48,12 +49,15 @@ def ray():
 
     with connected(2) as module:
         yield module
+        for made in MADE:
+            made.close()
 
 
 def deployments(ray, **held):
     from retrieval.cluster.serving import Deployments, Held
 
-    return Deployments(ray, Held(cpus=0.1, **held))
+    MADE.append(Deployments(ray, Held(cpus=0.1, **held)))
+    return MADE[-1]
 
 
 @pytest.fixture(scope="module")
@@ -332,6 +336,29 @@ def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
                 thread.join(300)
     grown.close()
     assert found == {tuple(expected)}
+
+
+ENDING = """
+import sys, time
+from retrieval.cluster.serving import Deployments, Held
+from retrieval.cluster.session import connected
+from retrieval.search.searcher import Searcher
+with connected(2) as ray:
+    held = Deployments(ray, Held(cpus=0.1, wait_s=240.0, most_replicas=2))
+    with Searcher.open(sys.argv[1], shards=held.open) as searcher:
+        print(searcher.shard.rows(["nothing"]), flush=True)
+    held.close()
+time.sleep(12)
+print(ray.is_initialized())
+"""
+
+
+def test_after_the_end_nothing_speaks_to_ray_or_starts_another(cluster):
+    """Where shards may grow, a thread tells Ray every ten seconds how many requests wait."""
+    asked = [sys.executable, "-W", "ignore", "-c", ENDING, str(cluster)]
+    done = subprocess.run(asked, capture_output=True, text=True, timeout=600)
+    assert done.stdout.splitlines() == ["[None]", "False"], done.stderr
+    assert "metrics" not in done.stderr
 
 
 # Building -------------------------------------------------------------------------------------------------------------

@@ -193,7 +193,9 @@ class Deployments:
         self._own = secrets.token_hex(4)
         self._holder = ray.remote(num_cpus=0)(Holder).options(name=self._own, namespace=HOLDERS).remote()
         self._users: Counter[str] = Counter()
-        self._lock = threading.Lock()
+        self._handles: dict[str, Any] = {}
+        self._over: list[Any] = []
+        self._lock = threading.RLock()  # the collector of garbage lets shards go wherever it runs, in `open` too
         ray.serve.start(proxy_location="Disabled")
         self._delete_of_killed()
 
@@ -205,14 +207,26 @@ class Deployments:
             where = cluster if is_url(cluster) else Path(cluster).resolve()
             self._deploy(names, str(where), manifest, stored)
             self._users.update(names.values())
-        handles = {folder: self._ray.serve.get_app_handle(name) for folder, name in names.items()}
+            for name in set(names.values()) - set(self._handles):
+                self._handles[name] = self._ray.serve.get_app_handle(name)
+            handles = {folder: self._handles[name] for folder, name in names.items()}
+        self._end_handles()
         opened = RayShards(described_cluster(manifest), manifest.shards, handles, self._held)
         weakref.finalize(opened, self._let_go, list(names.values()))
         return opened
 
     def close(self) -> None:
-        """End all that was opened."""
+        """End all that was opened; to be called before Ray is left."""
         self._let_go(list(self._users.elements()))
+        self._end_handles()
+
+    def _end_handles(self) -> None:
+        """Of shards that nobody asks any more. One that is left tells Ray of its queue for ever, also when that Ray has
+        ended. Waits for the thread that does so: nothing for the collector of garbage, which may run on it."""
+        with self._lock:
+            over, self._over = self._over, []
+        for handle in over:
+            handle.shutdown()
 
     def _delete_of_killed(self) -> None:
         held = {one["name"] for one in self._ray.util.list_named_actors(all_namespaces=True)}
@@ -272,6 +286,7 @@ class Deployments:
         with self._lock:
             self._users.subtract(names)
             over = [name for name in set(names) if self._users[name] <= 0]
+            self._over += [self._handles.pop(name) for name in over if name in self._handles]
         if self._ray.is_initialized():
             for name in over:
                 self._ray.serve.delete(name, _blocking=False)

@@ -13,13 +13,15 @@ from retrieval.errors import BadInput, RetrievalError
 OBJECT_STORE_BYTES = 200 * 2**20
 """Of a Ray that is started here: what travels is small."""
 ADDRESS, LOOPBACK = "RAY_ADDRESS", "127.0.0.1"
-_QUIET = {
+_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_SERVE_LOG_TO_STDERR": "0",
     "RAY_TRAIN_V2_ENABLED": "1",
     "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_ENABLE_AUTO_CONNECT": "0",
 }
+"""Quiet, and started by `connected` alone: a thread of Ray's own that outlives it would start another Ray."""
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 """Ray's own switch for a cluster of this machine alone, which then listens on 127.0.0.1."""
 
@@ -40,7 +42,7 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
 
     cpus: of a Ray that is started here, None: all. Raises BadInput without Ray, RetrievalError where it cannot be had.
     """
-    os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
+    os.environ.update({name: os.environ.get(name, value) for name, value in _SETTINGS.items()})
     joined = os.environ.get(ADDRESS)
     if not joined:
         os.environ.update(_LOOPBACK)
