@@ -208,7 +208,8 @@ class Deployments:
             self._deploy(names, str(where), manifest, stored)
             self._users.update(names.values())
             for name in set(names.values()) - set(self._handles):
-                self._handles[name] = self._ray.serve.get_app_handle(name)
+                # With its router at once: threads that ask first would make one each, and one alone could be ended.
+                self._handles[name] = self._ray.serve.get_app_handle(name).options()
             handles = {folder: self._handles[name] for folder, name in names.items()}
         self._end_handles()
         opened = RayShards(described_cluster(manifest), manifest.shards, handles, self._held)
