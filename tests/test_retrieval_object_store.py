@@ -457,6 +457,8 @@ def switches(s3_server, cluster):
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("before", [False, True], ids=["created", "replaced"])
 def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_server):
+    if before:
+        pytest.importorskip("moto", "5.1.5", reason="this moto replaces a file whatever the condition")
     switch, _, theirs = switches
     url = f"s3://photos/raced-{before}"
     with pytest.raises(StorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
