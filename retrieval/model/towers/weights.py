@@ -64,7 +64,8 @@ def read_state(path: Path) -> dict[str, Tensor]:
             return load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # third-party loaders raise a dozen kinds; each means the same to the user
-        raise CheckpointError(f"{path} is not a readable state dict ({type(error).__name__}: {error})") from error
+        # What PyTorch says is long, and advises to unpickle the file after all.
+        raise CheckpointError(f"{path} is not a readable state dict ({type(error).__name__})") from error
     if not isinstance(state, dict) or not all(
         isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
     ):
