@@ -49,7 +49,7 @@ class Point:
 
     @classmethod
     def of(cls, what: str, objects: int, touches: int, first: Measure, pairs: Measure) -> "Point":
-        """Of measures over the objects left out."""
+        """A place on the curve, from measures over the objects left out."""
         return cls(what, objects, touches, interval_of(first), interval_of(pairs), float(first.chance[0]))
 
 
@@ -92,7 +92,8 @@ def learning_curve(
 def _point(
     what: str, features: Features, blocks: Blocks, folds: Sequence[Sequence[str]], objects: int, touches: int, seed: int
 ) -> Point:
-    """Of every fold, a fit on objects and touches drawn from those outside it."""
+    """A place on the curve: for every fold a fit on objects and touches drawn from those outside it, judged on the
+    fold."""
     rng = np.random.default_rng([seed, objects, touches])
     everyone = {name for fold in folds for name in fold}
     number_of = {name: number for number, name in enumerate(sorted(set(features.object_ids)))}

@@ -41,7 +41,7 @@ class Estimate:
         return fingers and mean(self.known_below) >= mean(self.below)
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The estimate as lines for people."""
         found = [("first guess", self.first, self.blurred_first), ("pair accuracy", self.below, self.blurred_below)]
         lines = [f"objects left out once each, one touch, {self.first.gallery}:"]
         for name, touched, control in found:
@@ -66,7 +66,7 @@ class Estimate:
         return "the touch tells no more than its blur does: this is not shown to be touch; record more objects"
 
     def to_dict(self) -> dict[str, float]:
-        """As the checkpoint keeps it."""
+        """The numbers that a checkpoint keeps as its metrics."""
         return {
             "left_out_first_guess": mean(self.first),
             "left_out_first_guess_blurred": mean(self.blurred_first),
@@ -79,7 +79,7 @@ class Estimate:
 
 
 def mean(measure: Measure) -> float:
-    """Over objects."""
+    """The mean of a measure over objects, which count alike."""
     return float(measure.by_object()[1].mean())
 
 

@@ -84,7 +84,8 @@ def install(matcher: Matcher, codes: Codes, scale: float, offset: float) -> None
 
 
 def _set(layer: nn.Linear, found: Affine) -> None:
-    """Codes may be shorter than the layer: the rest stays 0, which no cosine sees."""
+    """Make a layer the affine map that was found. Codes may be shorter than the layer: the rest stays 0, which no
+    cosine sees."""
     used = found.weight.shape[1]
     layer.weight.zero_()
     layer.bias.zero_()
@@ -97,8 +98,9 @@ def _float(values: np.ndarray[Any, Any]) -> Tensor:
 
 
 def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
-    """With the check of touches, and with the posterior of the folds: codes know the objects that they were fitted on
-    too well to say what a match is worth."""
+    """The fitted checkpoint with a check of touches, and with the posterior of the folds: what a match is worth is told
+    by objects left out, as codes know those that they were fitted on too well. Without an estimate it has no
+    posterior."""
     made = _checked(made, material.grasps, material.features, quiet)
     if estimate is None:
         return dataclasses.replace(made, posterior=None, references=None)
@@ -106,7 +108,7 @@ def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, q
 
 
 def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """The model as it is, with a check of touches and a posterior of own objects."""
+    """The model that one started from, with a check of touches and a posterior fitted to own objects."""
     made = _checked(start, material.grasps, estimate.known.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": material.source, "data_digest": data_digest(material.grasps)}
@@ -115,13 +117,14 @@ def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bo
 
 
 def _calibrated(made: Checkpoint, left_out: list[FeltTouches]) -> Checkpoint:
-    """With what logits mean and what reference touches are worth, by touches of objects that were left out."""
+    """The checkpoint with a posterior and the worth of reference touches, both fitted on touches of objects left
+    out."""
     posterior = fit_posterior(*(part.judged for part in left_out))
     return dataclasses.replace(made, posterior=posterior, references=fit_references(*left_out))
 
 
 def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
-    """With a check of touches, whose thresholds come from half of the objects."""
+    """The checkpoint with a check of touches: fitted on one half of the objects, thresholds from the other half."""
     device = default_device()
     names = sorted({grasp.object_id for grasp in grasps})
     halves = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]

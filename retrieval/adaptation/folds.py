@@ -66,10 +66,11 @@ def best_ridge(folds: Sequence[Fold]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """Of each touch of a fold: how its place among the fold's objects came out.
+    """How each touch of a fold (n of them) was told apart from the fold's other objects.
 
-    object_ids (n,); first (n,): whether its own object's photo stood first (a share where photos tie); below (n,): the
-    share of the other objects' photos that stood lower, equals counting half; objects: how many were told apart.
+    object_ids (n,): what was touched. first (n,): whether its own object's photo stood first (a share where photos
+    tie). below (n,): the share of the other objects' photos that stood lower, equals counting half. objects: how many
+    were told apart.
     """
 
     object_ids: tuple[str, ...]
@@ -85,12 +86,13 @@ class Told:
 
 
 def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> Told:
-    """A touch against a photo, drawn, of each of the fold's objects; its own is of another grasp where there is one."""
+    """Tell each touch of a fold by one photo, drawn, of each of the fold's objects; the photo of its own object is of
+    another grasp where there is one."""
     return told(fold.cosines(ridge), fold.left_out, seed)
 
 
 def told(scores: NDArray[np.float32], features: Features, seed: int = 0) -> Told:
-    """The same of scores (n, n) of touches with photos of grasps."""
+    """As `first_guesses`, from scores (n, n) of every touch with the photo of every grasp."""
     rng, owner = np.random.default_rng([seed, 8]), features.owner
     rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
     higher, equal = np.empty((2, len(features)), np.int64)

@@ -65,7 +65,7 @@ def _holds(*keys: str) -> Callable[[BinaryIO], bool]:
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
-    """A JSON object; nothing where it is none."""
+    """The JSON object that a text holds; an empty one where it holds none."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):
@@ -114,5 +114,6 @@ def write_output(path: Path, data: bytes, kind: Kind) -> None:
 
 
 def text_bytes(text: str) -> bytes:
-    """A page in UTF-8; what UTF-8 cannot hold (names of unknown coding) as the references of HTML."""
+    """The text of a page in UTF-8; characters that UTF-8 cannot hold (of names in unknown coding) become HTML's numeric
+    references."""
     return text.encode("utf-8", "xmlcharrefreplace")

@@ -326,9 +326,9 @@ class PairSampler:
         )
 
     def _drawn(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_Drawn]]:
-        """For the object of each touch the photos to pair it with: (object, photo, label). Shared negatives are of the
-        batch's other objects, in turn in a random order, one of the photos shown of each; of all objects where the
-        batch holds no other."""
+        """Photos to pair with the touch of each object: (object, photo, label). Shared negatives are of the batch's
+        other objects, taken in turn in a random order, with one of the photos that the batch shows of each; where the
+        batch holds no other object they are drawn from all."""
         if not share:
             for index in objects:
                 matches = [(index, photo, 1.0) for photo in self._positives(index, rng)]

@@ -99,7 +99,8 @@ def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbIm
 
 
 def decode(data: bytes, name: str | Path, least: int | None = None) -> Samples:
-    """As `decode_rgb`, in the 8 bits of the file where it has no more and nothing was laid on white."""
+    """As `decode_rgb`, but in the 8 bits of the file, (H, W, 3) uint8, where it has no more bits and nothing was laid
+    on white."""
     with _opened(data, name) as image:
         _reduce(image, least)
         check_pixels(image.size, name)

@@ -14,7 +14,7 @@ from retrieval.data.resize import RgbImage, Samples, axes, axis_weights, to_unit
 
 
 def resize_photo(image: Samples, size: tuple[int, int]) -> RgbImage:
-    """As `retrieval.data.resize.resized`."""
+    """As `retrieval.data.resize.resized`, bit for bit, in machine code."""
     mixed: Samples = np.ascontiguousarray(image)  # type: ignore[assignment]
     for axis in axes(image.shape, size):
         places, weights = axis_weights(mixed.shape[axis], size[axis])
@@ -27,8 +27,8 @@ def resize_photo(image: Samples, size: tuple[int, int]) -> RgbImage:
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As numba compiles it at its first call, kept beside the source, or in the user's cache, where these can be
-    written. It lets other threads run."""
+    """The function compiled by numba at its first call; machine code is kept beside the source, or in the user's cache,
+    where these can be written. Other threads run meanwhile."""
     try:
         made: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # there is no place to keep it
@@ -53,7 +53,8 @@ def _rows(image: Samples, most: float, places: npt.NDArray[np.int64], weights: R
 
 @_compiled
 def _columns(image: RgbImage, places: npt.NDArray[np.int64], weights: RgbImage) -> RgbImage:
-    """Of an image (H, W, C) the columns (H, new, C), each the sum of those at `places` (taps, new) times `weights`."""
+    """An image (H, W, C) with new columns (H, new, C), each the sum of the columns at `places` (taps, new) times
+    `weights`."""
     height, _, channels = image.shape
     mixed = np.zeros((height, places.shape[1], channels), np.float32)
     for row in range(height):

@@ -42,7 +42,7 @@ def to_unit(image: Samples) -> RgbImage:
 
 
 def resized(samples: Samples, size: tuple[int, int]) -> RgbImage:
-    """As `resize`, of pictures (H, W, C) of any number of channels; nothing is checked."""
+    """As `resize`, for pictures (H, W, C) of any number of channels, and without its checks."""
     image = to_unit(samples)
     for axis in axes(image.shape, size):
         image = _resize_axis(image, axis, size[axis])
@@ -50,7 +50,7 @@ def resized(samples: Samples, size: tuple[int, int]) -> RgbImage:
 
 
 def axes(old: Sequence[int], new: Sequence[int]) -> list[int]:
-    """Of an image's two axes those whose length changes, in the order in which they do: shrink before growing."""
+    """Which of an image's two axes change in length, in the order in which they are resized: shrink before growing."""
     return [axis for axis in sorted((0, 1), key=lambda axis: new[axis] / old[axis]) if old[axis] != new[axis]]
 
 
@@ -78,7 +78,8 @@ def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
 
 @lru_cache(maxsize=64)
 def axis_weights(old: int, new: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
-    """Both (n, new): the n old samples that each new one is mixed from, and their weights, of sum 1."""
+    """Which old samples each of the `new` ones is mixed from, and by what weights: two arrays (n, new), n the most that
+    any one needs; weights add up to 1."""
     rows, columns, weights = (_area_weights if new < old else _linear_weights)(old, new)
     order = np.argsort(rows, kind="stable")
     rows, columns = rows[order], columns[order]

@@ -60,7 +60,7 @@ class Fetched(Catalogue):
 
     @property
     def where(self) -> str:
-        """As indexes name it."""
+        """The URL, by which indexes name the catalogue."""
         return self.url
 
     def read(self, path: str) -> bytes:

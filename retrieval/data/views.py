@@ -72,14 +72,15 @@ def find_object(image: Samples, resize: Resize = resized) -> Box:
 
 
 def _summed(channels: NDArray[np.float32]) -> Grey:
-    """Of three, one after the other, as numpy's own sum of a pixel's numbers, in a tenth of its time."""
+    """The sum of three channels, one added after the other as numpy's own sum over a pixel's numbers does, in a tenth
+    of its time."""
     total: Grey = channels[0] + channels[1] + channels[2]
     return total
 
 
 def _off_the_ground(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """By how much each map of values (n, S, S) lies above a plane through those of its border, and how much these
-    scatter about it (n,)."""
+    """How much each of n maps of values (n, S, S) lies above a plane through the values of its border, and how much
+    these scatter about that plane (n,)."""
     ring, planes, products = _border()
     flat = values.reshape(len(values), -1)
     border, terms = flat[:, ring], planes[:, ring]
@@ -109,7 +110,7 @@ def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float6
 
 
 def _medians(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Of those of each row of values (n, R) that are kept, one at least."""
+    """The median (n,) of the kept values of each row of `values` (n, R); each row keeps one at least."""
     ranked = np.sort(np.where(kept, values, np.float32(np.inf)), axis=1)
     count, rows = kept.sum(axis=1), np.arange(len(values))
     middle: NDArray[np.float64] = (ranked[rows, (count - 1) // 2].astype(np.float64) + ranked[rows, count // 2]) / 2

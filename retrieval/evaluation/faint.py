@@ -80,7 +80,7 @@ def score_faint(
 
 
 def _measures(judged: MethodScores, rows: NDArray[np.bool_]) -> dict[str, Measure]:
-    """Of these test touches with all test photos."""
+    """The measures of some test touches (`rows`) with all test photos."""
     fitted, table = judged.calibration, judged.touches("test", "test")
     part = table.select(rows, np.arange(len(table.photo_owner)))
     return take(Scored(part, part, {}, fitted, judged.seed), MEASURED) if part.askable.any() else {}

@@ -121,7 +121,8 @@ def _false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) ->
 
 
 def _false_accept_share(present: Floats, absent: Floats, weights: Floats) -> float:
-    """By the threshold that accepts 95 % with the object; of equals so large a part that it is 95 % exactly."""
+    """The share of questions without the object that are accepted by the threshold that accepts 95 % of those with it;
+    of equals at the threshold so large a part that it is 95 % exactly."""
     order = np.argsort(-present, kind="stable")
     accepted = np.cumsum(weights[order])
     threshold = present[order][min(int(np.searchsorted(accepted, TRUE_ACCEPTS * accepted[-1])), len(order) - 1)]

@@ -210,7 +210,7 @@ def _timings(material: Material, experiment: Experiment, jobs: Jobs) -> dict[str
 
 
 def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Medians over the seeds; no time of fitting for a method that came fitted."""
+    """Times of a method, medians over the seeds; no time of fitting for a method that came fitted."""
     seconds = {key: float(np.median([one[key] for one in by_seed])) for key in by_seed[0]}
     return {
         "fit_s": seconds["fit"] or None,

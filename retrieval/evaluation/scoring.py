@@ -55,7 +55,8 @@ class MethodScores:
         )
 
     def sets(self, part: str) -> dict[int, ScoreTable]:
-        """By number of grasps: sets of grasps of a part with the photos of that part; sizes that can be asked."""
+        """Scores of sets of grasps of a part with the photos of that part, by the number of grasps in a set; sizes that
+        can be asked."""
         tables = {size: self._sets(part, size) for size in self.queries.sets}
         return {size: table for size, table in tables.items() if table is not None and table.askable.any()}
 
@@ -75,7 +76,7 @@ class MethodScores:
         )
 
     def by_grasps(self, part: str) -> dict[int, ScoreTable]:
-        """For calibration: single touches, and sets of more grasps."""
+        """Scores by number of grasps, as calibration takes them: single touches, and sets of more grasps."""
         return {1: self.touches(part, part)} | {size: table for size, table in self.sets(part).items() if size > 1}
 
     def ids(self, grasp_ids: Sequence[str], part: str) -> tuple[list[str], list[str]]:
@@ -102,7 +103,7 @@ class MethodScores:
 
     @cached_property
     def calibration(self) -> Calibration:
-        """Of single touches, fitted on validation objects."""
+        """The calibration of single touches, fitted on validation objects."""
         return calibrate_pairs(self.touches("validation", "validation"), seed=self.seed)
 
 
@@ -183,7 +184,8 @@ def _confusions(queries: Queries, judged: Sequence[MethodScores], shown: Shown, 
 def _reject(
     judged: Sequence[MethodScores], calibrations: Sequence[Calibrations], draws: int, seed: int
 ) -> dict[str, Any] | None:
-    """Of single grasps all, and by number of grasps how well the two are parted."""
+    """The "reject" of results.json: everything about single grasps, and for each number of grasps how well objects of
+    the catalogue and others are told apart."""
     found = [_rejections(one, fitted, seed) for one, fitted in zip(judged, calibrations, strict=True)]
     if not found[0]:
         return None
@@ -201,7 +203,8 @@ def _reject(
 
 
 def _rejections(judged: MethodScores, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
-    """By number of grasps, where validation objects gave a posterior and test objects can be missed."""
+    """What "none of these" is worth, by number of grasps, where validation objects gave a posterior and enough test
+    objects can be left out."""
     tables = judged.by_grasps("test").items()
     fitted = calibrations.posteriors
     return {

@@ -79,7 +79,7 @@ class Shown:
         return np.where(self.table.own, -np.inf, self.table.scores)
 
     def _best(self, among: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Of each touch, the highest score among these photos."""
+        """For each touch the highest score among these photos."""
         return np.asarray(np.where(among, self._seen(), -np.inf).max(1))
 
     def _first(self, among: NDArray[np.bool_], row: int) -> int:

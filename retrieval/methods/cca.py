@@ -47,7 +47,7 @@ class View:
 
     @property
     def rank(self) -> int:
-        """How many directions vary."""
+        """In how many directions the items vary."""
         return len(self.singular)
 
     def damped(self, ridge: float) -> Matrix:

@@ -71,7 +71,8 @@ class Reduced:
 
     @classmethod
     def of(cls, x: Rows, blocks: Sequence[int]) -> Self:
-        """Of features x (n, F), towers side by side as wide as `blocks` say; a block that does not vary gives none."""
+        """The reduction of features x (n, F), which come from towers that stand side by side, as wide as `blocks` say;
+        a block that does not vary is left out."""
         parts = [_widest(part) for part in np.split(x, np.cumsum(blocks)[:-1], axis=1)]
         weight = np.zeros((x.shape[1], sum(part.weight.shape[1] for part in parts)))
         row = column = 0
@@ -83,7 +84,7 @@ class Reduced:
 
 
 def _widest(x: Rows) -> Affine:
-    """To the widest directions of x (n, F), whose variances add up to 1."""
+    """The map of x (n, F) to its directions of largest variance, scaled so that all variances add up to 1."""
     view = decompose(x, DIRECTIONS)
     size = np.sqrt((view.singular**2).sum() / len(x))
     weight = np.zeros((x.shape[1], view.rank))
@@ -92,7 +93,7 @@ def _widest(x: Rows) -> Affine:
 
 
 def _centred(x: Matrix) -> View:
-    """Of items that are centred already, and whose spread is meant."""
+    """The decomposition of items that are centred already and are not to be scaled: their spread has a meaning."""
     as_it_is = Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1]))
     return factored(x, as_it_is, LEADING)
 
@@ -125,11 +126,12 @@ def fit_codes(
 
 
 class CcaTowers(Method):
-    """Cosine of such codes; the ridge by ranking on validation objects.
+    """CCA on the features of towers that stand side by side: a pair's score is the cosine of its two codes, and the
+    ridge is chosen by ranking on validation objects.
 
-    Where features of a reference touch stand behind those of each photo, the catalogue's entry is both: the touch's
-    cosine with the photo and its cosine with the reference, which is a touch and encoded as one, are weighed as the
-    log-odds of one object say on validation objects.
+    Where features of a reference touch stand behind those of each photo, a catalogue's entry is both. A touch's cosine
+    with the photo and its cosine with the reference, which is encoded as a touch, are then weighed as the log-odds of
+    one object on validation objects say.
     """
 
     def _fit(self, train: "Features", validation: "Features") -> None:
@@ -171,8 +173,9 @@ def _rows(features: "Features") -> Rows:
 
 
 def _weights(codes: Codes, shown: "Features", width: int) -> list[float]:
-    """Of the cosine with a photo and of that with a reference touch, in log-odds: logistic regression over all pairs of
-    a touch and an entry, pairs of one object weighing as much as the others; evidence never counts against itself."""
+    """What the cosine with a photo and that with a reference touch add to the log-odds of one object: logistic
+    regression over all pairs of a touch and an entry, where pairs of one object weigh as much as the others. No weight
+    is negative."""
     from sklearn.linear_model import LogisticRegression  # slow to import
 
     touch, entries = _rows(shown), shown.photo
@@ -184,8 +187,9 @@ def _weights(codes: Codes, shown: "Features", width: int) -> list[float]:
 
 
 def blocks_of(config: Config, features: "Features") -> Blocks:
-    """Of features of the towers of `config`, a reference touch behind a photo not counted; touches alone may stand in
-    place of photos. Raises BadInput for features of others."""
+    """How wide the features of each tower of `config` are, of a touch and of a photo, without those of a reference
+    touch behind a photo; touches alone may stand in place of photos. Raises BadInput for features that are not of these
+    towers."""
     import torch
 
     with torch.device("meta"):

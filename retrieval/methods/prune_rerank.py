@@ -57,7 +57,7 @@ class PruneRerank(LateFusion):
         return np.array(scores)
 
     def _score_sets(self, touch_codes: Array, photo_codes: Array, sets: NDArray[np.int64]) -> Array:
-        """As of one touch; but sets share touches, so that here all photos are judged, each once a touch."""
+        """As for single touches. Sets share touches, so that here all photos are judged, once for each touch."""
         used, place = np.unique(sets, return_inverse=True)
         touch_halves, halves, nearness = self._parts(touch_codes[used], photo_codes)
         logits = super()._score(touch_halves, halves)

@@ -52,7 +52,7 @@ class Validator:
 
     @classmethod
     def of(cls, validation: Features) -> "Validator":
-        """By enough of the validation grasps."""
+        """A validator by as many of the validation grasps as are enough."""
         return cls(validation.select(judged_rows(validation)))
 
     def touches(self, scores: NDArray[np.floating[Any]]) -> float:

@@ -25,8 +25,11 @@ class FirstRelevant(NamedTuple):
 
 
 def first_relevant(scores: Scores, relevant: Mask, shown: Mask) -> FirstRelevant:
-    """scores, relevant, shown: all (Q, N). Raises BadInput where a row is shown nothing relevant, NumericalError for a
-    score that is not finite."""
+    """Where the best relevant entry of each query stands.
+
+    scores, relevant, shown: all (Q, N). Raises BadInput where a row is shown nothing relevant, NumericalError for a
+    score that is not finite.
+    """
     good = _checked(relevant, shown)
     _require_finite(scores)
     best = np.where(good, scores, -np.inf).max(1, keepdims=True)

@@ -43,8 +43,11 @@ class Scored:
 
 @dataclass(frozen=True)
 class Metric:
-    """label: what the report calls it; column: at the head of its own table; section: which table that is; take: gives
-    its values, None where these scores cannot be asked so."""
+    """A metric, as results and reports hold it.
+
+    label: what the report calls it. column: what stands above it in its own table. section: which table that is. take:
+    gives its values; None where it cannot be asked of these scores.
+    """
 
     label: str
     column: str
@@ -63,7 +66,7 @@ def of_photos(count: int) -> str:
 
 
 def guesses(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
-    """`protocols.k_way`; None where there are fewer objects than candidates."""
+    """`protocols.k_way`, or None where there are fewer objects than candidates."""
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
 
 

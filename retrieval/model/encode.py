@@ -162,7 +162,7 @@ class TorchEncoder:
 
     @torch.inference_mode()
     def encode(self, touches: Sequence[Sequence[Image]]) -> TouchCodes:
-        """Of touches, each its fingers' images."""
+        """The codes of grasps, each given as its fingers' images."""
         if self._threads is not None:
             torch.set_num_threads(self._threads)  # which holds for the calling thread
         features = self._fast.touch_features(touch_batch(touches))

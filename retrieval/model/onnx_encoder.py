@@ -44,7 +44,7 @@ class OnnxEncoder:
         self._process, self._session = os.getpid(), self._open()
 
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
-        """Of touches, each its fingers' images in 0..1."""
+        """The codes of grasps, each given as its fingers' images, float32 in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
         if self._process != os.getpid():  # a fork opens its own
             self._process, self._session = os.getpid(), self._open()

@@ -35,7 +35,7 @@ PhotoEncoder = Callable[[Sequence[Image]], PhotoCodes]
 
 
 def on_torch(checkpoint: Checkpoint) -> PhotoEncoder:
-    """By the checkpoint's own towers."""
+    """An encoder by the checkpoint's own towers."""
 
     def encode(images: Sequence[Image]) -> PhotoCodes:
         with one_thread():
@@ -46,7 +46,7 @@ def on_torch(checkpoint: Checkpoint) -> PhotoEncoder:
 
 
 def on_onnx(checkpoint: Checkpoint) -> PhotoEncoder | None:
-    """By ONNX Runtime; None where it or `onnx` is not installed, or cannot run these towers."""
+    """An encoder by ONNX Runtime; None where it or `onnx` is not installed, or cannot run these towers."""
     if any(find_spec(name) is None for name in ("onnx", "onnxruntime")):
         return None
     from retrieval.model.export import photo_graph_of
@@ -60,8 +60,8 @@ def on_onnx(checkpoint: Checkpoint) -> PhotoEncoder | None:
 
 
 def fastest(checkpoint: Checkpoint) -> PhotoEncoder:
-    """The faster one of both, PyTorch unless the other gives the same halves. Not to be called while other threads
-    encode: they would be traced along."""
+    """The faster encoder of the two; PyTorch's unless the other one gives the same halves. Not to be called while other
+    threads encode: the export would record what they do, too."""
     settings = checkpoint.config.preprocessing
     shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
     images = list(np.random.default_rng(0).random(shape, dtype=np.float32))

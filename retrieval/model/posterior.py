@@ -70,7 +70,7 @@ class Mass:
 
     @classmethod
     def joined(cls, masses: Sequence["Mass"]) -> "Mass":
-        """Of several parts, one at least, that have no object in common."""
+        """What several parts of a catalogue weigh together: one part at least, no object in two of them."""
         top = max(mass.top for mass in masses)
         return cls(
             float(np.logaddexp.reduce([mass.judged + (mass.top - top) for mass in masses])),
@@ -80,7 +80,8 @@ class Mass:
         )
 
     def extended(self, objects: int) -> "Mass":
-        """With so many other objects of which nothing is known: each is taken to weigh what these do on average."""
+        """The same with so many more objects, of which nothing is known: each is taken to weigh what these do on
+        average."""
         if not objects:
             return self
         mean = float(np.logaddexp(self.judged, self.unjudged)) - math.log(self.objects)
@@ -236,7 +237,8 @@ def fit_posterior(*parts: JudgedTouches, seed: int = 0) -> Posterior:
 
 
 def questions_of(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
-    """Of single touches, and then of sets of each size that its objects have grasps for."""
+    """Questions asked by single touches, and then by sets of two grasps, three and so on, as far as objects have grasps
+    for them."""
     for grasps in range(1, _MOST_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
         sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch
@@ -266,7 +268,8 @@ class Questions:
 
     @classmethod
     def of(cls, judged: JudgedTouches, sets: Numbers, seed: int = 0) -> "Questions":
-        """Of sets of touches (S, G). Raises BadInput where there are none, or fewer than three objects."""
+        """Questions asked by sets of G touches each, `sets` (S, G). Raises BadInput where there are none, or fewer than
+        three objects."""
         objects, owner = np.unique(judged.photo_owner, return_inverse=True)
         if len(objects) < LEAST_OBJECTS or not len(sets):
             raise BadInput(
@@ -312,7 +315,7 @@ class Questions:
 
 
 def fit_questions(asked: Sequence[Questions]) -> Posterior:
-    """The likeliest posterior. Numbers of grasps count by their questions.
+    """The likeliest posterior for the answers to all of these questions, each counting once.
 
     Targets are smoothed as Platt's are (1999, section 2.2), so that logits that never err have a finite optimum too,
     and the slope stays within `SLOPE_BOUNDS`.

@@ -75,8 +75,8 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, halves: Tensor, embedding_dim: int = 0) -> Self:
-        """Of halves (N, half), the last `embedding_dim` numbers of which are an embedding; what does not vary is not
-        scaled up."""
+        """The spread of halves (N, half), of which the last `embedding_dim` numbers are an embedding; what does not
+        vary is not scaled up."""
         end = halves.shape[1] - embedding_dim
         parts = [part for part in (halves[:, :end], halves[:, end:]) if part.shape[1]]
         scale = torch.cat([part.std(correction=0).expand(part.shape[1]) for part in parts])
@@ -88,7 +88,7 @@ class Spread(NamedTuple):
 
 
 def _side_by_side(student: nn.Module, axes: nn.Linear | None, half: Tensor) -> Tensor:
-    """(B, embedding_dim): what a network makes of halves, and what is linear in their embeddings."""
+    """What a network makes of halves and what is linear in their embeddings, in one array (B, embedding_dim)."""
     made: Tensor = student(half)
     return made if axes is None else torch.cat([made, axes(half[..., -axes.in_features :])], dim=-1)
 

@@ -120,7 +120,7 @@ class _Asked:
 
     @property
     def both(self) -> NDArray[np.float64]:
-        """(T, N): C of each photo's object."""
+        """(T, N): C of each touch with the object of each photo."""
         return np.asarray(self.alone.logits[:, self.photos.photo_owner])
 
     @property

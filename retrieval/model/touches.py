@@ -240,11 +240,11 @@ class _Forks:
         self._threads &= alive
 
     def after_in_parent(self) -> None:
-        """Others go on."""
+        """Let other threads go on."""
         self._idle.release()
 
     def after_in_child(self) -> None:
-        """Nothing is computed here yet."""
+        """Begin anew: no thread of the parent is here, and nothing is computed yet."""
         self._idle, self._computing, self._threads = threading.Condition(), 0, set()
 
 
@@ -281,7 +281,8 @@ class TouchReader:
     def encode(
         self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None], clock: Stopwatch
     ) -> TouchCodes:
-        """Of all grasps, in batches, with stages "decode" and "encode" on the clock."""
+        """The codes of grasps, made in batches; the clock counts the stages "decode" and "encode". references: the
+        no-contact frame of each finger, or None."""
         parts, levels = [], []
         for start in range(0, len(grasps), BATCH):
             with clock("decode"):

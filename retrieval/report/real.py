@@ -165,7 +165,7 @@ def verdicts(entry: Entry) -> list[str]:
 
 
 def _label(name: str, row: Entry) -> str:
-    """A method as elsewhere; a model by the name that it was given."""
+    """What a row is called: a method as everywhere, a model by the name that it was given."""
     return method_label(name) if row["model"] is None and name in METHODS else f"{name} (as it is)"
 
 

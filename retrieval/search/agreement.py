@@ -20,8 +20,10 @@ LONGER_SIDE = 640
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """logit: of the whole photo with the touches. falls (rows, columns): by how much it falls when that square of the
-    photo is hidden; what is below 0 spoke against the match.
+    """What of a photo speaks for a match, found by hiding one square of it after the other.
+
+    logit: match logit of the whole photo with the touches. falls (rows, columns): by how much the logit falls when that
+    square is hidden; a square with a negative number speaks against the match.
 
     >>> with retrieval.open("index") as searcher:
     ...     found = retrieval.agreement(searcher, ["a.png", "b.png"], "catalog/mug/1.jpg", squares=2)

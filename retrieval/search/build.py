@@ -215,8 +215,8 @@ def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str
 
 
 def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:
-    """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest say the
-    same. Parts are held back until one differs; these have rows alone."""
+    """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest would
+    say the same. Parts are held back until one differs; these have rows alone."""
     told = {ROWS: None, **about}  # there may be no references any more
     if parent is None or any(parent.manifest.about.get(key) != value for key, value in told.items()):
         return parts
@@ -279,7 +279,7 @@ class _Job:
 
 
 def _said(references: MadeReferences, generation: Generation) -> dict[str, Any] | None:
-    """Of reference touches, for the report."""
+    """What the report says of reference touches; None where the catalogue has none."""
     if not references.rows:
         return None
     counts = {key: generation.manifest.about[ROWS][key] for key in ("touches", "objects")}
@@ -288,8 +288,9 @@ def _said(references: MadeReferences, generation: Generation) -> dict[str, Any] 
 
 
 def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
-    """The generation to take unchanged photos over from, or one to take halves alone from; and where there is one that
-    cannot serve as a whole, what is made again and why."""
+    """What the index holds that can be used again: a generation of which unchanged photos are taken over whole, one of
+    which their halves alone are, and in words what is made again and why. Where there is no index yet: None, None and
+    nothing."""
     try:
         there = store.open()
     except NoIndex:

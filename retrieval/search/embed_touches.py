@@ -39,8 +39,11 @@ BATCH = 32
 
 @dataclass(frozen=True, eq=False)
 class MadeReferences:
-    """rows: of each touch its object, the paths of its gel images and their digests; halves (R, half). alone: objects
-    without photos. skipped: what could not be used. encoded: how many were not taken over."""
+    """The reference touches of a catalogue (R of them), encoded.
+
+    rows: of each touch its object, the paths of its gel images and their digests. halves (R, half). alone: objects
+    without photos. skipped: what could not be used. encoded: how many were encoded now, not taken over from the parent.
+    """
 
     rows: list[dict[str, Any]]
     halves: Halves
@@ -50,12 +53,12 @@ class MadeReferences:
 
     @property
     def documents(self) -> dict[str, Any]:
-        """For the generation; nothing without references."""
+        """What a generation keeps of the references; empty without any."""
         return {ROWS: {"touches": self.rows, "alone": self.alone}, CODES: self.halves} if self.rows else {}
 
     @property
     def about(self) -> dict[str, Any]:
-        """For the manifest; nothing without references."""
+        """What the manifest says of the references; empty without any."""
         if not self.rows:
             return {}
         told = json.dumps([self.rows, self.alone]).encode()
@@ -63,7 +66,8 @@ class MadeReferences:
         return {ROWS: {"touches": len(self.rows), "objects": objects, "sha256": hashlib.sha256(told).hexdigest()}}
 
     def shown(self, catalogue: Catalogue) -> Catalogue:
-        """With a picture of each object without photos, for people: the first gel image of its first touch."""
+        """The catalogue, with a picture to show of each object that has no photo: the first gel image of its first
+        touch."""
         first: dict[str, CatalogueTouch] = {}
         for touch in catalogue.touches:
             if touch.object_id in self.alone:
@@ -151,7 +155,8 @@ def _require_fit(checkpoint: Checkpoint) -> None:
 
 
 def _require_told(references: MadeReferences, photographed: set[str]) -> None:
-    """Enough touches to tell what references are worth, of objects with photos where there are such."""
+    """Raise BadInput unless enough objects have two touches to tell what references are worth; of objects with photos
+    where any touched object has one."""
     counts = Counter(row["object_id"] for row in references.rows)
     both = set(counts) & photographed
     several = [name for name, count in counts.items() if count > 1 and (name in both or not both)]
@@ -182,7 +187,8 @@ def _read(
     known: Mapping[tuple[str, ...], Halves],
     skipped: list[SkippedPhoto],
 ) -> Iterator[tuple[dict[str, Any], list[Image], Halves | None]]:
-    """Of each touch its row, and its half where that is known, else what the tower sees."""
+    """For each touch its row, what the tower sees of it, and its half where that is known already. A touch that cannot
+    be used is added to `skipped`."""
     fingers, see = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
     for touch in touches:
         if len(touch.paths) != fingers:

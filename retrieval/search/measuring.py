@@ -59,7 +59,7 @@ class Point:
 
     @property
     def ms(self) -> float:
-        """Milliseconds for one touch."""
+        """Milliseconds of search and judging together, for one touch."""
         return self.search_ms + self.judge_ms
 
 
@@ -199,7 +199,7 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
 
 
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
-    """As many touches as `MEASURING` lets judge every photo, but `LEAST_QUERIES`; a judgement is a product with a
-    square matrix."""
+    """The halves and embeddings of as many touches as may judge every photo within `MEASURING` operations (a judgement
+    is a product with a square matrix), but of `LEAST_QUERIES` at least."""
     affordable = MEASURING / (2.0 * photos * checkpoint.config.matcher.hidden**2)
     return query_codes(checkpoint, max(LEAST_QUERIES, int(affordable)))

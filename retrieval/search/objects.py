@@ -84,7 +84,7 @@ class Objects:
         return len(self._photos)
 
     def numbers_of(self, names: Sequence[str]) -> Rows:
-        """Of each object its number, -1 for one that is not there."""
+        """The number of each object named; -1 for one that is not there."""
         keys, first = np.unique(self._rows.keys("object_id"), return_index=True)
         wanted = keys_of(names)
         places = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

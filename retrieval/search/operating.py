@@ -142,8 +142,8 @@ def _kind_points(bench: Bench, built: VectorIndex, asked: Asked, least: int) -> 
 
 
 def _ends(point: Point, asked: Asked) -> bool:
-    """Whether nothing more need be tried: it has the recall, and is within the time, or without one not held up by
-    the search."""
+    """Whether no further point need be tried: this one has the recall and is within the time; where no time was asked
+    for, its search takes no longer than its judging."""
     if point.recall < asked.target:
         return False
     if asked.max_ms is not None:
@@ -152,7 +152,7 @@ def _ends(point: Point, asked: Asked) -> bool:
 
 
 def _hurried(bench: Bench, asked: Asked, tried: Sequence[Point]) -> Iterator[Point]:
-    """With fewer candidates than the recall needs, where the time is short and was all that was asked for."""
+    """Points with fewer candidates than the recall needs, for a user who asked for a short time and nothing else."""
     if asked.max_ms is None or asked.min_recall is not None:
         return
     for kind in dict.fromkeys(point.kind for point in tried):
@@ -164,8 +164,8 @@ def _hurried(bench: Bench, asked: Asked, tried: Sequence[Point]) -> Iterator[Poi
 
 
 def _nearest(points: Sequence[Point], asked: Asked) -> Point:
-    """Where time alone was asked for, the highest recall within it; else, or where nothing is, the fastest with the
-    recall."""
+    """The point to take where none was good enough. Where only a time was asked for: the highest recall within that
+    time. Else, and where nothing is within it: the fastest point with the recall."""
     quick = [point for point in points if asked.max_ms is not None and point.ms <= asked.max_ms]
     if asked.min_recall is None and quick:
         return max(quick, key=lambda point: (point.recall, -point.ms))
@@ -196,8 +196,8 @@ def all_judged(photos: int, asked: Asked) -> dict[str, Any]:
 
 
 def kept(previous: Mapping[str, Any] | None, asked: Asked, photos: int, changed: int) -> dict[str, Any] | None:
-    """What was measured before, where it was asked for alike and too few of `photos` have changed since to measure
-    again; `changed`: in this build."""
+    """The record of what was measured before, brought up to date, where the same was asked for and too few of `photos`
+    have changed since to measure again; else None. changed: how many photos this build changed."""
     if not previous or not previous.get("queries") or previous["asked"] != asdict(asked):
         return None
     total = previous["changed"] + changed

@@ -23,7 +23,7 @@ Near = NDArray[np.float64]
 
 
 class _Touch(NamedTuple):
-    """Of an object: its gel images, and the digests of their files."""
+    """A reference touch: its object, the paths of its gel images, and the digests of their files."""
 
     object_id: str
     paths: tuple[str, ...]
@@ -114,7 +114,7 @@ class References:
 
 
 def open_references(generation: Generation, objects: Objects, hidden: int) -> References | None:
-    """Those of a generation; None where it has none. Raises CorruptIndex."""
+    """The reference touches of a generation; None where it has none. Raises CorruptIndex."""
     return References(generation, objects, hidden) if ROWS in generation.documents else None
 
 
@@ -128,7 +128,8 @@ def told_of(about: Mapping[str, Any]) -> dict[str, Any]:
 def by_both(
     references: References, objects: Objects, rows: Numbers, logits: Floats, grasps: int
 ) -> JudgedObjects | None:
-    """Objects by their photos, as the posterior beside references takes these."""
+    """Objects judged by their photos with the posterior that is used beside references; None where no object has both
+    photos and references."""
     beside = references.worth.beside
     return None if beside is None else objects.judged(rows, logits, beside, grasps)
 

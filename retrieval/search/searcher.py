@@ -249,7 +249,7 @@ class Searcher:
         candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
-        """An answer for each of `asked`, which names the grasps that are of its object."""
+        """An answer for each object in the hand; each slice of `asked` names the grasps that are of one object."""
         require_prior(none_prior)
         clock = Stopwatch()
         references = self.reader.references(background)
@@ -317,7 +317,7 @@ class Searcher:
         )
 
     def _shares(self, judged: "_Judged | None") -> dict[str, Any]:
-        """Of how many shards the index is, and which share of its photos could be searched."""
+        """For an index of several shards: how many there are, and which share of all photos could be searched."""
         searched = self.described.photos if judged is None else judged.found.searched
         return {"shards": self.described.shards, "searched": searched / self.described.photos}
 

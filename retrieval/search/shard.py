@@ -204,7 +204,7 @@ class FolderShard:
         return np.sort(self.generation.candidates(together(embeddings), k)[0])
 
     def _with_near(self, rows: Rows, near: Near | None, most: int) -> Rows:
-        """With the photos of at most so many objects whose reference touches are nearest."""
+        """The rows, and with them the photos of at most `most` objects, those whose reference touches are nearest."""
         if self.references is None or near is None or len(rows) == self.generation.count:
             return rows
         return np.union1d(rows, self.objects.rest_of(self.references.nearest_objects(near, most), rows))
@@ -259,9 +259,12 @@ class FolderShard:
 
 
 def together(embeddings: Floats) -> Floats:
-    """Of grasps (G, d) the unit embedding (1, d) whose cosines order photos as the sums of the grasps' do: match logits
-    add, and so do the cosines that foretell them. Where they cancel out no photo is nearer than another, and the first
-    grasp's stands for all."""
+    """One embedding (1, d) of unit length that stands for several grasps (G, d): its cosines order photos as the sums
+    of the grasps' cosines do.
+
+    Match logits of grasps add, and so do the cosines that foretell them. Where the embeddings cancel out, no photo is
+    nearer than another, and the first grasp's stands for all.
+    """
     total = embeddings.sum(0, keepdims=True, dtype=np.float64)
     length = float(np.linalg.norm(total))
     return embeddings[:1] if length < CANCELLED else (total / length).astype(np.float32)
@@ -316,5 +319,6 @@ def one_page(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: in
 
 
 def first_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
-    """Of what shards say of the same photos, what is not None."""
+    """The row of each photo, from whichever shard has it: `found` holds what every shard says of the same photos, None
+    where it has none."""
     return [next((row for row in rows if row is not None), None) for rows in zip(*found, strict=True)]

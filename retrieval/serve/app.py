@@ -123,7 +123,7 @@ class Counted:
         self.app, self.metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Pass a request on, and count its response (ASGI)."""
 
         async def counted(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -139,7 +139,7 @@ def _result(answer: dict[str, Any], grasps: list[list[GivenImage]]) -> QueryResu
 
 
 def _said(options: QueryOptions) -> dict[str, Any]:
-    """Of the body: what was said beside the touches."""
+    """The options of a query as the service takes them in a body, beside the touches."""
     frames = options.get("background")
     if frames is None:
         return dict(options)

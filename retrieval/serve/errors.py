@@ -60,11 +60,11 @@ class Problem(Exception):
 
     @property
     def status(self) -> int:
-        """Of HTTP."""
+        """The status of HTTP."""
         return KINDS[self.kind][0]
 
     def response(self) -> JSONResponse:
-        """The document."""
+        """The problem document as a response."""
         status, title = KINDS[self.kind]
         detail = self.detail if len(self.detail) <= LONGEST else self.detail[:LONGEST] + " ..."
         document = ProblemDocument(type=PREFIX + self.kind, title=title, status=status, detail=detail)

@@ -31,7 +31,7 @@ class Opened:
 
     @property
     def name(self) -> str:
-        """Of the generation."""
+        """The name of the generation."""
         return self.searcher.described.name
 
     def checkpoint(self) -> Checkpoint:
@@ -53,7 +53,7 @@ class Generations:
 
     @property
     def ready(self) -> bool:
-        """Whether one is open."""
+        """Whether a generation is open."""
         return self._current is not None
 
     @property

@@ -252,8 +252,8 @@ def _first_photo(opened: Opened, object_id: str) -> str:
 
 
 def _photo(opened: Opened, photo: str) -> bytes | None:
-    """Its file; None where it is gone, or where a gel image stands for a photo, and then the grasps are kept but in no
-    recording."""
+    """The file of a catalogue's photo. None where it is gone, or where a gel image stands for a photo: the grasps are
+    then kept, but in no recording."""
     (row,) = opened.shard.rows([photo])
     try:
         return (
@@ -297,20 +297,21 @@ def _archive(keeping: Keeping) -> Iterator[bytes]:
 
 
 def _files_of(folder: Path) -> list[Path]:
-    """Of a recording, the lines after the images: what they name is in the archive."""
+    """The files of a recording; the lines of metadata come after the images, so that what they name is in the
+    archive."""
     found = [folder / "recording.json", *sorted((folder / "images").glob("*.*")), folder / "metadata.jsonl"]
     return [path for path in found if path.is_file() and path.suffix != ".part"]
 
 
 class _Sink(io.RawIOBase):
-    """What is written into it is taken out again."""
+    """A file for `zipfile` to write to, out of which what was written is taken as it comes."""
 
     def __init__(self) -> None:
         super().__init__()
         self._parts: list[bytes] = []
 
     def writable(self) -> bool:
-        """It is."""
+        """Always: this is what `zipfile` asks."""
         return True
 
     def write(self, data: Any) -> int:

@@ -53,5 +53,5 @@ class Metrics:
         self.reloads.inc()
 
     def page(self) -> bytes:
-        """In Prometheus' text format."""
+        """All numbers, in the text format of Prometheus."""
         return generate_latest(self.registry)

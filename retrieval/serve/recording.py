@@ -26,7 +26,7 @@ class Recorder(Protocol):
 
     @property
     def grasp_ids(self) -> Set[str]:
-        """What is recorded."""
+        """The ids of the grasps that are recorded."""
 
     def append(self, grasp_id: str, object_id: str, images: Mapping[str, bytes], **fields: Any) -> object:
         """Record a grasp; it is on the disk when this returns."""

@@ -48,7 +48,8 @@ def of_index(index: str | Path) -> LiveRig | None:
 
 
 def _seed(index: str | Path) -> int | None:
-    """Of the simulated objects that an index shows; None where its first is none, or lies behind a URL."""
+    """The seed of the simulated objects that an index shows; None where its first object is none of the simulated rig,
+    and for an index behind a URL."""
     if is_url(index):
         return None
     try:

@@ -61,7 +61,7 @@ class Guard:
         self.app, self.settings = app, settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Answer a request, or refuse it (ASGI)."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -116,7 +116,8 @@ def _host_name(host: str) -> str:
 
 
 def _given_tokens(headers: Headers) -> list[str]:
-    """By the header of programs, and by the cookie of the page, whose pictures cannot send a header."""
+    """The tokens that a request carries: in the header, as programs send it, and in the cookie of the page, whose
+    pictures cannot send a header."""
     scheme, _, value = headers.get("authorization", "").partition(" ")
     found = [value.strip()] if scheme.lower() == "bearer" else []
     try:

@@ -10,7 +10,7 @@ CACHED_BYTES = 32 * 2**20
 
 
 class Thumbnails:
-    """Of files, by what is in them."""
+    """Small JPEG pictures of photo files, kept in memory by the content of the file."""
 
     def __init__(self, most_bytes: int = CACHED_BYTES) -> None:
         self._kept: OrderedDict[tuple[Path, str, int], bytes] = OrderedDict()

@@ -52,7 +52,7 @@ def share_of(right: int, trials: int) -> Share:
 
 
 def results(choices: list[Choice]) -> tuple[Share, Share]:
-    """Of the person, and of the model in the same trials."""
+    """The shares of right choices: of the person, and of the model in the same trials."""
     right = [sum(one.choice == one.truth for one in choices), sum(one.model == one.truth for one in choices)]
     return share_of(right[0], len(choices)), share_of(right[1], len(choices))
 

@@ -40,7 +40,7 @@ class BodyLimit:
         self.app, self.seconds, self.held = app, seconds, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Pass a request on, whose body is refused where it is too large or too slow (ASGI)."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -77,7 +77,7 @@ class BodyLimit:
 
 
 def too_large() -> Problem:
-    """Of a body."""
+    """What is answered to a body that is too large."""
     return Problem("too-large", f"a request may hold at most {MAX_BODY_BYTES:,} bytes; send smaller pictures", _CLOSE)
 
 
@@ -163,7 +163,8 @@ QUERY_BODY = {
 
 
 def json_body(model: str) -> dict[str, Any]:
-    """For OpenAPI: a JSON body of the schema `model`, which `app.document` adds."""
+    """What OpenAPI says of a path that takes a JSON body of the schema `model`; `retrieval.serve.app` adds the
+    schema."""
     schema = {"$ref": f"#/components/schemas/{model}"}
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
@@ -178,7 +179,7 @@ class Asked:
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Of `Searcher.query`, beside the touches."""
+        """The keywords of `Searcher.query`, all but the touches."""
         said = self.options
         return {
             "background": self.background,

@@ -265,7 +265,7 @@ class _Parts(Generic[T]):
     quiet: bool
 
     def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
-        """(len(items), F)."""
+        """The features (len(items), F) of items, in their order."""
         shown = self.made_by[0]
         unit = "photos" if shown in SHOWN else "grasps"
         with Bar(f"encode {shown}", len(items), unit, quiet=self.quiet) as bar, ThreadPoolExecutor(2) as pool:

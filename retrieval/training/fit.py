@@ -19,8 +19,12 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True)
 class Plan:
-    """steps: of the optimiser. learning_rate: of the first, then by `schedule` (`retrieval.model.config.SCHEDULES`).
-    validate_every: so many steps, and after the last, the module is validated."""
+    """How long to train, and how fast.
+
+    steps: how many steps the optimiser takes. learning_rate: of the first step; then it follows `schedule`
+    (`retrieval.model.config.SCHEDULES`). validate_every: the module is validated after so many steps, and after the
+    last.
+    """
 
     steps: int
     learning_rate: float

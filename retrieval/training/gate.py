@@ -58,7 +58,7 @@ class GraspNet(nn.Module):
         self.last = nn.Linear(64, 1)
 
     def forward(self, differences: Tensor) -> Tensor:
-        """See the class."""
+        """The logits (B, fingers) that a grasp succeeded; the class says of what."""
         maps = self.layers(differences.flatten(0, 1) / self.scale).flatten(2)
         logits: Tensor = self.last(torch.cat([maps.mean(2), maps.amax(2)], dim=1).log1p())
         return logits.view(differences.shape[:2])

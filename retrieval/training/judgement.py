@@ -137,7 +137,7 @@ class Pictures:
     def of(
         cls, matcher: Matcher, settings: Preprocessing, grasps: Sequence[Grasp], touches: Tensor, count: int, seed: int
     ) -> "Pictures":
-        """Of recorded grasps, whose touch features are known, and as many foreign pictures as are asked for."""
+        """Pictures of recorded grasps, whose touch features are known, and `count` foreign ones."""
         fingers = matcher.config.fingers
         frames = list(_untouched(settings, grasps, fingers))
         some = [grasps[row] for row in np.linspace(0, len(grasps) - 1, min(_PIECES, len(grasps))).round().astype(int)]

@@ -62,7 +62,7 @@ class ReliefReport:
     sizes: dict[str, float]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The report as lines for people."""
         return [
             f"{self.kind}: {self.steps} steps on {self.pictures} pictures of {self.objects} objects",
             "objects held out: "
@@ -326,13 +326,13 @@ def _sampled(images: Tensor, maps: Tensor, shown: float) -> Tensor:
 
 
 def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
-    """Of Pearson; 0 where one of them does not vary."""
+    """Pearson's correlation; 0 where one side does not vary."""
     if len(readings) < 2 or readings.std() == 0 or wanted.std() == 0:
         return 0.0
     return float(np.corrcoef(readings, wanted)[0, 1])
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
-    """As JSON gives it back: lists for tuples."""
+    """Settings as JSON gives them back, with lists for tuples."""
     plain: dict[str, Any] = json.loads(json.dumps(settings))
     return plain

@@ -196,7 +196,7 @@ class Trainer:
         return self.features.prepare(self.matcher, batch)
 
     def loss(self, loaded: Loaded) -> Tensor:
-        """Of a prepared batch."""
+        """The loss of a prepared batch."""
         settings, batch = self.config.training, loaded.batch
         torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
         touch, photo = self.features.train_features(self.matcher, loaded)
@@ -356,7 +356,8 @@ def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
-    """Training mode; what is frozen stays in evaluation mode, so that its running statistics stand still.
+    """Put the matcher into training mode. What is frozen stays in evaluation mode, so that its running statistics stand
+    still.
 
     Frozen towers are never switched, not even for a moment: another thread may be encoding with them.
     """

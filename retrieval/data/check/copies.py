@@ -57,7 +57,7 @@ def look_at(path: Path) -> Thumbnail:
 
 
 def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
-    """Of a picture's bytes and what they decode to."""
+    """The thumbnail of a picture: `data` are the bytes of its file, `image` what they decode to."""
     picture = np.rint(255 * image).astype(np.uint8)
     return Thumbnail(
         sha256(data).hexdigest(), _small(picture), np.stack([_small(changed(picture)) for changed in DAMAGES])
@@ -76,7 +76,7 @@ def as_jpeg(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def brighter(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """With a tenth more light."""
+    """The picture with a tenth more light."""
     return np.asarray(np.clip(np.rint(picture * np.float32(1.1)), 0, 255).astype(np.uint8))
 
 
@@ -119,8 +119,8 @@ def is_copy(one: Thumbnail, other: Thumbnail) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Of each query (q,): row and distance of the nearest picture of another object, whether a copy of the query could
-    have been told from other pictures, and whether that nearest one is a copy."""
+    """For each of q queries, arrays (q,): row and distance of the nearest picture of another object, whether a copy of
+    the query could have been told from other pictures, and whether that nearest one is a copy."""
 
     row: NDArray[np.int64]
     distance: NDArray[np.float64]
@@ -141,7 +141,8 @@ class PictureSet:
         self.changed = SLACK * (1 - np.array(likeness, dtype=np.float64).reshape(-1, len(DAMAGES)))
 
     def nearest(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> Nearest:
-        """Of the pictures `queries` (rows), the nearest of those in `among` that show another object."""
+        """For each of the pictures `queries` (rows of this set), the nearest of those in `among` that show another
+        object."""
         if not len(queries) or not len(among):
             nothing = np.zeros(len(queries), dtype=bool)
             return Nearest(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)

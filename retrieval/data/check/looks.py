@@ -45,8 +45,11 @@ def swapped_fingers(a: Looks, b: Looks) -> Rows | None:
 
 @dataclass(frozen=True)
 class Moments:
-    """swapped: grasps whose frames before and during look exchanged; throughout: whether all do; faint: how many
-    touches differ from the untouched gel too little to tell."""
+    """What the moments at which frames were taken look like.
+
+    swapped: grasps whose frames before and during the contact look exchanged. throughout: whether all do. faint: how
+    many touches differ too little from the untouched gel to tell.
+    """
 
     swapped: Rows
     throughout: bool
@@ -112,8 +115,11 @@ def named_by(values: NDArray[np.floating], objects: NDArray[np.int64]) -> Named:
 
 @dataclass(frozen=True)
 class Exchanges:
-    """pairs: grasps (row, row) of two objects whose photos look exchanged; told_apart: of how many pairs of objects
-    (`all`) the photos look different enough to notice."""
+    """Photos that look exchanged between objects.
+
+    pairs: grasps (row, row) of two objects whose photos look exchanged. told_apart: of how many pairs of objects
+    (`all`) the photos look different enough for that to be noticed.
+    """
 
     pairs: list[tuple[int, int]]
     told_apart: int

@@ -45,7 +45,7 @@ class Facts:
 
 
 def read_facts(folder: Path) -> Facts:
-    """Read a recording. Raises DatasetError."""
+    """What is known of a recording's grasps. Raises DatasetError."""
     grasps = load_grasps(folder)  # which checks the files that are read here
     info = read_json(folder / "recording.json")
     said = info.get("objects")
@@ -85,12 +85,13 @@ class Protocol:
 
     @property
     def main(self) -> str:
-        """The measure that decides."""
+        """The name of the measure that decides."""
         return next(iter(self.measures))
 
 
 def fold(rest: Sequence[str], test: Sequence[str], seed: Sequence[int]) -> Split:
-    """Test on `test`; of the rest a few choose, as many as `CHOOSING` or a quarter, and the others train."""
+    """A split that tests on `test`; of the other objects `CHOOSING`, or a quarter where that is fewer, validate, and
+    the rest train."""
     order = np.random.default_rng([*seed, 17]).permutation(len(rest))
     count = max(2, min(CHOOSING, len(rest) // 4))
     return Split(

@@ -150,7 +150,8 @@ class _Asked:
 
     @cached_property
     def facts(self) -> Facts:
-        """Of the grasps that ask."""
+        """What is known of the grasps that ask: of all, or where reference touches are asked for, of those that have
+        one, which then stands in place of their photo."""
         return self.all_facts if self.protocol.entry == PHOTO else referenced(self.all_facts)
 
     @cached_property
@@ -235,7 +236,7 @@ class _Asked:
         return entries
 
     def _examples(self, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
-        """Of the first row that looks at its input, first seed: the best and the worst queries of all folds."""
+        """The best and the worst queries of all folds, of the first seed, for the first row that looks at its input."""
         row = next((row for row in self.rows if row.method not in KNOW_NOTHING), self.rows[0])
         folds = found[f"{row.name}-touch"][0]
         every = {kind: [one for fold in folds for one in fold.examples[kind]] for kind in ("best", "worst")}
@@ -246,8 +247,8 @@ class _Asked:
     # One fold ----------------------------------------------------------------------------------------
 
     def _measured(self, line: Line, seed: int, number: int, split: Split) -> Measured:
-        """Of one line in one fold: what is kept, else fitted and asked, and then kept. Scores are not kept: those of
-        all folds fill gigabytes."""
+        """The measures of one line in one fold: those that are kept, else the line is fitted and asked, and its
+        measures are kept. Scores are not kept: those of all folds fill gigabytes."""
         self._require_unseen(line, split)
         features, towers = self._features(line), line.row.towers
         made_by = digest(

@@ -37,7 +37,7 @@ class Towers:
 
     @classmethod
     def of_model(cls, grasps: list[Grasp], model: Path, cache: Path, quiet: bool) -> "Towers":
-        """Those of a checkpoint. Where it has two fingers and the recording one, both are shown that one's touch.
+        """The towers of a checkpoint. Where it has two fingers and the recording one, both are shown that one's touch.
 
         Raises CheckpointError, and DatasetError where the recording has more fingers.
         """

@@ -99,7 +99,7 @@ def ranks(queries: Array, embeddings: Array, winners: NDArray[np.int64]) -> NDAr
 
 
 def _first_guesses(sample: Sample) -> Panel:
-    """On real photos only: a blend is of no object."""
+    """First guesses lost to fewer candidates; on real photos only, as a blend is of no object."""
     rows = sample.touch_rows[: sample.scale.queries]
     asked, halves, count = sample.touch_codes(rows), sample.own["half"], len(sample.photo_rows)
     points, works = list[Tradeoff](), list[Callable[[], object]]()

@@ -30,7 +30,7 @@ class Tradeoff:
 
     @property
     def name(self) -> str:
-        """Series and setting."""
+        """Series and setting, with a comma between."""
         return ", ".join(part for part in (self.series, self.setting) if part)
 
 
@@ -86,7 +86,7 @@ class Panel:
         return "; ".join(said)
 
     def said(self, point: Tradeoff) -> str:
-        """One point in words."""
+        """A point in words: its name, its error and its time."""
         return f"{point.name}: {number(point.error)} {self.unit}, {duration(point.seconds)}"
 
     def to_dict(self) -> dict[str, Any]:

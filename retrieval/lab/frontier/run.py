@@ -70,7 +70,7 @@ def _kept(path: Path) -> dict[str, Any]:
 
 
 def _digest(sample: Sample, name: str) -> str:
-    """Of what makes a row: software, machine, scale, and the model and grasps where it needs them."""
+    """A digest of all that makes a row: software, machine, scale, and the model and grasps where it needs them."""
     made_by: dict[str, Any] = {"name": name, "format": FORMAT, "software": __version__, "machine": machine()}
     made_by["scale"] = dataclasses.asdict(sample.scale)
     if name not in NEED_NOTHING:

@@ -69,7 +69,7 @@ class Sample:
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
-        """The model."""
+        """The loaded model."""
         return load_checkpoint(self.model)
 
     @cached_property
@@ -89,7 +89,7 @@ class Sample:
 
     @cached_property
     def digest(self) -> str:
-        """Of the grasps: ids and images."""
+        """A digest of the grasps: of their ids and images."""
         return data_digest(self.grasps)
 
     @cached_property
@@ -128,7 +128,7 @@ class Sample:
         return self._codes(self.features.touch[rows].reshape(len(rows), -1), photo=False)
 
     def photo_codes(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """The same of photos."""
+        """As `touch_codes`, of the photos at these rows."""
         return self._codes(self.features.photo[rows], photo=True)
 
     @torch.inference_mode()

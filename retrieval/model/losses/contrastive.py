@@ -12,7 +12,7 @@ LOG_SCALE_MAX = math.log(100.0)
 
 
 def of_batch(batch: EncodedBatch) -> Tensor:
-    """Of the embeddings by the contrastive projections."""
+    """`contrastive_loss` of the embeddings of a batch, made by the contrastive projections."""
     objects = batch.touch_objects, batch.photo_objects
     return contrastive_loss(batch.touch.embedding, batch.photo.embedding, *objects, batch.matcher.log_scale)
 

@@ -8,7 +8,7 @@ from retrieval.model.losses import EncodedBatch
 
 
 def of_batch(batch: EncodedBatch) -> Tensor:
-    """Of the match logits of every touch with every photo."""
+    """`listwise_loss` of the match logits of every touch of a batch with every photo of it."""
     logits = batch.matcher.head(batch.touch.half[:, None], batch.photo.half[None])
     return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
 
