@@ -55,9 +55,12 @@ _DTYPES = {
 class Checkpoint(Stored):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
-    posterior: what its logits mean; None where it was never calibrated. references: what reference touches are worth;
-    None where nothing could tell. queries: (Q, half) halves of touches of
-    validation objects, by which an index can measure its own search.
+    * `config`: settings of towers, head and preprocessing. `provenance`: step, seed, data digest, metrics of its
+      training. `split`: the objects that it was trained, validated and tested on.
+    * `posterior`: what its logits mean; None where it was never calibrated. `gel_check`: what tells a touch from an
+      untouched gel and from no gel; None without one.
+    * `references`: what reference touches are worth; None where nothing could tell.
+    * `queries`: (Q, half) halves of touches of validation objects, by which an index can measure its own search.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))

@@ -46,9 +46,9 @@ def agreement(
 ) -> Agreement:
     """Hide one square of a photo after the other (Zeiler and Fergus, ECCV 2014) and judge the rest with the touches.
 
-    touches, background: as `Searcher.query` takes them. model: the searcher's checkpoint, where it is loaded already.
-    squares: a side; a hidden one has the photo's mean colour. The photo tower looks squares^2 + 1 times. Raises
-    BadInput and ImageError.
+    `touches`, `background`: as `Searcher.query` takes them. `model`: the searcher's checkpoint, where it is loaded
+    already. `squares`: how many the photo has along each side; a hidden one gets the photo's mean colour. The photo
+    tower looks squares^2 + 1 times. Raises BadInput and ImageError.
 
     >>> with retrieval.open("index") as searcher:
     ...     found = retrieval.agreement(searcher, ["a.png", "b.png"], "catalog/mug/1.jpg", squares=2)

@@ -37,9 +37,11 @@ class NearestReference:
 class Match:
     """One object of a ranking, shown by its best photo.
 
-    logit: what ranks. probability: P(object | touches, catalogue); over all objects and "none of these" it adds up to
-    1; None where the model was never calibrated. photo: its path in the catalogue; photo_path: on the disk, absolute.
-    metadata: the user's own. reference: its nearest reference touch; None, and in no document, where it has none.
+    * `logit`: what ranks. `probability`: P(object | touches, catalogue); over all objects and "none of these" it adds
+      up to 1; None where the model was never calibrated.
+    * `photo`: path of the photo in the catalogue. `photo_path`: its absolute path on the disk. `metadata`: the user's
+      own.
+    * `reference`: the nearest reference touch of the object; None, and in no document, where it has none.
 
     >>> with retrieval.open("index") as searcher:
     ...     best = searcher.query(["a.png", "b.png"]).top
@@ -67,16 +69,18 @@ class Match:
 class QueryResult:
     """A verdict and a ranking.
 
-    verdict: "match": the best object is likelier than that the catalogue lacks it. "none of these": it is not; the
-    ranking names the nearest. "no contact": no grasp felt anything; "not a gel image": one of the images is none, as
-    far as the model knows gels; both come without a ranking. "uncalibrated": a ranking of a model without
-    probabilities.
-
-    touches: the gel images of each grasp by name, files by their paths. grasps: what each shows, "contact", "no
-    contact" or "not a gel image"; only grasps with contact were judged. none_probability: that the object is none of
-    the catalogue's. posterior: the formula and its numbers (`retrieval.model.posterior`). index: what was searched with
-    what. timing_ms: by stage, of this query; of several at once (`Searcher.query_many`) an equal share for each.
-    embeddings: of the grasps, (G, embedding_dim), where they were encoded in this process; in no document.
+    * `verdict`: "match": the best object is likelier than that the catalogue lacks it. "none of these": it is not; the
+      ranking names the nearest. "no contact": no grasp felt anything. "not a gel image": one of the images is none, as
+      far as the model knows gels. These two come without a ranking. "uncalibrated": a ranking of a model without
+      probabilities.
+    * `touches`: the gel images of each grasp by name, files by their paths. `grasps`: what each shows, "contact", "no
+      contact" or "not a gel image"; only grasps with contact were judged.
+    * `none_probability`: probability that the object is none of the catalogue's. `posterior`: the formula of the
+      probabilities and its numbers (`retrieval.model.posterior`).
+    * `index`: what was searched, and with which model. `timing_ms`: milliseconds of this query by stage; of several
+      objects at once (`Searcher.query_many`) each has an equal share.
+    * `embeddings`: those of the grasps, (G, embedding_dim), where they were encoded in this process; no document holds
+      them.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])

@@ -56,16 +56,18 @@ def build_index(
 ) -> BuildReport:
     """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
 
-    folder: of this machine, or a URL as `retrieval.data.sources` reads it.
+    * `folder`: of this machine, or a URL as `retrieval.data.sources` reads it.
+    * `objects_from`: the rule that says which object a photo shows (`retrieval.data.naming`); None: the rule of the
+      index that is there, else by folder.
+    * `kind`, `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.operating`); where all are None,
+      exact search.
+    * `verify`: list every folder and read every file, also those that look as an earlier build found them, by size,
+      times and inode (`indexes.store.seen_folders`, `retrieval.search.looks`).
 
-    objects_from: which object a photo shows (`retrieval.data.naming`); where None, as the index has it, else by folder.
-    kind, min_recall, max_ms: what is asked of the search (`retrieval.search.operating`); where all are None, exact
-    search. verify: list every folder and read every file, also those whose size, times and inode are as an earlier
-    build found them (`indexes.store.seen_folders`, `retrieval.search.looks`). Where neither the photos' content nor
-    their objects nor what is asked for changed, nothing is written. Photos that cannot be read are skipped and
-    reported. Raises BadInput for a rule that is none, DatasetError where no photo can be read, and the errors of
-    `indexes.store.folder.IndexStore.write`, which leave the index as it was. What was embedded until an error, or until
-    the process was killed, is not embedded again by the next build (`indexes.store.unfinished`).
+    Nothing is written where neither photos, nor their objects, nor what is asked for has changed. Photos that cannot be
+    read are skipped and reported. What was embedded until an error, or until the process was killed, is not embedded
+    again by the next build (`indexes.store.unfinished`). Raises BadInput for a rule that is none, DatasetError where no
+    photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the index as it was.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))

@@ -14,22 +14,26 @@ SHOWN, FEW = 20, 5
 
 @dataclass(frozen=True)
 class BuildReport:
-    """What a build did.
+    """What a build did and what it understood; `lines` says it to people.
 
-    written: False where nothing had changed, so that the generation stayed as it was. objects_from: the rule that
-    names objects (`retrieval.data.naming`); per_object: min, median and max of their photos; examples: objects,
-    each with a photo of it; doubts: what looks wrong about the objects. reused: photos that were not embedded anew,
-    `renamed` of which had another name in the index before, `remade` of which have a new embedding made of their
-    old half, and `resumed` of which stood in no index yet, but had been embedded by a build that was cut off.
-    removed: names that are gone. unread: of how many the files were not read, as they look as they did when an
-    earlier build read them (`retrieval.search.looks`). skipped: pictures that could not be read; ignored: files
-    that are no pictures by name; left_out: how many of both for each reason; without_photo: objects all of whose
-    pictures were skipped; notes: remarks on metadata. candidates: the operating point as the manifest has it
-    (`retrieval.search.operating`), None where the checkpoint has nothing to measure one with. half_error: largest
-    rounding of a stored half, which the manifest keeps too. seconds: decoding and encoding alone. shards: of a
-    cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
-    references: how many reference touches of how many objects, how many of these have no photo (`alone`), how many
-    touches were encoded now, and by what was told what they are worth; None without.
+    * `written`: False where nothing had changed, so that the generation stayed as it was.
+    * `objects_from`: the rule that names objects (`retrieval.data.naming`). `per_object`: least, median and largest
+      number of their photos. `examples`: some objects, each with a photo of it. `doubts`: sentences on what looks wrong
+      about the objects.
+    * `photos`, `objects`: how many the index holds. Of the photos `embedded` were encoded now and `reused` were not. Of
+      these `renamed` had another name in the index before, `remade` have a new embedding made of their old half, and
+      `resumed` had been embedded by a build that was cut off.
+    * `removed`: photos that the index held before and the catalogue no longer does.
+    * `unread`: photos whose files were not read, for they look as they did when an earlier build read them
+      (`retrieval.search.looks`).
+    * `skipped`: pictures that could not be read. `ignored`: files that are no pictures by name. `left_out`: how many of
+      both for each reason. `without_photo`: objects all of whose pictures were skipped. `notes`: remarks on metadata.
+    * `kind`, `reason`, `recall`, `candidates`: how the index is searched and why (`retrieval.search.operating`);
+      `candidates` is None where the checkpoint has nothing to measure them with.
+    * `half_error`: largest rounding of a stored half. `seconds`: time of decoding and encoding alone.
+    * `shards`: those of a cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
+    * `references`: how many reference touches of how many objects, how many of these have no photo (`alone`), how many
+      touches were encoded now, and who says what they are worth (`by`); None where there are none.
 
     >>> from pathlib import Path
     >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))

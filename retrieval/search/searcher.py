@@ -83,13 +83,15 @@ class Searcher:
     ) -> "Searcher":
         """Open the current generation of an index, or of a cluster of them, with the checkpoint that built it.
 
-        index: its folder; of a cluster the URL too, from which shards are fetched once into the user's cache.
+        * `index`: its folder; of a cluster the URL too, from which shards are fetched once into the user's cache.
+        * `model`: where that checkpoint lies now, if it was moved.
+        * `verify`: compare the checksums of the index's files.
+        * `threads`: how many encode a touch; None leaves the choice to the library. PyTorch has one number for all that
+          computes in a process.
+        * `shards`: what opens the shards of a cluster; None opens them in this process.
 
-        model: where that checkpoint lies now, if it was moved. verify: compare the checksums of the index's files.
-        threads: with which touches are encoded, in PyTorch by whatever else computes in this process too; None leaves
-        the choice to the library. shards: opens those of a cluster; None: in this process, `open_cluster`.
-        Touches are encoded by the export beside the checkpoint (`retrieval.model.export`) or in the user's cache where
-        there is one, and PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`,
+        Touches are encoded by the export of the checkpoint where one lies beside it (`retrieval.model.export`) or in
+        the user's cache; PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`,
         CheckpointError, and MismatchedIndex for another model.
 
         >>> import numpy as np
@@ -153,17 +155,21 @@ class Searcher:
     ) -> QueryResult:
         """Which of the catalogue's objects was felt in one or more grasps, or none of them?
 
-        touches: one grasp, which is a list with an image for each finger in their order, or a list of several such
-        grasps; for a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a
-        Pillow image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like
-        any other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
-        background: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
-        them what a contact is. top: objects to return. candidates: photos that the full classifier judges, those
-        nearest to all grasps together and `top` at least, by default as many as the index was found to need; with no
-        fewer than there are photos, or a model without trained embeddings, all of them and no candidate stage runs.
-        none_prior: probability, before anything is felt, that the catalogue lacks the object. Match logits of several
-        grasps add; what the sum is worth, and how objects and "none of these" get their probabilities, stands in
-        `retrieval.model.posterior`. Only grasps with contact are judged. Raises BadInput, ImageError or NumericalError.
+        * `touches`: one grasp, a list with an image for each finger in their order; or a list of several such grasps.
+          For a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a Pillow
+          image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like any
+          other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
+        * `background`: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
+          them what a contact is.
+        * `top`: how many objects to return.
+        * `candidates`: how many photos the full classifier judges, `top` at least: those nearest to all grasps
+          together. By default as many as the index was found to need. Where that is no fewer than there are photos, or
+          the model has no trained embeddings, every photo is judged and nothing is searched.
+        * `none_prior`: probability, before anything is felt, that the catalogue lacks the object.
+
+        Only grasps with contact are judged. Match logits of several grasps add; `retrieval.model.posterior` says what
+        the sum is worth and how objects and "none of these" get their probabilities. Raises BadInput, ImageError or
+        NumericalError.
         """
         held = self._held()
         require_counts(top, candidates)
@@ -204,8 +210,8 @@ class Searcher:
     ) -> list[QueryResult]:
         """Answer for several objects in the hand, each given as `query` takes it, in their order.
 
-        Their touches are encoded in batches. The logits are those of single queries within 1e-4, as a batch rounds in
-        another order. Where one object's touches are not fit, nothing is answered and the error names it.
+        Their touches are encoded in batches. Logits are within 1e-4 of those of single queries, as a batch rounds in
+        another order. Where the touches of one object cannot be used, nothing is answered and the error names it.
         """
         held = self._held()
         require_counts(top, candidates)
@@ -221,9 +227,9 @@ class Searcher:
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
         """The unit embeddings (G, embedding_dim) and halves (G, half) of G grasps, given as `query` takes them.
 
-        The inner product with a photo's embedding (`retrieval.embed_photos`) is the score by which candidates are
-        found; it orders photos for one touch and is no probability. Match logits are
-        `searcher.judge.logits(halves, photo_halves)`, added over the grasps.
+        The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) is the score by which
+        candidates are found; it orders photos for one touch and is no probability. Match logits, summed over the
+        grasps, are `searcher.judge.logits(halves, photo_halves)`.
         """
         held = self._held()
         grasps = read_grasps(touches, held.reader.fingers)
