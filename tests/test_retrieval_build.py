@@ -223,8 +223,7 @@ def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, e
     report = build_index(own, other, index, quiet=True)
     assert (sum(embedded), report.embedded, report.reused) == (24, 24, 0)
     assert report.reason.startswith(
-        "Every photo was embedded again: another model makes what is stored of it; the index there is of version "
-        f"{__version__}."
+        f"Every photo was embedded again: the model is another one; the index was written by version {__version__}."
     )
 
 

@@ -358,6 +358,8 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
     command = ["evaluate", str(grasped), "--out", str(out), "--preset", "tiny", "--iterations", "6"]
     assert main([*command, "--methods", "late_fusion,cca,chance", "--json"]) == 0
     said = capsys.readouterr()
+    for role in ("", " (control: shuffled)", " (control: blurred)"):
+        assert f"evaluate: late_fusion, seed 0{role}\n" in said.err
     assert json.loads(said.out) == json.loads((out / "results.json").read_text())
     assert f"report: {out / 'report.md'}" in said.err
     assert (out / "report.html").is_file()

@@ -161,7 +161,7 @@ def test_the_verdict_is_said(tmp_path):
     assert "Most likely mug, probability 80.0 %; none of these: 20.0 %." in accepted.text
     assert firsts(accepted)
     rejected = Page(query_html(made_up(ONE, verdict="none of these", none=0.9), tmp_path))
-    assert "None of these, most likely: that the catalogue lacks the object has probability 90.0 %." in rejected.text
+    assert "None of these, most likely: the catalogue lacks the object with probability 90.0 %." in rejected.text
     assert "Most likely" not in rejected.text
     assert "1. mug" in rejected.text
     assert not firsts(rejected)

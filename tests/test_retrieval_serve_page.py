@@ -115,7 +115,7 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
 @pytest.mark.parametrize(
     ("verdict", "claim", "told"),
     [
-        ("none of these", "None of these", "That the catalogue lacks the object has probability"),
+        ("none of these", "None of these", "The catalogue lacks the object with probability"),
         ("no contact", "No contact", "The gels look untouched"),
         ("not a gel image", "Not a gel image", "does not look like a gel"),
         ("uncalibrated", None, "This model was never calibrated"),

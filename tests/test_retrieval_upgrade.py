@@ -25,8 +25,8 @@ def test_photos_that_are_prepared_otherwise_are_embedded_again_and_it_is_said(ow
     monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", preprocessing.PREPROCESSING_VERSION + 1)
     report = build_index(own, checkpoint, index, quiet=True)
     assert (report.embedded, report.remade) == (24, 0)
-    assert report.reason.startswith("Every photo was embedded again: photos are prepared otherwise for the model;")
-    assert "another model" not in report.reason
+    assert report.reason.startswith("Every photo was embedded again: the model wants photos prepared in another way;")
+    assert "the model is another one" not in report.reason
 
 
 def taught_again(checkpoint, path, halves_of):

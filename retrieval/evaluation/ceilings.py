@@ -20,7 +20,9 @@ def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:
         "photo_to_photo": dataclasses.replace(features, touch=features.photo[:, None]),
     }
     return {
-        name: dataclasses.replace(experiment, folder=folder / name, features=twice, pairs=None, checkpoint=None)
+        name: dataclasses.replace(
+            experiment, folder=folder / name, features=twice, pairs=None, checkpoint=None, role=f"ceiling: {name}"
+        )
         for name, twice in seen_twice.items()
         if _is_taken_twice(features, name)
     }

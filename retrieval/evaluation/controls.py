@@ -32,7 +32,9 @@ MOST_PAIRS = 2000
 def control_experiments(experiment: Experiment, material: Material, cache: Path, seed: int) -> dict[str, Experiment]:
     """The experiment of each control; "before" is left out where the recording lacks frames from before the contact."""
     folder, unfitted = experiment.folder / "controls", dataclasses.replace(experiment, checkpoint=None)
-    experiments = {"shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True)}
+    experiments = {
+        "shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True, role="control: shuffled")
+    }
     grasps = thinned(material.grasps, MOST_GRASPS)
     queries = draw_queries(grasps, material.split, seed)
     pairs = material.pairs[:: len(material.pairs) // MOST_PAIRS + 1]
@@ -47,6 +49,7 @@ def control_experiments(experiment: Experiment, material: Material, cache: Path,
             features=shown(grasps, *towers, photos_of=experiment.features),
             pairs=shown(pairs, *towers, photos_of=experiment.pairs) if pairs else None,
             queries=queries,
+            role=f"control: {variant}",
         )
     return experiments
 

@@ -31,7 +31,8 @@ class Experiment:
 
     pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
     and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
-    each part before fitting, so that nothing can be learned. all_teach: as in `Setting`.
+    each part before fitting, so that nothing can be learned. all_teach: as in `Setting`. role: what it is beside the
+    evaluation itself, such as "control: blurred", for people who watch.
     """
 
     folder: Path
@@ -44,6 +45,7 @@ class Experiment:
     shuffled: bool
     quiet: bool
     all_teach: bool = False
+    role: str = ""
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
         """The seeds that make a difference to a method."""
@@ -61,7 +63,7 @@ class Experiment:
             except BadInput:  # damaged, or of other features, queries or settings: made again
                 path.unlink()
         if not self.quiet:
-            say(f"evaluate: {name}, seed {seed}")
+            say(f"evaluate: {name}, seed {seed}" + (f" ({self.role})" if self.role else ""))
         method, fit_s = self._fitted(name, seed)
         write_predictions(path, predict(method, self.features, self.queries, fit_s), self._made_by(name, seed))
 

@@ -158,8 +158,8 @@ def in_words(result: QueryResult) -> str:
         return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {none:.2f}{remark}"
     if result.verdict == NONE_OF_THESE:
         return (
-            f"none of these: that the catalogue lacks the object has probability {none:.2f}, its nearest, "
+            f"none of these: the catalogue lacks the object with probability {none:.2f}; the nearest is "
             f"{best.object_id}, {best.probability:.2f}; more grasps may tell, and --none-prior says how likely it is "
-            f"beforehand{remark}"
+            f"beforehand that the object is missing{remark}"
         )
     return f"uncalibrated: {best.object_id} comes first; this model has no probabilities{remark}"

@@ -84,18 +84,16 @@ def build_index(
 
 
 UNNOTED = (
-    "How the photos' files looked when they were read was not noted, as older versions do not, so each was read and "
+    "No earlier build noted sizes and times of the photos' files, as older versions do not, so each was read and "
     "compared."
 )
-
-
 TAUGHT_AGAIN = (
-    "The model names candidates otherwise and judges as before, so the halves of unchanged photos were kept, and their "
-    "embeddings made again from these; no such photo was decoded or encoded."
+    "The model finds candidates in another way and judges as before, so unchanged photos kept their halves and were "
+    "given new embeddings made of these; none of them was decoded or encoded."
 )
 CHANGED = {
-    "checkpoint": "another model makes what is stored of it",
-    "preprocessing": "photos are prepared otherwise for the model",
+    "checkpoint": "the model is another one",
+    "preprocessing": "the model wants photos prepared in another way",
 }
 """By what of the fingerprint is another one: why a photo is embedded again."""
 
@@ -306,7 +304,7 @@ def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | Non
     if halves_kept(checkpoint, before) and there.arrays["halves"].shape[1:] == half:
         return None, there, TAUGHT_AGAIN
     changed = [said for name, said in CHANGED.items() if before.get(name) != now[name]]
-    written = f"; the index there is of version {there.manifest.software}" if there.manifest.software else ""
+    written = f"; the index was written by version {there.manifest.software}" if there.manifest.software else ""
     return None, None, f"Every photo was embedded again: {' and '.join(changed)}{written}."
 
 

@@ -33,7 +33,7 @@ export function verdict(answer) {
         above: "Most likely",
         claim: "None of these",
         below:
-          `That the catalogue lacks the object has probability ${percent(answer.none_probability)}. ` +
+          `The catalogue lacks the object with probability ${percent(answer.none_probability)}. ` +
           "The nearest objects are shown.",
       };
     case "no contact":
