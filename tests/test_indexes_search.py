@@ -338,8 +338,12 @@ def test_what_faiss_throws_becomes_our_error(tmp_path):
 def test_settings_are_checked(kind):
     with pytest.raises(ParameterError, match=f"{kind.kind} has the settings .*; got colour"):
         kind.parameters_from({"colour": 3})
-    with pytest.raises(ParameterError, match="threads must be at least 1"):
-        kind.build(unit(COUNT), threads=0)
+    for threads in (0, 1.5, True, 10**10):
+        with pytest.raises(ParameterError, match="threads must be a whole number from 1 to 4096"):
+            kind.build(unit(COUNT), threads=threads)
+    for seed in (-1, 2**31, 1.5):
+        with pytest.raises(ParameterError, match="a seed must be a whole number from 0 to 2147483647"):
+            kind.build(unit(COUNT), seed=seed)
     for name in kind.parameters_type.__dataclass_fields__:
         for value in (0, -4, 2.5, True, "8"):
             with pytest.raises(ParameterError, match=f"{name} must be a whole number"):

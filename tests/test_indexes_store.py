@@ -328,6 +328,12 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
         ({"documents": {"x": 1}, "arrays": {"x": np.zeros(3)}}, RowError, "cannot share a name"),
         ({"fingerprint": {"checkpoint": 3}}, RowError, "fingerprint must map text to text"),
         ({"about": {"a": float("inf")}}, RowError, "about must be JSON"),
+        ({"documents": {"touches": np.array(1.0)}}, RowError, r"must have rows of numbers; got the shape \(\)"),
+        ({"documents": {"touches": np.zeros((3, 0))}}, RowError, "must have rows of numbers"),
+        ({"seed": 2**31}, ParameterError, "seed must be a whole number from 0"),
+        ({"threads": 10**10}, ParameterError, "threads must be a whole number from 1"),
+        ({"keep": -3}, ParameterError, "keep must be a whole number of at least 0"),
+        ({"self_check": -1}, ParameterError, "self_check must be a whole number of at least 0"),
         ({"kind": "annoy"}, ParameterError, "exact, flat"),
         ({"kind": "hnsw", "parameters": 3}, ParameterError, "hnsw takes HNSWParameters"),
         ({"kind": "ivf_pq"}, ParameterError, "624 or more"),
@@ -340,6 +346,14 @@ def test_bad_input_is_refused_in_words_and_leaves_the_old_index(tmp_path, change
         IndexStore(tmp_path).write(**good | change)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
     assert IndexStore(tmp_path).open().count == 20
+
+
+@pytest.mark.parametrize("k", [0, -1, True, 2.0, "2", None])
+def test_a_search_for_no_number_of_results_is_refused_and_ends(tmp_path, k):
+    generation = filled(tmp_path)
+    for ask in (generation.search, generation.candidates):
+        with pytest.raises(ParameterError, match="k, the number of results, must be a whole number of at least 1"):
+            ask(unit(1), k)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,10 @@ from indexes.errors import ParameterError, VectorError
 from indexes.kinds.checks import check_k, check_unit
 from indexes.kinds.scores import Floats, Mask, Slots
 
+MOST = 2**31 - 1
+"""FAISS counts in 32 bits."""
+MOST_THREADS = 4096
+
 Ladder: TypeAlias = tuple[str, tuple[int, ...]]
 """The name of a parameter, and values of it to try."""
 
@@ -26,8 +30,7 @@ class Parameters:
         """Each named setting is None or a whole number from `least` to `most`, or `ParameterError`."""
         for name in names:
             value = getattr(self, name)
-            is_whole = isinstance(value, int) and not isinstance(value, bool)
-            if value is not None and not (is_whole and least <= value <= most):
+            if value is not None and not is_whole(value, least, most):
                 limit = f" and at most {most}" if most < math.inf else ""
                 raise ParameterError(f"{name} must be a whole number of at least {least}{limit}; got {value!r}")
 
@@ -114,7 +117,7 @@ class VectorIndex(ABC):
     @classmethod
     def over(cls, vectors: Floats, parameters: Parameters, *, seed: int = 0, threads: int | None = None) -> Self:
         """`build` over vectors (M, d), M >= 1, that were checked before."""
-        index = cls(vectors, cls.resolved(parameters, *vectors.shape), seed, check_threads(threads))
+        index = cls(vectors, cls.resolved(parameters, *vectors.shape), check_seed(seed), check_threads(threads))
         index._build()
         return index
 
@@ -278,7 +281,19 @@ class VectorIndex(ABC):
 
 
 def check_threads(threads: int | None) -> int | None:
-    """`threads`, None or at least 1, or `ParameterError`."""
-    if threads is not None and threads < 1:
-        raise ParameterError(f"threads must be at least 1 or left out; got {threads!r}")
+    """`threads`, None or a whole number from 1 to `MOST_THREADS`, or `ParameterError`."""
+    if threads is not None and not is_whole(threads, 1, MOST_THREADS):
+        raise ParameterError(f"threads must be a whole number from 1 to {MOST_THREADS}, or left out; got {threads!r}")
     return threads
+
+
+def check_seed(seed: int) -> int:
+    """`seed`, a whole number from 0 to `MOST`, or `ParameterError`."""
+    if not is_whole(seed, 0, MOST):
+        raise ParameterError(f"a seed must be a whole number from 0 to {MOST}; got {seed!r}")
+    return seed
+
+
+def is_whole(value: object, least: int, most: float) -> bool:
+    """Whether it is a whole number from `least` to `most`."""
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most

@@ -7,9 +7,6 @@ from indexes.kinds import base
 from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
-MOST = 2**31 - 1
-"""FAISS counts links and breadths in 32 bits. With a single link a node it ends the process."""
-
 
 @dataclass(frozen=True)
 class HNSWParameters(base.Parameters):
@@ -20,8 +17,8 @@ class HNSWParameters(base.Parameters):
     ef_search: int = 64
 
     def __post_init__(self) -> None:
-        self.check("neighbours", least=2, most=MOST)
-        self.check("ef_construction", "ef_search", most=MOST)
+        self.check("neighbours", least=2, most=base.MOST)  # with one FAISS ends the process
+        self.check("ef_construction", "ef_search", most=base.MOST)
 
 
 class HNSWIndex(FaissIndex):

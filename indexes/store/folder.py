@@ -31,8 +31,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from indexes import load_kind
-from indexes.errors import AGAIN, CorruptIndex, NoIndex, RowError, WriteFailed
-from indexes.kinds.base import Parameters
+from indexes.errors import AGAIN, CorruptIndex, NoIndex, ParameterError, RowError, WriteFailed
+from indexes.kinds.base import MOST, Parameters, check_seed, check_threads, is_whole
 from indexes.kinds.scores import Floats
 from indexes.store import files
 from indexes.store.generation import Generation, read_generation
@@ -171,12 +171,15 @@ class IndexStore:
             asked=load_kind(kind).asked(parameters),
             parent=parent,
             software=software,
-            seed=seed,
-            threads=threads,
+            seed=check_seed(seed),
+            threads=check_threads(threads),
             settle=settle,
             queries=queries,
         )
         check_about(fingerprint, about or {})
+        for what, number in (("self_check", self_check), ("keep", keep)):
+            if not is_whole(number, 0, MOST):
+                raise ParameterError(f"{what} must be a whole number of at least 0; got {number!r}")
         self._require_ours()
         try:
             with self._lock:

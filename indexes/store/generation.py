@@ -19,7 +19,7 @@ from indexes.errors import (
     UnsupportedFormat,
 )
 from indexes.kinds.base import VectorIndex
-from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, row_norms
+from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, check_k, row_norms
 from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
@@ -117,6 +117,7 @@ class Generation:
 
         A slot stands for all its rows, so n may exceed k. Order: (-score, id).
         """
+        k = check_k(k)
         scores, slots = self.index.search(queries, k + 1, self._live)
         return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
 

@@ -281,6 +281,8 @@ def check_documents(documents: Mapping[str, Any]) -> dict[str, Any]:
             json_of(document, f"document {name!r}")
         elif document.dtype.kind not in "biuf" or not np.isfinite(document).all():
             raise RowError(f"document {name!r}: an array must hold finite numbers; got {document.dtype}")
+        elif document.ndim < 1 or 0 in document.shape[1:]:
+            raise RowError(f"document {name!r}: an array must have rows of numbers; got the shape {document.shape}")
     return dict(documents)
 
 
