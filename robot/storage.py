@@ -95,6 +95,11 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     """Return (file content, suffix): pixels as PNG, a file's own bytes as they are. Raises RecordingError."""
     if isinstance(source, np.ndarray):
         return _png(column, source), ".png"
+    if not isinstance(source, bytes | str | Path):
+        raise RecordingError(
+            f"{column} must be pixels as a NumPy array, or the bytes or the path of a PNG or JPEG file; got "
+            f"{type(source).__name__}"
+        )
     try:
         data = source if isinstance(source, bytes) else content_of(source, RecordingError)
     except RecordingError as error:
@@ -119,10 +124,10 @@ def decoded(data: bytes, way: int | None = None) -> npt.NDArray[Any] | None:
 def read_regular(path: str | Path) -> bytes:
     """The bytes of a regular file. Raises OSError, whose `strerror` says what stands there instead: a pipe would block,
     a device may be read for ever."""
-    _require_regular(os.stat(path).st_mode, path)
+    require_regular(os.stat(path).st_mode, path)
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what was swapped since does not block
     with os.fdopen(descriptor, "rb") as file:
-        _require_regular(os.fstat(descriptor).st_mode, path)
+        require_regular(os.fstat(descriptor).st_mode, path)
         return file.read()
 
 
@@ -130,8 +135,8 @@ def content_of(path: str | Path, refusal: type[RobotError]) -> bytes:
     """The bytes of a regular file. Raises `refusal`, which names it and what keeps it from being read."""
     try:
         return read_regular(path)
-    except OSError as error:
-        raise refusal(f"{path} cannot be read: {error.strerror}") from error
+    except (OSError, ValueError) as error:  # ValueError of a name that holds a zero
+        raise refusal(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
 
 
 def object_of(text: bytes, refusal: type[RobotError]) -> dict[str, Any]:
@@ -149,7 +154,8 @@ def _refuse_constant(text: str) -> NoReturn:
     raise ValueError(f"numbers must be finite, got {text}")
 
 
-def _require_regular(mode: int, path: str | Path) -> None:
+def require_regular(mode: int, path: str | Path) -> None:
+    """Raise OSError, whose `strerror` says what stands there, unless `mode` is that of a regular file."""
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
     if not stat.S_ISREG(mode):

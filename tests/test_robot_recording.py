@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from robot.errors import RecordingError, StorageError
 from robot.recording import folder as module
@@ -362,6 +363,13 @@ BAD_IMAGES = {
         "photo must be a PNG or JPEG file; its first bytes are b'GIF8'",
     ),
     "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "photo: /nowhere/x.png cannot be read"),
+    "no such name": ({"photo": "a\0b.png", "touch_a": pixels()}, "cannot be read: embedded null byte"),
+    "of Pillow": (
+        {"photo": Image.new("RGB", (2, 2)), "touch_a": pixels()},
+        "the path of a PNG or JPEG file; got Image",
+    ),
+    "numbers": ({"photo": pixels().tolist(), "touch_a": pixels()}, "photo must be pixels as a NumPy array, or"),
+    "a descriptor": ({"photo": 3, "touch_a": pixels()}, "the path of a PNG or JPEG file; got int"),
     "unknown column": ({**pictures(), "foto": pixels()}, "unknown key 'foto_file_name'"),
 }
 
@@ -442,6 +450,13 @@ def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
         path.rmdir() if path.is_dir() else path.unlink()
+
+
+def test_a_pipe_where_the_lines_are_to_stand_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "metadata.jsonl")
+    with pytest.raises(StorageError, match="it is a pipe, a socket or a device"):
+        RecordingWriter(tmp_path, INFO)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".json"] == []
 
 
 def test_a_picture_that_is_no_file_is_refused_without_being_read(tmp_path):

@@ -38,6 +38,7 @@ from robot.storage import (
     content_of,
     file_content,
     object_of,
+    require_regular,
     storage_errors,
     sync_folder,
     write_file,
@@ -208,6 +209,7 @@ class RecordingWriter:
             descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
             self._file = os.fdopen(descriptor, "r+b", buffering=0)
             try:
+                require_regular(os.fstat(descriptor).st_mode, self.folder / METADATA_FILE)
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 self._start(wanted)
             except BaseException:
