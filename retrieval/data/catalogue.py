@@ -145,58 +145,84 @@ def catalogue_of(
 ) -> Catalogue:
     """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
     METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does."""
-    photos, objects, gels = list[str](), list[str](), list[tuple[str, str]]()
-    skipped, ignored, unfit, unread = list(passed_over), [], [], set()
-    for path in sorted(names):
-        dot = path.rfind(".")
-        ending = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
-        if ending not in EXTENSIONS and ending not in UNREAD:
-            ignored += [path] if path != METADATA_FILE else []
-            continue
-        name = naming.object_of(path)
-        if ending in UNREAD:
-            skipped.append(SkippedPhoto(path, f"{ending} pictures are not read: save it as PNG or JPEG"))
-            unread |= {name} if name else set()
-        elif name is None:
-            why = ": a number alone" if naming.text == STEM else ""
-            skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
-            unfit.append(path)
-        elif touch_name(path, naming) is None:
-            photos.append(path)
-            objects.append(name)
-        else:
-            gels.append((path, name))
-    if not photos and not gels and unfit:
-        raise DatasetError(
-            f"no photo in {where} fits --objects-from {naming.text}; the first of {len(unfit)}: {unfit[0]}. "
-            "Give folder, stem, or a pattern for paths like this one"
-        )
-    if not photos and not gels:
-        others = f"{len(ignored)} other files" + (f" such as {ignored[0]}" if ignored else "")
-        left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
-        kinds = ", ".join(sorted(EXTENSIONS))
-        raise DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
+    found = _sorted_out(names, naming)
+    found.skipped[:0] = passed_over
+    if not found.photos and not found.gels:
+        raise _no_photo(where, found, naming)
     by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
-    touches = grouped(gels, naming)
-    strange = sorted(by_photo.keys() - [*photos, *(path for path, _ in gels)])
-    strange += sorted(by_object.keys() - [*objects, *(touch.object_id for touch in touches)])
+    touches = grouped(found.gels, naming)
+    strange = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
+    strange += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
     told: _Table = {}
     if by_object or by_photo:
-        for path, name in zip(photos, objects, strict=True):
+        for path, name in zip(found.photos, found.objects, strict=True):
             if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
                 told[path] = own
     return Catalogue(
         folder,
-        Photos(photos, objects, told),
-        tuple(ignored),
-        tuple(skipped),
+        Photos(found.photos, found.objects, told),
+        tuple(found.ignored),
+        tuple(found.skipped),
         tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
-        tuple(sorted(unread)),
+        tuple(sorted(found.unread)),
         tuple(
             replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
             for touch in touches
         ),
     )
+
+
+@dataclass
+class _Names:
+    """Files sorted out by their names. photos, and objects: theirs. gels: gel images, each with its object. ignored: no
+    pictures. skipped: pictures that are left out, and why; unfit: those among them that do not fit the naming. unread:
+    objects of pictures of a kind that is not read."""
+
+    photos: list[str] = field(default_factory=list)
+    objects: list[str] = field(default_factory=list)
+    gels: list[tuple[str, str]] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    unfit: list[str] = field(default_factory=list)
+    unread: set[str] = field(default_factory=set)
+
+
+def _sorted_out(names: Iterable[str], naming: Naming) -> _Names:
+    """What each file is by its name and ending, in alphabetical order."""
+    found = _Names()
+    for path in sorted(names):
+        dot = path.rfind(".")
+        ending = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
+        if ending not in EXTENSIONS and ending not in UNREAD:
+            found.ignored += [path] if path != METADATA_FILE else []
+            continue
+        name = naming.object_of(path)
+        if ending in UNREAD:
+            found.skipped.append(SkippedPhoto(path, f"{ending} pictures are not read: save it as PNG or JPEG"))
+            found.unread |= {name} if name else set()
+        elif name is None:
+            why = ": a number alone" if naming.text == STEM else ""
+            found.skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
+            found.unfit.append(path)
+        elif touch_name(path, naming) is None:
+            found.photos.append(path)
+            found.objects.append(name)
+        else:
+            found.gels.append((path, name))
+    return found
+
+
+def _no_photo(where: str, found: _Names, naming: Naming) -> DatasetError:
+    """Why there is nothing to search in a catalogue without photos and touches."""
+    if found.unfit:
+        return DatasetError(
+            f"no photo in {where} fits --objects-from {naming.text}; the first of {len(found.unfit)}: "
+            f"{found.unfit[0]}. Give folder, stem, or a pattern for paths like this one"
+        )
+    others = f"{len(found.ignored)} other files" + (f" such as {found.ignored[0]}" if found.ignored else "")
+    left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
+    kinds = ", ".join(sorted(EXTENSIONS))
+    return DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
