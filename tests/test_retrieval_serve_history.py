@@ -156,6 +156,16 @@ def test_the_oldest_queries_of_which_nothing_was_said_go(index, touches, tmp_pat
     small.close()
 
 
+def test_nothing_can_be_said_of_a_query_that_went_meanwhile(client, touches, monkeypatch):
+    name, _ = ask(client, next(iter(touches.values())))
+    assert client.get(f"/v1/history/{name}").status_code == 200  # it is written
+    store = client.app.state.service.keeping.store
+    read = iter([store.query(name)])  # as the request finds it, just before it goes
+    store._database.execute("DELETE FROM queries")
+    monkeypatch.setattr(store, "query", lambda name: next(read, None))
+    assert "the oldest are left out" in problem(say(client, name, "none"), 404, "unknown")
+
+
 def test_a_file_of_another_program_is_no_history(tmp_path):
     from retrieval.errors import BadInput
 

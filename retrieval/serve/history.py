@@ -108,8 +108,12 @@ async def _entry(parts: Service, name: str) -> Kept:
     await keeping.written()
     kept = await run_in_threadpool(keeping.store.query, name)
     if kept is None:
-        raise Problem("unknown", f"the history has no query {name[:64]!r}; the oldest are left out")
+        raise _no_query(name)
     return kept
+
+
+def _no_query(name: str) -> Problem:
+    return Problem("unknown", f"the history has no query {name[:64]!r}; the oldest are left out")
 
 
 def _item(kept: Kept) -> dict[str, Any]:
@@ -221,6 +225,8 @@ async def feedback(request: Request, parts: Parts, response: Response) -> Feedba
         new, recorded, name = await asyncio.shield(asyncio.to_thread(say))
     except BadInput as error:
         raise Problem("conflict", str(error)) from error
+    except KeyError as error:  # one of the oldest, which went meanwhile
+        raise _no_query(body.query) from error
     response.status_code = 201 if new else 200
     return FeedbackDocument(query=body.query, said=body.said, object_id=name, recorded=recorded)
 

@@ -232,7 +232,7 @@ class Store:
 
     def say(self, name: str, said: str, object_id: str | None, photo: bytes | None) -> bool:
         """Keep what was said of a query; False where the same was said before. Raises BadInput where something else
-        was."""
+        was, and KeyError where there is no such query, or no more."""
         before = self._read("SELECT said, object_id FROM said WHERE query = ?", [name])
         if before:
             if before[0] == (said, object_id):
@@ -243,7 +243,9 @@ class Store:
                 database.execute("INSERT INTO said VALUES (?, ?, ?, ?, ?)", (name, time.time(), said, object_id, photo))
                 more = _searched([said, object_id or ""])
                 database.execute("UPDATE queries SET search = search || ? WHERE id = ?", (more, name))
-        except sqlite3.IntegrityError:  # said between the two steps
+        except sqlite3.IntegrityError:  # between the two steps the query went, or something was said of it
+            if self.query(name) is None:
+                raise KeyError(name) from None
             return self.say(name, said, object_id, photo)
         return True
 
