@@ -1,12 +1,15 @@
 """The client over a real port: what a searcher answers, however images are given; and what it says when it cannot."""
 
+from pathlib import Path
+
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
 import retrieval
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.search.answer import QueryResult
+from retrieval.search.answer import Match, QueryResult
 from tests.serving import listening
 
 TOKEN = "a token of some length"
@@ -109,6 +112,50 @@ def test_a_busy_service_is_asked_again(client, touch, monkeypatch):
     monkeypatch.setattr(client, "_timeout_s", 1)
     with pytest.raises(RetrievalError, match="all full"):
         client.query(touch)
+
+
+def answered_by(monkeypatch, answer):
+    """A client whose requests `answer` answers; and the paths that it asked for, as they are sent."""
+    from retrieval.serve import client as module
+
+    client, asked = retrieval.Client("http://elsewhere"), []
+
+    def respond(request):
+        asked.append(request.url.raw_path.decode())
+        return answer
+
+    transport = module.httpx.MockTransport(respond)
+    monkeypatch.setattr(client, "_http", module.httpx.Client(base_url="http://elsewhere", transport=transport))
+    monkeypatch.setattr(module.time, "sleep", lambda seconds: asked.append(seconds))
+    return client, asked
+
+
+@pytest.mark.parametrize("content", [b"<html>hello</html>", b"[]", b'{"other": 1}'])
+def test_another_service_at_that_address_is_an_error_of_ours(touch, monkeypatch, content):
+    client, _ = answered_by(monkeypatch, httpx.Response(200, content=content))
+    with pytest.raises(RetrievalError, match="answered 200, and not as `retrieve serve` does"):
+        client.query(touch)
+
+
+def test_a_proxy_that_names_a_date_to_come_again_is_asked_again_in_a_second(touch, monkeypatch):
+    headers = {"retry-after": "Wed, 21 Oct 2026 07:28:00 GMT"}
+    client, asked = answered_by(monkeypatch, httpx.Response(503, headers=headers))
+    monkeypatch.setattr(client, "_timeout_s", 1.5)
+    clock = iter([0.0, 0.1, 1.0])
+    monkeypatch.setattr("retrieval.serve.client.time.monotonic", lambda: next(clock))
+    with pytest.raises(RetrievalError, match="answered 503"):
+        client.query(touch)
+    assert asked == ["/v1/index", 1.0, "/v1/index"]
+
+
+@pytest.mark.parametrize(
+    ("photo", "path"), [("mug/a#b.jpg", "mug/a%23b.jpg"), ("a?b.jpg", "a%3Fb.jpg"), ("50%41.jpg", "50%2541.jpg")]
+)
+def test_a_photo_of_any_name_is_asked_for_by_that_name(monkeypatch, photo, path):
+    client, asked = answered_by(monkeypatch, httpx.Response(200, content=b"its bytes"))
+    match = Match(1, "mug", 0.0, None, photo, {}, Path("/data") / photo)
+    assert client.photo(match) == b"its bytes"
+    assert asked == [f"/v1/photos/{path}"]
 
 
 def test_an_answer_comes_back_from_its_document(searcher, touch):

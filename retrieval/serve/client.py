@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self, TypedDict, Unpack
+from urllib.parse import quote
 
 import numpy as np
 from PIL import Image
@@ -82,21 +83,21 @@ class Client:
             return []
         asked = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
         body = {"objects": [_encoded(grasps) for grasps in asked], **_said(options)}
-        answers = self._send("POST", "query/batch", json=body).json()["answers"]
+        answers = _document(self._send("POST", "query/batch", json=body), "answers")["answers"]
         return [_result(answer, grasps) for answer, grasps in zip(answers, asked, strict=True)]
 
     def photo(self, match: Match) -> bytes:
         """The file of a match's photo. Raises BadInput where it is gone."""
-        return self._send("GET", f"photos/{match.photo}").content
+        return self._send("GET", f"photos/{quote(match.photo)}").content
 
     def _ask(self, path: str, touches: AnyTouches, options: QueryOptions) -> list[QueryResult]:
         grasps = self._grasps(touches)
-        answer = self._send("POST", path, json={"touches": _encoded(grasps), **_said(options)}).json()
+        answer = _document(self._send("POST", path, json={"touches": _encoded(grasps), **_said(options)}))
         return [_result(one, grasps) for one in answer.get("answers", [answer])]
 
     def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
         if self._fingers is None:
-            self._fingers = int(self._send("GET", "index").json()["fingers"])
+            self._fingers = int(_document(self._send("GET", "index"), "fingers")["fingers"])
         return read_grasps(touches, self._fingers, of=of)
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
@@ -109,7 +110,7 @@ class Client:
                 raise RetrievalError(
                     f"{self.url} cannot be reached ({error}); is `retrieve serve` running there?"
                 ) from error
-            pause = float(response.headers.get("retry-after", "1"))
+            pause = _pause_s(response)
             if response.status_code not in (429, 503) or time.monotonic() + pause > until:
                 break
             time.sleep(pause)
@@ -118,13 +119,36 @@ class Client:
         return response
 
 
+def _pause_s(response: httpx.Response) -> float:
+    """How long a busy service wants to be left alone: a second, unless it says how many (a proxy before it may name a
+    date)."""
+    told = response.headers.get("retry-after", "")
+    return float(told) if told.isdecimal() else 1.0
+
+
+def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
+    """The JSON object of a response, which has these keys. Raises RetrievalError for another one: what listens there
+    is no service of ours."""
+    try:
+        found = response.json()
+    except ValueError as error:
+        raise _not_ours(response) from error
+    if not isinstance(found, dict) or not all(key in found for key in keys):
+        raise _not_ours(response)
+    return found
+
+
+def _not_ours(response: httpx.Response) -> RetrievalError:
+    return RetrievalError(f"{response.url} answered {response.status_code}, and not as `retrieve serve` does")
+
+
 def _error(response: httpx.Response) -> RetrievalError:
     """What a problem document means in Python."""
     try:
         problem = response.json()
         kind, detail = problem["type"].rpartition(":")[2], problem["detail"]
     except (ValueError, KeyError, TypeError, AttributeError):
-        return RetrievalError(f"{response.url} answered {response.status_code}, and not as `retrieve serve` does")
+        return _not_ours(response)
     if kind == "bad-image":
         name, _, reason = detail.partition(": ")
         return ImageError(name, reason)
