@@ -105,6 +105,47 @@ def test_parquet_holds_pictures_or_their_names(catalogue, tmp_path):
     assert [of for of, _, _ in named.values()] == list(own.values())
 
 
+def test_a_parquet_file_that_is_refused_half_way_is_listed_once(catalogue, tmp_path, monkeypatch):
+    photos = contents(list_catalogue(catalogue))
+    write_parquet(tmp_path / "a.parquet", {"path": list(photos), "image": [data for _, _, data in photos.values()]})
+    real, refusals = sources._parquet_file, [OSError("the storage is busy")]
+
+    class Refusing:
+        def __init__(self, url):
+            self.file = real(url)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            self.file.close()
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+        def read_row_group(self, number, columns):
+            if number == 1 and refusals:
+                raise refusals.pop()
+            return self.file.read_row_group(number, columns=columns)
+
+    monkeypatch.setattr(sources, "_parquet_file", Refusing)
+    listed = list_photos(str(tmp_path / "a.parquet"))
+    assert not refusals
+    assert listed.skipped == ()
+    assert {path: data for path, (_, _, data) in contents(listed).items()} == {
+        path: data for path, (_, _, data) in photos.items()
+    }
+
+
+def test_of_two_rows_of_one_name_the_first_is_taken_whole(catalogue, tmp_path):
+    first, second = [data for _, _, data in contents(list_catalogue(catalogue)).values()][:2]
+    rows = {"path": ["mug/1.jpg"] * 2, "image": [first, second], "object_id": ["mug", "tin"]}
+    write_parquet(tmp_path / "a.parquet", rows)
+    listed = list_photos(str(tmp_path / "a.parquet"))
+    assert contents(listed) == {"mug/1.jpg": ("mug", {}, first)}
+    assert [item.reason for item in listed.skipped] == ["comes twice"]
+
+
 def test_pictures_without_a_name_are_named_by_their_row(catalogue, tmp_path):
     data = [item for _, _, item in contents(list_catalogue(catalogue)).values()][:5]
     for part, rows in (("one", data[:3]), ("two", data[3:])):

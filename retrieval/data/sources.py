@@ -214,17 +214,23 @@ def _parquet(url: str, naming: Naming) -> Catalogue:
     photos, places, column = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]](), ""
     for file in _matching(url):
         try:
-            column = tried(file, lambda file=file: _list_parquet(file, photos, places))  # type: ignore[misc]
+            column, listed = tried(file, lambda file=file: _list_parquet(file))  # type: ignore[misc]
         except FINAL as error:
             raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
+        for photo, object_id, place in listed:
+            photos.append((photo, object_id))
+            places.setdefault(photo.path, place)  # of two of one name the first is taken
     source: Source = ParquetSource(column, places) if column else FolderSource(url.rpartition("/")[0] or ".")
     return _named(url, photos, naming, source)
 
 
-def _list_parquet(
-    file: str, photos: list[tuple[CataloguePhoto, str | None]], places: dict[str, tuple[str, int, int]]
-) -> str:
-    """Add the rows of one file; the column with pictures, "" where rows name their files."""
+_Row = tuple[CataloguePhoto, str | None, tuple[str, int, int]]
+
+
+def _list_parquet(file: str) -> tuple[str, list[_Row]]:
+    """The column with pictures, "" where rows name their files; and of each row its photo, its object where it names
+    one, and its place: file, row group, row there."""
+    found = list[_Row]()
     with _parquet_file(file) as table:
         names = list(table.schema_arrow.names)
         picture = next((name for name in _PICTURES if name in names), "")
@@ -241,11 +247,10 @@ def _list_parquet(
                 name = str(own) if own else f"{stem}/{count + place:08d}"
                 object_id = row.pop("object_id", None)
                 metadata = {key: value for key, value in row.items() if _is_plain(value)}
-                photos.append((CataloguePhoto(name, "", metadata), None if object_id is None else str(object_id)))
-                if picture:
-                    places[name] = (file, group, place)
+                owner = None if object_id is None else str(object_id)
+                found.append((CataloguePhoto(name, "", metadata), owner, (file, group, place)))
             count += rows
-    return picture
+    return picture, found
 
 
 def _is_plain(value: object) -> bool:
