@@ -187,6 +187,18 @@ def test_a_picture_that_repeats_the_last_is_as_old_as_its_first_copy(script, mak
     assert reader.after(0.1).time_s == 1.2
 
 
+def test_a_stream_that_was_lost_has_time_to_warm_up_again(script, make):
+    reader = make(ReaderSettings(warmup_s=30.0, timeout_s=1e-3))
+    script.show(31.0)
+    reader.start()
+    script.items.put(OSError(19, "No such device"))
+    until(lambda: reader.lost == 1)
+    later = threading.Timer(0.2, script.show, (32.0,))
+    later.start()
+    assert reader.after(31.0).time_s == 32.0
+    later.join()
+
+
 def test_a_stream_that_stands_still_gives_nothing_fresh_long_before_it_counts_as_frozen(script, make):
     script.show(0.0, 0.3, 0.7, picture=7)
     now = [0.7]

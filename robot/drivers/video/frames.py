@@ -99,8 +99,9 @@ class FrameReader:
         return self._wait(self.settings.timeout_s)[-1]
 
     def after(self, time_s: float) -> Frame:
-        """Wait for a picture newer than `time_s`. Raises DeviceError after `timeout_s`."""
-        return self._wait(self.settings.timeout_s, time_s)[-1]
+        """Wait for a picture newer than `time_s`. Raises DeviceError after `timeout_s` and the time to warm up, which a
+        stream that was lost takes again."""
+        return self._wait(self.settings.timeout_s + self.settings.warmup_s, time_s)[-1]
 
     def near(self, time_s: float) -> Frame:
         """Of the kept pictures the one taken nearest to `time_s`, the newer one of two. Raises DeviceError."""
