@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from indexes.errors import LockedIndex, NoIndex, WriteFailed
-from indexes.store import files
+from indexes.store import files, locking
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from tests.test_indexes_store import FINGERPRINT, filled, names, rows_of, unit
@@ -265,6 +265,26 @@ def test_a_lock_that_cannot_be_made_is_one_error(tmp_path):
     (tmp_path / "index").write_text("a file")
     with pytest.raises(WriteFailed, match="lock file cannot be opened"):
         filled(tmp_path / "index")
+
+
+def test_a_disk_without_room_for_the_writers_number_is_locked_and_let_go_all_the_same(tmp_path, monkeypatch):
+    def full(descriptor, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(locking.os, "write", full)
+        with IndexStore(tmp_path).lock(), pytest.raises(LockedIndex, match="an unknown process is writing"):
+            filled(tmp_path)
+    assert filled(tmp_path).count == 20
+
+
+def test_a_disk_that_keeps_no_locks_is_not_taken_for_one_that_somebody_writes_to(tmp_path, monkeypatch):
+    def refused(descriptor, how):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    monkeypatch.setattr(locking.fcntl, "flock", refused)
+    with pytest.raises(WriteFailed, match=r"this disk keeps no locks \(Operation not supported\); build the index on"):
+        filled(tmp_path)
 
 
 def test_a_generation_replaced_while_it_is_being_opened_is_read_again(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import fcntl
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -47,15 +47,21 @@ class WriterLock:
             raise WriteFailed(f"{self.path} is not the lock file of an index, and stays as it is; give another folder")
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             holder = _holder(descriptor)
             os.close(descriptor)
             who = "an unknown process" if holder is None else f"process {holder}"
             raise LockedIndex(
                 f"{self.path.parent}: one writer at a time; {who} is writing. Wait for it to end", holder
             ) from error
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"{os.getpid()}\n".encode())
+        except OSError as error:
+            os.close(descriptor)
+            raise WriteFailed(
+                f"{self.path}: this disk keeps no locks ({error.strerror}); build the index on another one"
+            ) from error
+        with suppress(OSError):  # a full disk may lack the room for who it is: the lock is held all the same
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"{os.getpid()}\n".encode())
         return descriptor
 
 
