@@ -44,6 +44,7 @@ MADE = {
     "vt60-references": vt60(),
     "vt60-references-random": vt60(),
     "vt60-references-photos": vt60(),
+    "vt60-references-photos-random": vt60(),
     "billets-unseen": billets(),
     "billets-places": billets(),
     "objectfolder": facts(

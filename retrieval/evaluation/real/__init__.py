@@ -16,6 +16,7 @@ PROTOCOLS = {
     "vt60-references": "retrieval.evaluation.real.vt60:REFERENCE_SEEN_CLASSES",
     "vt60-references-random": "retrieval.evaluation.real.vt60:REFERENCE_RANDOM",
     "vt60-references-photos": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO",
+    "vt60-references-photos-random": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO_RANDOM",
     "billets-unseen": "retrieval.evaluation.real.billets:UNSEEN",
     "billets-places": "retrieval.evaluation.real.billets:PLACES",
     "objectfolder": "retrieval.evaluation.real.objectfolder:PUBLISHED",

@@ -122,3 +122,12 @@ REFERENCE_AND_PHOTO = Protocol(
     own_photos=True,
     entry=BOTH,
 )
+REFERENCE_AND_PHOTO_RANDOM = Protocol(
+    "vt60",
+    "VT60, reference touches with photos: nine random unseen objects",
+    f"As vt60-random, the catalogue holding a touch with each photo. {_PARTED} {_SHARED}",
+    _random,
+    _OF_REFERENCES,
+    own_photos=True,
+    entry=BOTH,
+)
