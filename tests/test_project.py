@@ -5,6 +5,8 @@ import tomllib
 from itertools import chain
 from pathlib import Path
 
+import tests
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
@@ -44,3 +46,10 @@ def test_only_our_packages_are_installed():
         "indexes",
         "tests",
     }
+
+
+def test_what_stands_beside_the_tests_is_told():
+    there = {
+        path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert {name for name in there if not name.startswith(("test_", "__"))} <= set(re.findall(r"\w+", tests.__doc__))
