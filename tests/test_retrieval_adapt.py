@@ -10,7 +10,7 @@ import torch
 import retrieval
 from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
 from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, told
+from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, tell_apart
 from retrieval.adaptation.material import config_for, encode, take_over
 from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
@@ -97,7 +97,7 @@ def test_places_of_hand_made_scores():
     )
     # Of a's touches the own photo is of the other grasp: 1 is shown photo 4, and 4 photo 1.
     scores = np.array([[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [2, 2, 1, 9]], np.float32)
-    found = told(scores, features)
+    found = tell_apart(scores, features)
     assert found.objects == 3
     assert found.first.tolist() == [1.0, 0.5, found.first[2], 0.5]
     assert found.below.tolist()[:2] == [1.0, 0.75]

@@ -19,7 +19,7 @@ from retrieval.search.measuring import NeighbourBench, Point, WinnerBench, can_m
 from retrieval.search.operating import (
     Asked,
     all_judged,
-    kept,
+    carried_over,
     needs_measuring,
     sentence,
     settle,
@@ -217,19 +217,19 @@ def test_few_photos_are_all_judged_unless_that_may_be_too_slow():
 
 def test_a_measurement_stands_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
     made = settle(WinnerBench(checkpoint, *gallery), Asked()).candidates
-    assert kept(made, Asked(), PHOTOS, 0) == made
-    after = kept(made, Asked(), PHOTOS + 4, 4)
+    assert carried_over(made, Asked(), PHOTOS, 0) == made
+    after = carried_over(made, Asked(), PHOTOS + 4, 4)
     assert after == {**made, "changed": 4}
-    assert kept(after, Asked(), PHOTOS + 7, 3)["changed"] == 7
-    assert kept(after, Asked(), PHOTOS + 8, 4) is None
-    assert kept(made, Asked(min_recall=0.5), PHOTOS, 0) is None
-    assert kept(all_judged(4, Asked()), Asked(), 5, 1) is None
-    assert kept(None, Asked(), PHOTOS, 0) is None
+    assert carried_over(after, Asked(), PHOTOS + 7, 3)["changed"] == 7
+    assert carried_over(after, Asked(), PHOTOS + 8, 4) is None
+    assert carried_over(made, Asked(min_recall=0.5), PHOTOS, 0) is None
+    assert carried_over(all_judged(4, Asked()), Asked(), 5, 1) is None
+    assert carried_over(None, Asked(), PHOTOS, 0) is None
 
 
 def test_where_all_were_judged_newcomers_are_too():
     made = {**all_judged(1000, Asked()), "queries": 50}
-    assert kept(made, Asked(), 1001, 1)["k"] == 1001
+    assert carried_over(made, Asked(), 1001, 1)["k"] == 1001
 
 
 def test_a_point_is_told_in_one_sentence_with_its_interval():

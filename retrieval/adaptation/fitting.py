@@ -30,7 +30,7 @@ MOST_JUDGED = 60
 
 
 @one_thread()
-def fitted(material: Material, estimate: Estimate | None, out: Path) -> Checkpoint:
+def fit_matcher(material: Material, estimate: Estimate | None, out: Path) -> Checkpoint:
     """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridge."""
     features, config, matcher = material.features, material.config, material.matcher
     by_ridge = dict(
@@ -97,7 +97,7 @@ def _float(values: np.ndarray[Any, Any]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
+def with_probabilities(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
     """The fitted checkpoint with a check of touches, and with the posterior of the folds: what a match is worth is told
     by objects left out, as codes know those that they were fitted on too well. Without an estimate it has no
     posterior."""
@@ -107,7 +107,7 @@ def judged(made: Checkpoint, material: Material, estimate: Estimate | None, *, q
     return _calibrated(made, _left_out(made.matcher, estimate))
 
 
-def kept(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
+def start_with_probabilities(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
     """The model that one started from, with a check of touches and a posterior fitted to own objects."""
     made = _checked(start, material.grasps, estimate.known.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]

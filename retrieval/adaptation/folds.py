@@ -65,7 +65,7 @@ def best_ridge(folds: Sequence[Fold]) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class ToldApart:
     """How each touch of a fold (n of them) was told apart from the fold's other objects.
 
     object_ids (n,): what was touched. first (n,): whether its own object's photo stood first (a share where photos
@@ -85,13 +85,13 @@ class Told:
         return Measure(getattr(self, column)[:, None], owner, np.array([chance]), f"{self.objects} objects left out")
 
 
-def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> Told:
+def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> ToldApart:
     """Tell each touch of a fold by one photo, drawn, of each of the fold's objects; the photo of its own object is of
     another grasp where there is one."""
-    return told(fold.cosines(ridge), fold.left_out, seed)
+    return tell_apart(fold.cosines(ridge), fold.left_out, seed)
 
 
-def told(scores: NDArray[np.float32], features: Features, seed: int = 0) -> Told:
+def tell_apart(scores: NDArray[np.float32], features: Features, seed: int = 0) -> ToldApart:
     """As `first_guesses`, from scores (n, n) of every touch with the photo of every grasp."""
     rng, owner = np.random.default_rng([seed, 8]), features.owner
     rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
@@ -102,15 +102,15 @@ def told(scores: NDArray[np.float32], features: Features, seed: int = 0) -> Told
         higher[touch], equal[touch] = (others > own).sum(), (others == own).sum()
     rivals = len(rows) - 1
     first = guess_curves(higher, equal, rivals, len(rows))[:, 0]
-    return Told(features.object_ids, first, 1 - (higher + equal / 2) / rivals, len(rows))
+    return ToldApart(features.object_ids, first, 1 - (higher + equal / 2) / rivals, len(rows))
 
 
-def pair_accuracy(parts: Sequence[Told]) -> float:
+def pair_accuracy(parts: Sequence[ToldApart]) -> float:
     """How often a touch's own photo stands above one of another object; objects count alike."""
     return float(measure(parts, "below").by_object()[1].mean())
 
 
-def measure(parts: Sequence[Told], column: str) -> Measure:
+def measure(parts: Sequence[ToldApart], column: str) -> Measure:
     """The measure "first" or "below" of all folds."""
     names = [sorted(set(part.object_ids)) for part in parts]
     number_of = {name: number for number, name in enumerate(sorted(set().union(*names)))}

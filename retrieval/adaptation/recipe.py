@@ -8,7 +8,7 @@ and every number that is told of it comes from objects that were left out of the
 from pathlib import Path
 
 from retrieval.adaptation.estimate import Estimate, judge
-from retrieval.adaptation.fitting import fitted, judged, kept
+from retrieval.adaptation.fitting import fit_matcher, start_with_probabilities, with_probabilities
 from retrieval.adaptation.material import Material, encode
 from retrieval.data.dataset import Split
 from retrieval.model.checkpoint import Checkpoint, require_writable, store_checkpoint
@@ -37,8 +37,8 @@ def adapt(
     material = encode(recording, start, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
     estimate = judge(material, start, cache=cache, seed=seed, quiet=quiet)
     if estimate and estimate.keeps_the_model:
-        made = kept(start, material, estimate, quiet=quiet)
+        made = start_with_probabilities(start, material, estimate, quiet=quiet)
     else:
-        made = judged(fitted(material, estimate, out), material, estimate, quiet=quiet)
+        made = with_probabilities(fit_matcher(material, estimate, out), material, estimate, quiet=quiet)
     store_checkpoint(made, out)
     return material, estimate

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.adaptation.folds import Told, told
+from retrieval.adaptation.folds import ToldApart, tell_apart
 from retrieval.data.dataset import Grasp
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
@@ -47,9 +47,9 @@ class AsItIs:
     def _halves(self, asked: Features) -> torch.Tensor:
         return self.start.matcher.touch_code(torch.from_numpy(asked.touch).flatten(1)).half
 
-    def told(self, folds: Sequence[Sequence[str]]) -> list[Told]:
+    def told(self, folds: Sequence[Sequence[str]]) -> list[ToldApart]:
         """How it tells the objects of each fold apart."""
-        return [told(self.logits(asked), asked) for asked in map(self.features.of_objects, folds)]
+        return [tell_apart(self.logits(asked), asked) for asked in map(self.features.of_objects, folds)]
 
     def felt(self, folds: Sequence[Sequence[str]], most: int) -> list[FeltTouches]:
         """What its posterior can be fitted on, and what references are worth: of each object at most so many

@@ -32,7 +32,7 @@ from retrieval.search.operating import (
     Asked,
     Settled,
     all_judged,
-    kept,
+    carried_over,
     needs_measuring,
     sentence,
     settle,
@@ -313,7 +313,7 @@ def _settled(made: Embedder, tables: Tables, asked: Asked, quiet: bool) -> Settl
     photos, checkpoint = len(tables.slots), made.checkpoint
     previous = None if made.parent is None else made.parent.manifest
     before = None if previous is None else previous.about.get("candidates")
-    again = kept(before, asked, photos, made.embedded + made.resumed + made.removed)
+    again = carried_over(before, asked, photos, made.embedded + made.resumed + made.removed)
     if previous is not None and again is not None:
         parameters = load_kind(previous.kind).parameters_from(previous.asked)
         return Settled(previous.kind, parameters, sentence(again), again)
