@@ -243,11 +243,12 @@ def test_the_export_beside_a_checkpoint_comes_first(own, monkeypatch):
     assert not onnx_encoder.cached(checkpoint.digest).exists()
 
 
-def test_a_damaged_export_in_the_cache_is_made_again(own, monkeypatch):
+@pytest.mark.parametrize("content", [sealed(b"model" * 100)[:-1], sealed(b"model" * 100)[:100], b"junk"])
+def test_a_damaged_export_in_the_cache_is_made_again(own, monkeypatch, content):
     checkpoint = load_checkpoint(own)
     path = onnx_encoder.cached(checkpoint.digest)
     path.parent.mkdir(parents=True)
-    path.write_bytes(sealed(b"model" * 100)[:-1])
+    path.write_bytes(content)
     timed(monkeypatch, 2.0, 1.0)
     assert Path(exporting.export_to_cache(checkpoint).path) == path
     assert OnnxEncoder(path, checkpoint.digest).name == "onnx"

@@ -89,6 +89,7 @@ def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
         unsealed(path)
         return None
     try:
+        path.unlink(missing_ok=True)  # of the cache everything is ours, whatever it holds by now
         path.parent.mkdir(parents=True, exist_ok=True)
         return export(checkpoint, path)
     except (OSError, RetrievalError) as error:
