@@ -39,6 +39,12 @@ def test_what_is_given_is_taken_even_if_it_is_not_there():
     assert defaults.find_index("none") == (Path("none"), "given")
 
 
+def test_a_file_given_for_an_index_is_refused(tmp_path):
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(BadInput, match=r"model\.safetensors is a file; an index is a folder"):
+        defaults.find_index(str(tmp_path / "model.safetensors"))
+
+
 def test_shipped_models_are_named_by_the_fingers_that_they_take():
     assert defaults.find_model("shipped")[0] == defaults.shipped_model()
     assert defaults.find_model("shipped-one-finger")[0] == defaults.shipped_model(1)

@@ -35,7 +35,9 @@ def evaluate(
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(metavar="PRESET", help="preset (tiny, small, mobilenet, paper) or TOML file (default: small)"),
+        typer.Option(
+            metavar="PRESET", help="preset, such as tiny, small, mobilenet or relief, or TOML file (default: small)"
+        ),
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,

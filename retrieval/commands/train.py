@@ -34,7 +34,8 @@ def train(
     ] = "match",
     out: Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")],
     config: Annotated[
-        str | None, typer.Option(help="preset (small, mobilenet, paper) or TOML file (default: small)")
+        str | None,
+        typer.Option(help="preset, such as small, mobilenet, relief or paper, or TOML file (default: small)"),
     ] = None,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     init_photo: InitPhoto = None,

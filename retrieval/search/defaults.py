@@ -104,8 +104,10 @@ def model_of(manifest: "Manifest | ClusterManifest") -> Path:
 
 def find_index(given: str | None) -> tuple[str | Path, str]:
     """The index to use, a folder or a URL, and why: the one given, else ./index, else the last one built from this
-    folder."""
+    folder. Raises BadInput where there is none."""
     if given is not None:
+        if not is_url(given) and Path(given).is_file():
+            raise BadInput(f"{given} is a file; an index is a folder, which `retrieve build-index` writes")
         return place_of(given), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
