@@ -180,6 +180,10 @@ def test_photos_are_embedded_however_they_are_given(catalogue, model):
 def test_no_photo_and_a_bad_one_are_refused(catalogue, model):
     with pytest.raises(BadInput, match="give at least one photo"):
         retrieval.embed_photos([], model=model)
+    with pytest.raises(BadInput, match="photos must be a list, of one photo too"):
+        retrieval.embed_photos("catalog/mug/1.jpg", model=model)
+    with pytest.raises(ImageError, match=r"photo 1: an image must be a path, .*, got int"):
+        retrieval.embed_photos([5], model=model)
     with pytest.raises(ImageError, match=r"photo 2: an array must hold uint8"):
         retrieval.embed_photos([sorted(catalogue.rglob("*.jpg"))[0], np.zeros((4, 4, 3))], model=model)
 

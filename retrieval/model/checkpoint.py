@@ -62,8 +62,7 @@ class Checkpoint(Stored):
     * `references`: what reference touches are worth; None where nothing could tell.
     * `queries`: (Q, half) halves of touches of validation objects, by which an index can measure its own search.
 
-    >>> from pathlib import Path
-    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
+    >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
     ('none', 64)
     """
@@ -143,19 +142,19 @@ def beside(path: Path, ending: str) -> Path:
     return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
-def load_checkpoint(path: Path, *, known: Stored | None = None) -> Checkpoint:
+def load_checkpoint(path: str | Path, *, known: Stored | None = None) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
 
     known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
     digest nor checksum is computed again.
 
-    >>> from pathlib import Path
-    >>> retrieval.load_checkpoint(Path("model.safetensors")).config.matcher.fingers
+    >>> retrieval.load_checkpoint("model.safetensors").config.matcher.fingers
     2
-    >>> retrieval.load_checkpoint(Path("none.safetensors"))
+    >>> retrieval.load_checkpoint("none.safetensors")
     Traceback (most recent call last):
     retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
+    path = Path(path)
     state, header = read_tensors(path, check=known is None)
     about = known or stored_of(path, header)
     try:

@@ -45,7 +45,7 @@ from retrieval.version import __version__
 def build_index(
     folder: str | Path,
     checkpoint: Checkpoint,
-    out: Path,
+    out: str | Path,
     *,
     objects_from: str | None = None,
     kind: str | None = None,
@@ -69,13 +69,12 @@ def build_index(
     again by the next build (`indexes.store.unfinished`). Raises BadInput for a rule that is none, DatasetError where no
     photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the index as it was.
 
-    >>> from pathlib import Path
-    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
-    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("index"), quiet=True)
+    >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
+    >>> report = retrieval.build_index("catalog", checkpoint, "index", quiet=True)
     >>> report.photos, report.embedded  # the index was there, and no photo changed
     (4, 0)
     """
-    asked = Asked(kind, min_recall, max_ms)
+    asked, out = Asked(kind, min_recall, max_ms), Path(out)
     naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
     wanted, seen = Wanted(naming, asked, quiet, verify, note), SeenFolders(out, known=not verify)
     report = build_listed(list_photos(folder, naming, seen), checkpoint, out, wanted)

@@ -35,9 +35,8 @@ class BuildReport:
     * `references`: how many reference touches of how many objects, how many of these have no photo (`alone`), how many
       touches were encoded now, and who says what they are worth (`by`); None where there are none.
 
-    >>> from pathlib import Path
-    >>> checkpoint = retrieval.load_checkpoint(Path("model.safetensors"))
-    >>> report = retrieval.build_index(Path("catalog"), checkpoint, Path("new-index"), quiet=True)
+    >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
+    >>> report = retrieval.build_index("catalog", checkpoint, "new-index", quiet=True)
     >>> report.written, report.objects, report.photos, report.skipped
     (True, 2, 4, [])
     """

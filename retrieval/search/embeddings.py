@@ -30,6 +30,8 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
     >>> scores.shape, logits.shape
     ((1, 2), (2,))
     """
+    if isinstance(photos, str | bytes | os.PathLike):  # of which each letter would be taken for a path
+        raise BadInput("photos must be a list, of one photo too; put it into [ ]")
     if not photos:
         raise BadInput("give at least one photo to embed")
     if not isinstance(model, Checkpoint):
