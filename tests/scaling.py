@@ -243,7 +243,7 @@ def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
             value, low, high = (np.array([each[name][part][0] for each in own]) for part in ("value", "low", "high"))
             x = np.array([each["objects"] for each in own]) + NONE_FELT
             colour = colormaps["viridis"](0.9 * number / max(len(counts) - 1, 1))
-            bars = [value - low, high - value]
+            bars = [list(value - low), list(high - value)]
             axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, label=f"{count:,} photographed")
         axes.axhline(points[0][name]["chance"][0], color="black", linestyle=":", linewidth=1)
         ticks = sorted({point["objects"] for point in points})
@@ -262,7 +262,7 @@ def _panel(axes: Axes, points: Sequence[dict[str, Any]], key: str) -> None:
             own = sorted((point for point in points if point["method"] == method), key=lambda point: int(point[key]))
             value, low, high = (np.array([point[name][part][0] for point in own]) for part in ("value", "low", "high"))
             words = f"{label}, {method.replace('_', ' ')}"
-            bars = [value - low, high - value]
+            bars = [list(value - low), list(high - value)]
             x = [point[key] for point in own]
             axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, linestyle=style, label=words)
         axes.axhline(points[0][name]["chance"][0], color=colour, linestyle=":", linewidth=1)

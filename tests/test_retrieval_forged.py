@@ -2,11 +2,13 @@
 
 import contextlib
 import os
+from importlib.metadata import version
 
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from packaging.version import Version
 from safetensors.torch import save_file
 
 from indexes.errors import CorruptIndex
@@ -23,6 +25,9 @@ JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
     max_leaves=5,
+)
+needs_complex = pytest.mark.skipif(
+    Version(version("safetensors")) < Version("0.7"), reason="this safetensors writes no complex numbers"
 )
 
 
@@ -113,7 +118,7 @@ def test_a_header_nested_without_end_is_refused(saved, tmp_path):
         {"queries.touch_halves": torch.zeros(3, 5, dtype=torch.float16)},
         {"queries.touch_halves": torch.zeros(3, dtype=torch.float16)},
         {"queries.touch_halves": torch.zeros(3, 8, dtype=torch.bfloat16)},
-        {"head.out.bias": torch.zeros(1, dtype=torch.complex64)},
+        pytest.param({"head.out.bias": torch.zeros(1, dtype=torch.complex64)}, marks=needs_complex),
         {"head.out.bias": torch.zeros(1).to(torch.float8_e4m3fn)},
         {"head.out.bias": torch.zeros(())},
     ],

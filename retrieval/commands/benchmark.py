@@ -42,7 +42,7 @@ def real(
         typer.Option(help=f"which to ask, with commas between: {', '.join(PROTOCOLS)} (default: those with data)"),
     ] = None,
     methods: Annotated[str, typer.Option(help="methods to fit, with commas between")] = METHODS,
-    preset: Annotated[str, typer.Option(metavar="PRESET", help="towers and heads: preset or TOML file")] = PRESET,
+    preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
     model: Annotated[
