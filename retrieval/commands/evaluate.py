@@ -34,14 +34,8 @@ def evaluate(
         str | None, typer.Option(help=f"methods to compare, with commas between: {', '.join(METHODS)} (default: all)")
     ] = None,
     preset: Annotated[
-<<<<<<< HEAD
         str | None,
-        typer.Option(
-            metavar="PRESET", help="preset, such as tiny, small, mobilenet or relief, or TOML file (default: small)"
-        ),
-=======
-        str | None, typer.Option(help="preset (tiny, small, mobilenet, paper) or TOML file (default: small)")
->>>>>>> 18cb6a0 (Oldest versions: --preset by its own name; tests that asked more of PyTorch, safetensors and matplotlib than the tested is)
+        typer.Option(help="preset, such as tiny, small, mobilenet or relief, or TOML file (default: small)"),
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
