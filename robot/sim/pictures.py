@@ -25,6 +25,7 @@ from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_versio
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
 from robot.storage import (
+    PART,
     append_line,
     content_of,
     file_content,
@@ -121,7 +122,8 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
                 )
             return _done(folder / METADATA_FILE)
-        if folder.exists() and {path.name for path in folder.iterdir()} - {IMAGES_FOLDER, METADATA_FILE}:
+        ours = {IMAGES_FOLDER, METADATA_FILE, METADATA_FILE + PART, INFO_FILE + PART}
+        if folder.exists() and {path.name for path in folder.iterdir()} - ours:
             raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
         (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
         write_file(folder / METADATA_FILE, b"")
