@@ -252,3 +252,16 @@ def test_the_command_says_what_it_found_and_goes_on_from_its_cache(recording, mo
     assert kept
     assert main(line) == 0
     assert sorted(cache.iterdir()) == kept
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_report_that_cannot_be_made_is_said_to_be_missing(recording, model, tmp_path, capsys):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    split = tmp_path / "split.json"
+    split.write_text(json.dumps(Split(0, tuple(names[:4]), (), tuple(names[4:])).to_dict()))
+    line = ["adapt", str(recording), "--out", str(tmp_path / "own.safetensors"), "--model", str(model)]
+    assert main([*line, "--init", "none", "--split", str(split), "--report", str(tmp_path / "curve")]) == 0
+    said = capsys.readouterr().err
+    assert "6 objects or more can be judged" in said
+    assert f"{tmp_path / 'curve'} is not written" in said
+    assert not (tmp_path / "curve").exists()

@@ -47,5 +47,7 @@ def adapt(
         say(line)
     if report and estimate:
         say(f"learning curve: {write_curve(report, learning_curve(material, start, cache=cache, seed=seed))}")
+    elif report:
+        say(f"{report} is not written: a learning curve, too, is judged on objects that are left out")
     objects = len({grasp.object_id for grasp in material.grasps})
     say(f"{out}: fitted to {objects} objects, {len(material.grasps)} touches")
