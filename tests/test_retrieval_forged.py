@@ -4,6 +4,7 @@ import contextlib
 import os
 from importlib.metadata import version
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -12,6 +13,7 @@ from packaging.version import Version
 from safetensors.torch import save_file
 
 from indexes.errors import CorruptIndex
+from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError, ConfigError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
@@ -208,6 +210,16 @@ def test_a_row_of_a_photo_outside_the_catalogue_or_without_its_parts_is_refused(
     assert listed_photo(ROW).path == "mug/1.jpg"
     with pytest.raises(CorruptIndex):
         listed_photo(ROW | change)
+
+
+def test_an_index_whose_rows_name_no_object_is_of_no_rig(tmp_path):
+    """`serve` looks for the simulated rig's objects before the index is opened to be searched, which says what is
+    wrong."""
+    from retrieval.serve.rig import of_index
+
+    vectors = np.eye(2, dtype=np.float32)
+    IndexStore(tmp_path).write([{"id": "a"}, {"id": "b"}], vectors, fingerprint={})
+    assert of_index(tmp_path) is None
 
 
 # Commands ---------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from retrieval.search.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
@@ -48,7 +49,7 @@ def _object_ids(opened: Opened, name: str | None) -> list[str]:
         return [name]
     step = max(1, photos // MOST_NAMES)
     rows = [row for number in range(0, photos, step) for row in shard.page([], None, number, 1).rows]
-    return sorted({str(row["object_id"]) for row in rows})
+    return sorted({listed_photo(row).object_id for row in rows})
 
 
 @router.get(

@@ -19,6 +19,7 @@ from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
+from retrieval.search.objects import listed_photo
 from retrieval.serve.service import Grasped, LiveRig
 from robot.devices import TactileSensor
 from robot.rig import load_rig
@@ -55,10 +56,10 @@ def _seed(index: str | Path) -> int | None:
     try:
         folder = Path(index)
         folder = folder / read_cluster(folder).shards[0].folder if is_cluster(folder) else folder
-        first = IndexStore(folder).open(verify=False).rows[0]["object_id"]
+        first = listed_photo(IndexStore(folder).open(verify=False).rows[0]).object_id
     except IndexesError:
         return None  # said when it is opened
-    found = _SIMULATED.fullmatch(str(first))
+    found = _SIMULATED.fullmatch(first)
     return int(found[1]) if found else None
 
 
