@@ -185,6 +185,15 @@ def test_names_that_lead_out_of_an_archive_and_twins_are_left_out_and_named(cata
     }
 
 
+def test_parquet_files_whose_pictures_are_in_columns_of_their_own_are_refused(tmp_path):
+    """Those of the first were looked for in the column of the last."""
+    write_parquet(tmp_path / "a.parquet", {"image": [b"1"], "object_id": ["mug"]})
+    for other, said in ({"photo": [b"2"]}, "photo"), ({"path": ["mug/1.jpg"]}, "names of files"):
+        write_parquet(tmp_path / "b.parquet", other)
+        with pytest.raises(DatasetError, match=rf"must be in one column of all files; .*a\.parquet has image, .*{said}"):
+            list_photos(f"{tmp_path}/*.parquet")
+
+
 @pytest.mark.parametrize("ending", ["parquet", "tar"])
 @pytest.mark.parametrize("content", [b"", b"no such format" * 100, b"PAR1" * 10])
 def test_files_that_are_none_are_refused_in_a_sentence(ending, content, tmp_path):

@@ -211,12 +211,18 @@ def _matching(url: str) -> list[str]:
 
 
 def _parquet(url: str, naming: Naming) -> Catalogue:
-    photos, places, column = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]](), ""
-    for file in _matching(url):
+    photos, places = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]]()
+    files = _matching(url)
+    column = None
+    for file in files:
         try:
-            column, listed = tried(file, lambda file=file: _list_parquet(file))  # type: ignore[misc]
+            own, listed = tried(file, lambda file=file: _list_parquet(file))  # type: ignore[misc]
         except FINAL as error:
             raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
+        if column not in (None, own):
+            told = [f"{name} has {each or 'names of files'}" for name, each in ((files[0], column), (file, own))]
+            raise DatasetError(f"{url}: pictures must be in one column of all files; {', '.join(told)}")
+        column = own
         for photo, object_id, place in listed:
             photos.append((photo, object_id))
             places.setdefault(photo.path, place)  # of two of one name the first is taken
