@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from numbers import Integral
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -371,8 +372,9 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
 
 def require_counts(top: int, candidates: int | None) -> None:
     """Raises BadInput for numbers of objects or candidates that are none."""
-    if top < 1 or (candidates is not None and candidates < 1):
-        raise BadInput(f"top and candidates must be 1 or more; got {top} and {candidates}")
+    given = [top] if candidates is None else [top, candidates]
+    if not all(isinstance(count, Integral) and count >= 1 for count in given):
+        raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
 
 
 def torch_encoder(stored: Stored, threads: int | None = None) -> Encoder:
