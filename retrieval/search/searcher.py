@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from numbers import Integral
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -372,8 +371,8 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
 
 def require_counts(top: int, candidates: int | None) -> None:
     """Raises BadInput for numbers of objects or candidates that are none."""
-    given = [top] if candidates is None else [top, candidates]
-    if not all(isinstance(count, Integral) and count >= 1 for count in given):
+    given: list[object] = [top] if candidates is None else [top, candidates]
+    if not all(isinstance(count, int | np.integer) and count >= 1 for count in given):
         raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
 
 
