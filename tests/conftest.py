@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,19 @@ TINY = Config(
     ),
     Preprocessing(touch_px=32, photo_px=48),
 )
+
+# What is made outside of a test, by fixtures of many tests and with settings read at import, is remembered for nobody:
+# it would be the default of the user's commands in this folder, and of the next run's fixtures.
+_REMEMBERED = tempfile.TemporaryDirectory(prefix="touch-retrieval-state-")
+os.environ["XDG_STATE_HOME"] = _REMEMBERED.name
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _state_of_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What one file's fixtures make is no other file's default."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
 
 
 @pytest.fixture(scope="session")

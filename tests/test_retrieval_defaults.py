@@ -13,6 +13,8 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.stored import read_stored
 from retrieval.search import defaults
 
+AT_IMPORT = defaults._state_file()
+
 
 @pytest.fixture(autouse=True)
 def _in_an_empty_folder(tmp_path, monkeypatch):
@@ -32,6 +34,18 @@ def an_index(folder):
     folder.mkdir(parents=True)
     (folder / "CURRENT").write_text("gen-000001")
     return folder
+
+
+@pytest.fixture(scope="module")
+def of_a_fixture():
+    return defaults._state_file()
+
+
+def test_nothing_that_these_tests_make_is_remembered_for_the_user(of_a_fixture, monkeypatch):
+    """A slow test's training was the default of the next run's fixtures."""
+    own = defaults._state_file()
+    monkeypatch.delenv("XDG_STATE_HOME")
+    assert len({AT_IMPORT, of_a_fixture, own, defaults._state_file()}) == 4
 
 
 def test_what_is_given_is_taken_even_if_it_is_not_there():
