@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from packaging.version import Version
 from torch import nn
 
 from retrieval.lab.frontier import training
@@ -22,14 +23,15 @@ def sample(model, recording, tmp_path_factory):
 
 
 @needs_bfloat16
-def test_a_training_s_own_format_is_the_default_and_stands_beside_none_rounded_and_all_rounded(sample):
+@pytest.mark.skipif(
+    Version(torch.__version__) < Version("2.7"), reason="of a model of a few weights this PyTorch rounds more, spared"
+)
+def test_a_training_s_own_format_is_the_default_and_less_is_turned_by_it_than_with_no_layer_spared(sample):
     (panel,) = training_formats(sample).panels
     whole, spared, all_rounded = panel.points
     assert (whole.name, whole.error) == ("float32", 0)
     assert panel.default == spared
-    assert 0 < spared.error < 1  # which of the two is smaller in a model of a few weights, PyTorch's kernels decide
-    assert 0 < all_rounded.error < 1
-    assert spared.error != all_rounded.error
+    assert 0 < spared.error < all_rounded.error < 1
 
 
 def test_where_a_processor_multiplies_no_bfloat16_float32_stands_alone_and_the_row_says_why(sample, monkeypatch):

@@ -420,7 +420,9 @@ def test_the_number_of_gel_images_must_be_the_models(count, searcher, touch):
         searcher.query([touch, files])
 
 
-@pytest.mark.parametrize("numbers", [{"top": 0}, {"top": -1}, {"top": 2.5}, {"top": "3"}, {"candidates": 0}])
+@pytest.mark.parametrize(
+    "numbers", [{"top": 0}, {"top": -1}, {"top": 2.5}, {"top": "3"}, {"candidates": 0}, {"candidates": -5}]
+)
 def test_top_and_candidates_must_be_whole_and_positive(numbers, searcher, touch):
     with pytest.raises(BadInput, match="top and candidates must be whole numbers of 1 or more"):
         searcher.query([touch], **numbers)
