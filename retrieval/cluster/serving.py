@@ -194,7 +194,6 @@ class Deployments:
         self._holder = ray.remote(num_cpus=0)(Holder).options(name=self._own, namespace=HOLDERS).remote()
         self._users: Counter[str] = Counter()
         self._handles: dict[str, Any] = {}
-        self._over: list[Any] = []
         self._lock = threading.RLock()  # the collector of garbage lets shards go wherever it runs, in `open` too
         ray.serve.start(proxy_location="Disabled")
         self._delete_of_killed()
@@ -203,6 +202,7 @@ class Deployments:
         """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
         require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
         names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._own}" for entry in manifest.shards}
+        self._end_handles()
         with self._lock:
             where = cluster if is_url(cluster) else Path(cluster).resolve()
             self._deploy(names, str(where), manifest, stored)
@@ -211,7 +211,6 @@ class Deployments:
                 # With its router at once: threads that ask first would make one each, and one alone could be ended.
                 self._handles[name] = self._ray.serve.get_app_handle(name).options()
             handles = {folder: self._handles[name] for folder, name in names.items()}
-        self._end_handles()
         opened = RayShards(described_cluster(manifest), manifest.shards, handles, self._held)
         weakref.finalize(opened, self._let_go, list(names.values()))
         return opened
@@ -225,7 +224,7 @@ class Deployments:
         """Of shards that nobody asks any more. One that is left tells Ray of its queue for ever, also when that Ray has
         ended. Waits for the thread that does so: nothing for the collector of garbage, which may run on it."""
         with self._lock:
-            over, self._over = self._over, []
+            over = [self._handles.pop(name) for name in list(self._handles) if self._users[name] <= 0]
         for handle in over:
             handle.shutdown()
 
@@ -287,7 +286,6 @@ class Deployments:
         with self._lock:
             self._users.subtract(names)
             over = [name for name in set(names) if self._users[name] <= 0]
-            self._over += [self._handles.pop(name) for name in over if name in self._handles]
         if self._ray.is_initialized():
             for name in over:
                 self._ray.serve.delete(name, _blocking=False)
