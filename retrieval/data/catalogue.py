@@ -25,6 +25,7 @@ from indexes.store.seen_folders import SeenFolders
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
+from retrieval.data.text import require_utf8
 from retrieval.data.touched import CatalogueTouch, grouped, touch_name
 from retrieval.data.walking import SkippedPhoto, Walk
 from retrieval.errors import DatasetError, ImageError
@@ -271,6 +272,8 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     row = json.loads(line.decode(), parse_constant=_finite, parse_float=_finite)
     if not isinstance(row, dict):
         raise ValueError("must hold one JSON object in braces")
+    if b"\\u" in line:
+        require_utf8(row)
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError("must name a photo (file_name) or an object (object_id)")

@@ -35,7 +35,8 @@ from retrieval.data.catalogue import (
 from retrieval.data.images import MAX_BYTES
 from retrieval.data.naming import Naming
 from retrieval.data.storage import FINAL, file_system, is_inside, is_url, tried
-from retrieval.data.walking import SkippedPhoto
+from retrieval.data.text import is_utf8, require_utf8
+from retrieval.data.walking import SkippedPhoto, not_utf8
 from retrieval.errors import BadInput, DatasetError, ImageError
 
 _PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
@@ -118,8 +119,12 @@ def _folder(url: str, naming: Naming) -> Catalogue:
         raise DatasetError(f"the catalogue {url} cannot be listed: {error}") from error
     files, skipped = [], list[SkippedPhoto]()
     for name in (name.removeprefix(below) for name in names if name.startswith(below)):
-        if not any(part.startswith(".") for part in PurePosixPath(name).parts):
+        if any(part.startswith(".") for part in PurePosixPath(name).parts):
+            continue
+        if is_utf8(name):
             files.append(name)
+        else:
+            skipped.append(not_utf8(name))
     source = FolderSource(url)
     lines = tried(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
     return _fetched(catalogue_of(Path(), url, files, skipped, naming, lines), source, url)
@@ -134,7 +139,9 @@ def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming
     found, skipped, seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
     for photo, object_id in photos:
         name = object_id or naming.object_of(photo.path)
-        if photo.path in seen:
+        if not is_utf8(photo.path):
+            skipped.append(not_utf8(photo.path))
+        elif photo.path in seen:
             skipped.append(SkippedPhoto(photo.path, "comes twice"))
         elif not is_inside(photo.path):
             skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
@@ -292,7 +299,7 @@ def _archives(url: str, naming: Naming) -> Catalogue:
         stem, about = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
         for name, data, _, _ in members:
             if data is not None:
-                about[_key(name)] = _metadata(data)
+                about[_key(name)] = _metadata(f"{file}, {name}", data)
         for name, data, start, end in members:
             if data is None:
                 own = dict(about.get(_key(name), {}))
@@ -327,9 +334,14 @@ def _key(name: str) -> str:
     return f"{folder}/{last.partition('.')[0]}"
 
 
-def _metadata(data: bytes) -> dict[str, Any]:
+def _metadata(where: str, data: bytes) -> dict[str, Any]:
+    """The plain keys of a document; none where it is no JSON object. Raises DatasetError for text that is not UTF-8."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError):
         return {}
+    try:
+        require_utf8(document)
+    except ValueError as error:
+        raise DatasetError(f"{where}: {error}") from error
     return {key: value for key, value in document.items() if _is_plain(value)} if isinstance(document, dict) else {}

@@ -6,6 +6,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from indexes.store.seen_folders import SeenFolders
+from retrieval.data.text import is_utf8
 from retrieval.errors import DatasetError
 
 
@@ -47,9 +48,8 @@ class Walk:
             if name.startswith("."):
                 continue
             path = prefix + name
-            if not path.isascii() and not _is_utf8(path):
-                named = os.fsencode(path).decode(errors="backslashreplace")
-                self.skipped.append(SkippedPhoto(named, "the name is not valid UTF-8; rename it"))
+            if not path.isascii() and not is_utf8(path):
+                self.skipped.append(not_utf8(path))
                 plain = False
                 continue
             try:
@@ -77,9 +77,7 @@ class Walk:
             self.walk(link, path + "/")
 
 
-def _is_utf8(path: str) -> bool:
-    try:
-        path.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+def not_utf8(path: str) -> SkippedPhoto:
+    """A file whose name cannot be shown."""
+    named = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
+    return SkippedPhoto(named, "the name is not valid UTF-8; rename it")

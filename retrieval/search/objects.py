@@ -13,6 +13,7 @@ from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
 from retrieval.data.storage import is_inside
+from retrieval.data.text import utf8_of
 from retrieval.model.posterior import Posterior
 
 Floats = NDArray[np.float32]
@@ -31,14 +32,15 @@ class ListedPhoto:
 
 
 def listed_photo(row: dict[str, Any]) -> ListedPhoto:
-    """The photo of a row. Raises CorruptIndex for one whose parts are missing or that lies outside the catalogue, from
-    where its picture would be put into pages."""
+    """The photo of a row; U+FFFD stands for text that UTF-8 cannot hold, which older versions let into indexes. Raises
+    CorruptIndex for one whose parts are missing or that lies outside the catalogue, from where its picture would be put
+    into pages."""
     object_id, path, metadata = (row.get(name) for name in ("object_id", "path", "metadata"))
     if not (isinstance(object_id, str) and isinstance(path, str) and isinstance(metadata, dict)):
         raise CorruptIndex(f"row {row['id']!r} must have an object_id, a path and metadata; {AGAIN}")
     if not is_inside(path):
         raise CorruptIndex(f"row {row['id']!r} must name a photo inside the catalogue, names {path!r}; {AGAIN}")
-    return ListedPhoto(object_id, path, metadata)
+    return ListedPhoto(utf8_of(object_id), utf8_of(path), utf8_of(metadata))
 
 
 def require_usable(generation: Generation, half: int) -> None:

@@ -1,9 +1,13 @@
 """The application: its parts, put together."""
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import anyio.to_thread
@@ -30,8 +34,15 @@ from retrieval.serve.trials import Trials
 from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
 from retrieval.version import __version__
 
+log = logging.getLogger(__name__)
 THREADS = 4
-"""That read files and make thumbnails; the model has its own."""
+"""That read files and make thumbnails; the model and the rig have their own."""
+MAX_GRASPS = 4
+"""Grasps of the rig that are held at once, the one in work among them."""
+MAX_FRAMES = 8
+"""Requests for single pictures of a sensor that are held at once, besides streams."""
+_CLOSING_S = 1.0
+"""For each part of the service to end; what hangs is left to itself."""
 _BODIES: tuple[type[BaseModel], ...] = (
     QueryBody,
     BatchBody,
@@ -57,14 +68,20 @@ def create_app(
     recorder: writes what people said into the recording in the history's folder; nothing is kept without it. trials: a
     recording with whose unseen objects people are tested. Raises BadInput.
     """
-    metrics = Metrics()
+    metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
+    alone = {"workers": 1, "batch_most": 1, "batch_ms": 0.0}
     parts = Service(
         settings,
         metrics,
         generations,
         Queue(generations, settings, metrics),
-        rig or LiveRig(),
+        Queue(generations, replace(settings, queue=MAX_GRASPS, **alone), metrics),
+        {
+            name: Queue(generations, replace(settings, queue=settings.streams + MAX_FRAMES, **alone), metrics)
+            for name in rig.sensors
+        },
+        rig,
         Thumbnails(),
         Keeping(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
         Trials(trials) if trials else None,
@@ -98,9 +115,12 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     if not parts.generations.ready:
         await asyncio.to_thread(parts.generations.open)
-    parts.queue.start()
-    work = [parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
-    running = [asyncio.ensure_future(one) for one in work]
+    queues = (parts.queue, parts.grasps, *parts.frames.values())
+    for queue in queues:
+        queue.start()
+    if parts.keeping:
+        parts.keeping.start()
+    watching = asyncio.ensure_future(parts.generations.watch())
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
             yield
@@ -108,12 +128,28 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         parts.stopping.set()
         if parts.keeping:
             await parts.keeping.written()
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
-        await asyncio.to_thread(parts.queue.close)
+        watching.cancel()
+        await asyncio.wait([watching], timeout=_CLOSING_S)
+        closing: list[Callable[[], None]] = [partial(queue.close, _CLOSING_S) for queue in queues]
         if parts.keeping:
-            parts.keeping.close()
+            closing.append(parts.keeping.close)
+        await asyncio.wait([_in_daemon(close) for close in closing], timeout=_CLOSING_S)
+
+
+def _in_daemon(work: Callable[[], None]) -> asyncio.Future[None]:
+    """Work in a thread of its own, for which the process does not wait: all others may hang."""
+    loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
+
+    def run() -> None:
+        try:
+            work()
+        except Exception:
+            log.exception("a part of the service did not end well")
+        with suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(done.set_result, None)
+
+    Thread(target=run, daemon=True).start()
+    return done
 
 
 class Counted:

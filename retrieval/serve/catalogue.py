@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from retrieval.data.images import read_bytes
+from retrieval.data.text import utf8_of
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.search.neighbours import nearest_photos
@@ -160,8 +161,8 @@ def index(parts: Parts) -> IndexDocument:
         kind=described.kind,
         photos=described.photos,
         objects=described.objects,
-        model=searcher.checkpoint.path.name,
-        trained_on=str(searcher.checkpoint.provenance.get("source", "unknown")),
+        model=utf8_of(searcher.checkpoint.path.name),
+        trained_on=utf8_of(str(searcher.checkpoint.provenance.get("source", "unknown"))),
         encoder=searcher.encoder.name,
         fingers=opened.fingers,
         background=searcher.checkpoint.config.preprocessing.background,

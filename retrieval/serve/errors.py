@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from indexes.errors import IndexesError
+from retrieval.data.text import utf8_of
 from retrieval.errors import BadInput, ImageError, RetrievalError, Unanswered
 
 MEDIA_TYPE = "application/problem+json"
@@ -24,7 +25,7 @@ KINDS: Mapping[str, tuple[int, str]] = {
     "refused": (403, "The request is refused"),
     "unknown": (404, "There is no such thing"),
     "not-allowed": (405, "This path does not take that method"),
-    "too-slow": (408, "The body did not come in time"),
+    "too-slow": (408, "The request did not come in time"),
     "conflict": (409, "This was said already"),
     "too-large": (413, "The request is too large"),
     "unsupported-type": (415, "The body is of a kind that is not read"),
@@ -32,12 +33,24 @@ KINDS: Mapping[str, tuple[int, str]] = {
     "bad-input": (422, "The input cannot be used"),
     "bad-image": (422, "An image cannot be read"),
     "busy": (429, "The service has all it can hold"),
+    "too-large-headers": (431, "The headers of the request are too large"),
     "failed": (500, "The service failed"),
     "not-ready": (503, "The service is not ready"),
     "late": (504, "The deadline passed"),
 }
 """Kind of a problem -> status and title."""
 _OF_STATUS = {400: "malformed", 404: "unknown", 405: "not-allowed", 413: "too-large", 415: "unsupported-type"}
+
+
+class DocumentResponse(JSONResponse):
+    """JSON, in which U+FFFD stands for what UTF-8 cannot hold, such as names of files on the disk."""
+
+    def render(self, content: Any) -> bytes:
+        """The document as bytes (Starlette)."""
+        try:
+            return super().render(content)
+        except UnicodeEncodeError:
+            return super().render(utf8_of(content))
 
 
 class ProblemDocument(BaseModel):
@@ -68,7 +81,9 @@ class Problem(Exception):
         status, title = KINDS[self.kind]
         detail = self.detail if len(self.detail) <= LONGEST else self.detail[:LONGEST] + " ..."
         document = ProblemDocument(type=PREFIX + self.kind, title=title, status=status, detail=detail)
-        return JSONResponse(document.model_dump(), status, {"cache-control": "no-store", **self.headers}, MEDIA_TYPE)
+        return DocumentResponse(
+            document.model_dump(), status, {"cache-control": "no-store", **self.headers}, MEDIA_TYPE
+        )
 
 
 def problem_of(error: Exception) -> Problem:

@@ -88,7 +88,9 @@ class FeedbackBody(BaseModel):
 
 
 class FeedbackDocument(BaseModel):
-    """What is kept. recorded: whether the grasps are in the recording, for which the object must have a photo."""
+    """What is kept. recorded: whether the grasps are in the recording: the object must have a photo, a grasp must have
+    felt something, and the disk must have room. Where it had none, the grasps are recorded after a later feedback, or
+    when the service starts again."""
 
     query: str
     said: Said
@@ -108,12 +110,8 @@ async def _entry(parts: Service, name: str) -> Kept:
     await keeping.written()
     kept = await run_in_threadpool(keeping.store.query, name)
     if kept is None:
-        raise _no_query(name)
+        raise keeping.absence(name)
     return kept
-
-
-def _no_query(name: str) -> Problem:
-    return Problem("unknown", f"the history has no query {name[:64]!r}; the oldest are left out")
 
 
 def _item(kept: Kept) -> dict[str, Any]:
@@ -155,7 +153,7 @@ async def history(
 
 
 # What an answer did not say, such as a reference touch, it does not say here either.
-@router.get("/v1/history/{name}", responses=problems("unknown"), response_model_exclude_unset=True)
+@router.get("/v1/history/{name}", responses=problems("unknown", "not-ready"), response_model_exclude_unset=True)
 async def entry(name: str, parts: Parts) -> HistoryEntry:
     """A query with its whole answer."""
     kept = await _entry(parts, name)
@@ -165,7 +163,10 @@ async def entry(name: str, parts: Parts) -> HistoryEntry:
 @router.get(
     "/v1/history/{name}/touches/{grasp}/{finger}",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"}, **problems("unknown")},
+    responses={
+        200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"},
+        **problems("unknown", "not-ready"),
+    },
 )
 async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
     """A gel image as it was sent; what browsers do not show, as PNG. grasp: from 1, 0 for the no-contact frames."""
@@ -180,7 +181,7 @@ async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
     return Response(shown, media_type=kind, headers={"cache-control": "private, max-age=86400, immutable"})
 
 
-@router.get("/v1/history/{name}/nearest", responses=problems("unknown", "bad-input"))
+@router.get("/v1/history/{name}/nearest", responses=problems("unknown", "bad-input", "not-ready"))
 async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearTouchesDocument:
     """Touches of the history that feel to the model like this one."""
     await _entry(parts, name)
@@ -205,7 +206,7 @@ async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=
 @router.post(
     "/v1/feedback",
     status_code=201,
-    responses=problems("unknown", "bad-input", "conflict"),
+    responses=problems("unknown", "bad-input", "conflict", "not-ready"),
     openapi_extra=json_body("FeedbackBody"),
 )
 async def feedback(request: Request, parts: Parts, response: Response) -> FeedbackDocument:
@@ -219,14 +220,14 @@ async def feedback(request: Request, parts: Parts, response: Response) -> Feedba
         said, name, photo = _meant(body, kept, opened)
         new = keeping.store.say(body.query, said, name, photo)
         keeping.recording.bring_up()
-        return new, photo is not None, name
+        return new, keeping.recording.holds(body.query), name
 
     try:
         new, recorded, name = await asyncio.shield(asyncio.to_thread(say))
     except BadInput as error:
         raise Problem("conflict", str(error)) from error
     except KeyError as error:  # one of the oldest, which went meanwhile
-        raise _no_query(body.query) from error
+        raise keeping.absence(body.query) from error
     response.status_code = 201 if new else 200
     return FeedbackDocument(query=body.query, said=body.said, object_id=name, recorded=recorded)
 

@@ -7,7 +7,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from starlette.concurrency import run_in_threadpool
 
 from retrieval.search.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
@@ -23,15 +22,17 @@ Named = Annotated[str | None, Query(max_length=1000, alias="object", description
 Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at most")]
 
 
-@router.post("/v1/grasp", responses=problems("unknown", "bad-input", "failed", "not-ready"))
-async def grasp(parts: Parts, name: Named = None) -> GraspDocument:
-    """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random."""
+@router.post("/v1/grasp", responses=problems("unknown", "bad-input", "failed", "busy", "late", "not-ready"))
+async def grasp(request: Request, parts: Parts, name: Named = None) -> GraspDocument:
+    """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random. The rig makes
+    one grasp after the other."""
     close = parts.rig.grasp
     if close is None:
         raise Problem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
-    names = await run_in_threadpool(_object_ids, parts.generations.current, name)
     try:
-        felt = await run_in_threadpool(close, names)
+        felt = await parts.grasps.do(lambda opened: close(_object_ids(opened, name)), request)
+    except Problem:
+        raise
     except Exception as error:  # of any rig
         raise Problem("failed", f"the rig could not grasp: {error}") from error
     encoded = [
@@ -55,11 +56,14 @@ def _object_ids(opened: Opened, name: str | None) -> list[str]:
 @router.get(
     "/v1/sensors/{name}/frame",
     response_class=Response,
-    responses={200: {"content": {"image/jpeg": {}}, "description": "the picture"}, **problems("unknown", "failed")},
+    responses={
+        200: {"content": {"image/jpeg": {}}, "description": "the picture"},
+        **problems("unknown", "failed", "busy", "late"),
+    },
 )
-async def frame(name: str, parts: Parts) -> Response:
+async def frame(name: str, request: Request, parts: Parts) -> Response:
     """The newest picture of a sensor."""
-    return Response(await _read(parts, name), media_type="image/jpeg")
+    return Response(await _read(parts, name, request), media_type="image/jpeg")
 
 
 @router.get(
@@ -67,20 +71,20 @@ async def frame(name: str, parts: Parts) -> Response:
     response_class=StreamingResponse,
     responses={
         200: {"content": {"multipart/x-mixed-replace": {}}, "description": "pictures without end (MJPEG)"},
-        **problems("unknown", "failed", "busy"),
+        **problems("unknown", "failed", "busy", "late"),
     },
 )
 async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:
     """The pictures of a sensor as they come; an `<img>` shows them."""
     if parts.streams.locked():
         raise Problem("busy", f"{parts.settings.streams} streams run already", {"retry-after": "5"})
-    first = await _read(parts, name)  # what fails, fails before the stream begins
+    first = await _read(parts, name, request)  # what fails, fails before the stream begins
     return StreamingResponse(
-        _pictures(parts, name, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+        _pictures(parts, name, request, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     )
 
 
-async def _pictures(parts: Service, name: str, first: bytes, pause_s: float) -> AsyncIterator[bytes]:
+async def _pictures(parts: Service, name: str, request: Request, first: bytes, pause_s: float) -> AsyncIterator[bytes]:
     async with parts.streams:
         data: bytes | None = first
         while data is not None and not parts.stopping.is_set():
@@ -91,17 +95,20 @@ async def _pictures(parts: Service, name: str, first: bytes, pause_s: float) -> 
             )
             await asyncio.sleep(pause_s)
             try:
-                data = await _read(parts, name)
-            except Problem:
-                data = None  # the sensor was unplugged: the stream ends
+                data = await _read(parts, name, request)
+            except Problem as problem:
+                if problem.kind != "busy":
+                    data = None  # the sensor was unplugged: the stream ends
 
 
-async def _read(parts: Service, name: str) -> bytes:
+async def _read(parts: Service, name: str, request: Request) -> bytes:
     read = parts.rig.sensors.get(name)
     if read is None:
         known = ", ".join(sorted(parts.rig.sensors)) or "none; name a rig with --rig"
         raise Problem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
     try:
-        return await run_in_threadpool(read)
+        return await parts.frames[name].do(lambda _: read(), request)
+    except Problem:
+        raise
     except Exception as error:  # of any driver
         raise Problem("failed", f"sensor {name}: {error}") from error

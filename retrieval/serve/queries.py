@@ -1,14 +1,13 @@
 """The paths of queries: one object, several, an answer grasp by grasp, and where a photo agrees with a touch."""
 
 from fastapi import APIRouter, Request
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from retrieval.search.agreement import agreement
 from retrieval.search.answer import QueryResult
 from retrieval.serve.catalogue import photo_of
 from retrieval.serve.documents import AgreementDocument, BatchDocument, GrowingDocument, QueryDocument
-from retrieval.serve.errors import problems
+from retrieval.serve.errors import DocumentResponse, problems
 from retrieval.serve.generations import Opened
 from retrieval.serve.service import Parts
 from retrieval.serve.uploads import (
@@ -34,19 +33,19 @@ _PROBLEMS = problems("bad-input", "bad-image", "too-large", "too-slow", "unsuppo
     openapi_extra={"requestBody": QUERY_BODY},
     summary="Which object is in the hand?",
 )
-async def query(request: Request, parts: Parts) -> JSONResponse:
+async def query(request: Request, parts: Parts) -> DocumentResponse:
     """The document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_room()
     asked = await read_query(request, parts.generations.current.fingers)
     answered = await parts.queue.ask(asked, request)
     name = parts.keeping.keep(asked, answered) if parts.keeping else None
-    return JSONResponse(answered.result.to_dict(), headers={"x-query-id": name} if name else None)
+    return DocumentResponse(answered.result.to_dict(), headers={"x-query-id": name} if name else None)
 
 
 @router.post(
     "/v1/query/growing", response_model=GrowingDocument, responses=_PROBLEMS, openapi_extra={"requestBody": QUERY_BODY}
 )
-async def query_growing(request: Request, parts: Parts, alone: bool = False) -> JSONResponse:
+async def query_growing(request: Request, parts: Parts, alone: bool = False) -> DocumentResponse:
     """How the answer changes grasp by grasp: after the first, after the first two, and so on; `alone`: and what each
     grasp says by itself."""
     parts.queue.require_room()
@@ -60,11 +59,11 @@ async def query_growing(request: Request, parts: Parts, alone: bool = False) -> 
         }
 
     found = await parts.queue.do(work, request, asked.options.deadline_ms)
-    return JSONResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
+    return DocumentResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
 
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
-async def query_batch(request: Request, parts: Parts) -> JSONResponse:
+async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     """Several objects in one request: their touches are encoded together, an answer for each in their order."""
     parts.queue.require_room()
     body = await read_json(request, BatchBody)
@@ -76,7 +75,7 @@ async def query_batch(request: Request, parts: Parts) -> JSONResponse:
     )
     for answer in answers:
         parts.metrics.answered(answer)
-    return JSONResponse({"answers": [answer.to_dict() for answer in answers]})
+    return DocumentResponse({"answers": [answer.to_dict() for answer in answers]})
 
 
 class AgreementBody(BaseModel):

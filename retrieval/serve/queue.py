@@ -9,6 +9,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from threading import Condition, Thread
 from typing import Any, NamedTuple, TypeVar
@@ -57,17 +58,18 @@ class Queue:
     def start(self) -> None:
         """Begin to answer, for the event loop that calls."""
         loop = asyncio.get_running_loop()
-        self._threads = [Thread(target=self._work, args=(loop,)) for _ in range(self._settings.workers)]
+        self._threads = [Thread(target=self._work, args=(loop,), daemon=True) for _ in range(self._settings.workers)]
         for thread in self._threads:
             thread.start()
 
-    def close(self) -> None:
-        """Answer what waits, and end."""
+    def close(self, seconds: float) -> None:
+        """Answer what waits, and end; work that takes longer than `seconds` is left to itself."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+        until = time.monotonic() + seconds
         for thread in self._threads:
-            thread.join()
+            thread.join(max(0.0, until - time.monotonic()))
 
     @property
     def held(self) -> int:
@@ -108,7 +110,7 @@ class Queue:
         seconds = min(self._settings.deadline_s, (deadline_ms or 1e9) / 1e3)
         answer: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._held += 1
-        self._metrics.held.set(self._held)
+        self._metrics.held.inc()
         answer.add_done_callback(self._let_go)
         job = _Job(work, asked, answer, now, now + seconds)
         with self._changed:
@@ -132,7 +134,7 @@ class Queue:
 
     def _let_go(self, answer: asyncio.Future[Any]) -> None:
         self._held -= 1
-        self._metrics.held.set(self._held)
+        self._metrics.held.dec()
         if not answer.cancelled():
             answer.exception()  # which nobody may be there to ask for
 
@@ -142,7 +144,9 @@ class Queue:
             for job in jobs:
                 self._metrics.waiting.observe(now - job.began)
             self._metrics.batches.observe(len(jobs))
-            loop.call_soon_threadsafe(_tell, jobs, _answers(opened, jobs))
+            answers = _answers(opened, jobs)
+            with suppress(RuntimeError):  # the loop has ended meanwhile
+                loop.call_soon_threadsafe(_tell, jobs, answers)
 
     def _together(self) -> list[_Job]:
         """The next job, and those that wait or come in the window and can be answered with it; none at the end."""
@@ -187,7 +191,7 @@ def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
     try:
         found = opened.searcher.query_many([one.touches for one in asked], **asked[0].keywords)
-    except Exception:  # each alone says which of them it was
+    except BaseException:  # each alone says which of them it was
         return None
     return [Answered(result, opened.model) for result in found]
 
@@ -197,5 +201,7 @@ def _answer(opened: Opened, job: _Job) -> Any:
         return Problem("late", "the deadline passed before the request's turn came")
     try:
         return job.work(opened)
-    except Exception as error:
-        return error
+    except BaseException as error:
+        if isinstance(error, Exception) and not isinstance(error, StopIteration):
+            return error
+        return RuntimeError(repr(error))  # a future takes no StopIteration, and SystemExit would end the event loop

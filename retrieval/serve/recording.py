@@ -39,17 +39,26 @@ class SaidRecording:
         self._store, self._recorder, self._metrics, self._lock = store, recorder, metrics, Lock()
 
     def bring_up(self) -> None:
-        """Record what was said and is not recorded yet. What fails is told in the log, and tried again at the next
-        word: the database has it."""
+        """Record the feedback that is not recorded yet. Failures are logged, and tried again after the next feedback:
+        the database has it."""
         with self._lock:
-            for name, object_id in self._store.recordable():
-                if f"{name}-00" in self._recorder.grasp_ids:
+            try:
+                waiting = self._store.recordable()
+            except Exception:
+                log.exception("feedback is stored, and cannot be recorded yet")
+                return
+            for name, object_id in waiting:
+                if self.holds(name):
                     continue
                 try:
                     self._record(name, object_id)
                 except Exception:
                     self._metrics.unrecorded.labels("said").inc()
                     log.exception("what was said of %s is kept, and cannot be recorded yet", name)
+
+    def holds(self, name: str) -> bool:
+        """Whether the grasps of a query are in the recording."""
+        return f"{name}-00" in self._recorder.grasp_ids
 
     def _record(self, name: str, object_id: str) -> None:
         """A grasp for each that felt something; the first one last, for it stands for all of them."""

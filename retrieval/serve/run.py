@@ -2,22 +2,31 @@
 
 import asyncio
 import contextlib
+import os
 import signal
 import socket
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
 
 from retrieval.errors import BadInput
+from retrieval.serve.connections import IDLE_S, MAX_CONNECTIONS, Connection, ConnectionTable
 from retrieval.serve.service import Service
 
-KEEP_ALIVE_S = 5
-MOST_CONNECTIONS = 512
 LAST_CALL_S = 0.5
 """For which, told to end, it still takes requests: those that were sent before, and lie unread in a socket."""
+GRACE_S = 5
+"""For requests in flight, after the last call."""
+END_S = 9.0
+"""From the signal to the end of the process, whatever hangs."""
+_SWEEP_TICKS = 5
+"""Ticks of a tenth of a second from one look at the connections' deadlines to the next."""
 
 
 class Server(uvicorn.Server):
@@ -32,6 +41,15 @@ class Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._say_started(self.servers[0].sockets[0].getsockname()[1])
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close connections whose deadline has passed, twice a second; whether to end (uvicorn)."""
+        if counter % _SWEEP_TICKS == 0:
+            now = asyncio.get_running_loop().time()
+            for connection in list(self.server_state.connections):
+                if isinstance(connection, Connection):
+                    connection.close_if_late(now)
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer what was sent until now, and end."""
@@ -58,9 +76,11 @@ class Server(uvicorn.Server):
 
 
 def serve(app: FastAPI, started: Callable[[int], object]) -> None:
-    """Serve until SIGTERM or Ctrl-C; `started` is told the port as soon as it listens. Raises BadInput where it cannot
-    listen, and the errors of `Searcher.open`."""
+    """Serve until SIGTERM or Ctrl-C, which the process outlives by END_S at most, even where a thread hangs. `started`
+    is told the port as soon as it listens. Raises BadInput where it cannot listen, and the errors of
+    `Searcher.open`."""
     parts: Service = app.state.service
+    threading.Thread(target=_end_in_time, args=(parts.stopping,), daemon=True).start()
     parts.generations.open()
     host, port = parts.settings.host, parts.settings.port
     try:
@@ -70,6 +90,22 @@ def serve(app: FastAPI, started: Callable[[int], object]) -> None:
         raise BadInput(f"{host}, port {port}, cannot be listened on: {error.strerror or error}") from error
     with listening:
         Server(configured(app), parts, started).run([listening])
+
+
+def _end_in_time(stopping: threading.Event) -> None:
+    """End the process END_S after `stopping` is set: the interpreter would wait for threads that hang in a driver, in
+    the disk or in a decoder."""
+    stopping.wait()
+    time.sleep(END_S)
+    hanging = ", ".join(
+        thread.name for thread in threading.enumerate() if not thread.daemon and thread is not threading.main_thread()
+    )
+    with contextlib.suppress(OSError, ValueError):
+        sys.stderr.write(
+            f"did not end within {END_S:g} s of the signal, and is cut off; threads that hang: {hanging}\n"
+        )
+        sys.stderr.flush()
+    os._exit(1)
 
 
 def configured(app: FastAPI) -> uvicorn.Config:
@@ -83,8 +119,9 @@ def configured(app: FastAPI) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         proxy_headers=False,
+        http=partial(Connection, table=ConnectionTable()),  # type: ignore[arg-type]  # it is only called
         ws="none",
-        limit_concurrency=MOST_CONNECTIONS,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=round(settings.deadline_s) + 5,
+        backlog=MAX_CONNECTIONS,
+        timeout_keep_alive=IDLE_S,
+        timeout_graceful_shutdown=GRACE_S,
     )

@@ -41,13 +41,15 @@ class LiveRig:
 
 @dataclass(frozen=True, eq=False)
 class Service:
-    """The parts of one service. streams: places for live pictures. stopping: set when it is to end, for what would
-    never end by itself."""
+    """The parts of one service. grasps: the queue of the rig; frames: one for each sensor, by name. streams: places for
+    live pictures. stopping: set when it is to end, for what would never end by itself."""
 
     settings: ServiceSettings
     metrics: Metrics
     generations: Generations
     queue: Queue
+    grasps: Queue
+    frames: Mapping[str, Queue]
     rig: LiveRig
     thumbnails: Thumbnails
     keeping: Keeping | None

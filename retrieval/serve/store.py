@@ -1,10 +1,12 @@
 """What the service keeps, in SQLite: queries with their gel images and answers, what people said of them, trials.
 
 Write-ahead log and `synchronous = FULL`: when a method that writes returns, what it wrote outlives the process and the
-machine. One connection, one thread at a time.
+machine. One connection, one thread at a time. Once the file was deleted or replaced, each use fails: SQLite would write
+into the deleted one.
 """
 
 import json
+import os
 import secrets
 import sqlite3
 import time
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.text import utf8_of
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.search.answer import QueryResult
 
@@ -26,6 +29,8 @@ RIGHT, OBJECT, NONE = "right", "object", "none"
 SAID = (RIGHT, OBJECT, NONE)
 _APPLICATION, _VERSION = 0x746F7563, 1
 _TRIM_EVERY = 32
+_LOCK_S = 5.0
+"""How long a request waits for another that uses the database; longer only while the disk hangs."""
 _SCHEMA = """
 CREATE TABLE queries (
     id TEXT PRIMARY KEY, time REAL NOT NULL, verdict TEXT NOT NULL, answer TEXT NOT NULL, search TEXT NOT NULL,
@@ -105,6 +110,7 @@ class Store:
         except sqlite3.DatabaseError as error:
             self._database.close()
             raise BadInput(f"{path} must be the history of a service: {error}; name another folder") from error
+        self._files = self._identity()
 
     def _prepare(self) -> None:
         said = self._database.execute
@@ -121,27 +127,67 @@ class Store:
             raise sqlite3.DatabaseError(f"it is of another program or version ({found[1]})")
 
     def close(self) -> None:
-        """Write what stands in the log into the file, and let go of it."""
-        with self._lock:
+        """Write the log into the file, and close it."""
+        with self._locked():
             self._database.close()
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        if not self._lock.acquire(timeout=_LOCK_S):
+            raise RetrievalError(f"{self.path} does not answer; is its disk full or gone?")
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    def _identity(self) -> list[tuple[int, int] | None]:
+        """Device and inode of the database and of its write-ahead log, by their names; None for a missing one."""
+        found: list[tuple[int, int] | None] = []
+        for path in (self.path, self.path.with_name(f"{self.path.name}-wal")):
+            try:
+                status = os.stat(path)
+            except OSError:
+                found.append(None)
+            else:
+                found.append((status.st_dev, status.st_ino))
+        return found
+
+    def _require_in_place(self) -> None:
+        """Raise RetrievalError where the open files are not those that have their names."""
+        if self._identity() != self._files:
+            raise RetrievalError(
+                f"{self.path} was deleted or replaced while the service ran, so nothing can be stored in it; "
+                "start the service again"
+            )
+
+    @contextmanager
+    def _using(self, what: str) -> Iterator[None]:
+        """The database, for one thread. Raises RetrievalError where the disk refuses."""
+        with self._locked():
+            self._require_in_place()
+            try:
+                yield
+            except sqlite3.IntegrityError:
+                raise
+            except sqlite3.Error as error:
+                raise RetrievalError(f"{self.path} cannot be {what}: {error}") from error
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """A transaction that is on the disk when this ends, or never was."""
-        with self._lock:
+        with self._using("written"):
             try:
                 self._database.execute("BEGIN IMMEDIATE")
                 yield self._database
                 self._database.execute("COMMIT")
-            except BaseException as error:
+            except BaseException:
                 if self._database.in_transaction:
                     self._database.execute("ROLLBACK")
-                if isinstance(error, sqlite3.Error) and not isinstance(error, sqlite3.IntegrityError):
-                    raise RetrievalError(f"{self.path} cannot be written: {error}") from error
                 raise
+            self._require_in_place()
 
     def _read(self, text: str, values: Sequence[Any] = ()) -> list[Any]:
-        with self._lock:
+        with self._using("read"):
             return self._database.execute(text, values).fetchall()
 
     # Queries ------------------------------------------------------------------------------------------------
@@ -292,7 +338,7 @@ _COLUMNS = "id, queries.time, verdict, answer, said, object_id"
 
 def _kept(row: tuple[Any, ...]) -> Kept:
     name, when, verdict, answer, said, object_id = row
-    return Kept(name, when, verdict, json.loads(answer), said, object_id)
+    return Kept(name, when, verdict, utf8_of(json.loads(answer)), said, object_id)
 
 
 def _searched(words: Sequence[str]) -> str:

@@ -1,0 +1,222 @@
+"""Connections of clients: how many, how long each may take over a request, and how large its headers may be.
+
+uvicorn bounds none of this by itself: half-sent headers hold a connection for ever, and its limit of concurrent
+connections answers 503 to every client once it is reached. Here a new connection is always taken. Where that exceeds a
+limit, the oldest connection that waits for its client is closed: first those that never completed a request.
+"""
+
+import asyncio
+from typing import Any
+
+import h11
+from uvicorn import Config
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
+
+from retrieval.serve.errors import Problem
+
+MAX_CONNECTIONS = 512
+MAX_CONNECTIONS_OF_ADDRESS = 128
+HEADERS_S = 5.0
+"""From the connection, or from the first byte of a later request, to the end of the request's headers."""
+IDLE_S = 5
+"""Between the end of a response and the first byte of the next request."""
+UNREAD_S = 30.0
+"""For a client that does not read its response."""
+CLOSING_S = 2.0
+"""For a client that does not read the last bytes of a connection that is being closed."""
+MAX_HEADER_BYTES = 16_384
+"""Of the request line and all headers of one request."""
+FREE_CHUNKS, MIN_CHUNK_BYTES = 1_000, 256
+"""Chunks of one body beyond the first 1,000 must hold this many bytes on average: each costs as much work as a
+kilobyte."""
+_HEADER_PIECE, _BODY_PIECE = 4_096, 65_536
+
+
+class ConnectionTable:
+    """The open connections of one server, counted together and by address."""
+
+    def __init__(self, limit: int = MAX_CONNECTIONS, limit_of_address: int = MAX_CONNECTIONS_OF_ADDRESS) -> None:
+        self._all, self._limit_of_address = _Group(limit), limit_of_address
+        self._by_address: dict[str, _Group] = {}
+
+    def admit(self, connection: "Connection") -> None:
+        """Count a new connection; close the oldest one that waits for its client where a limit is exceeded."""
+        groups = (
+            self._by_address.setdefault(connection.address, _Group(self._limit_of_address)),
+            self._all,
+        )
+        for group in groups:
+            group.waiting_new[connection] = None
+            group.count += 1
+        for group in groups:
+            if group.count > group.limit:
+                oldest = next(iter(group.waiting_new or group.waiting_idle))
+                self.remove(oldest)
+                oldest.transport.abort()
+
+    def update(self, connection: "Connection") -> None:
+        """Note whether a connection waits for its client now."""
+        for group in self._groups(connection):
+            if not connection.waits_for_client:
+                group.waiting_new.pop(connection, None)
+                group.waiting_idle.pop(connection, None)
+            elif connection not in group.waiting_new:
+                group.waiting_idle.setdefault(connection)
+
+    def remove(self, connection: "Connection") -> None:
+        """Count a connection no more; a second call does nothing."""
+        for group in self._groups(connection):
+            group.waiting_new.pop(connection, None)
+            group.waiting_idle.pop(connection, None)
+            group.count -= 1
+        if (own := self._by_address.get(connection.address)) is not None and not own.count:
+            del self._by_address[connection.address]
+        connection.counted = False
+
+    def _groups(self, connection: "Connection") -> tuple["_Group", ...]:
+        return (self._by_address[connection.address], self._all) if connection.counted else ()
+
+
+class _Group:
+    """Connections that share a limit. waiting_new, waiting_idle: those that wait for their client, the oldest first
+    (sets in order): before their first request is complete, and later."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.count = limit, 0
+        self.waiting_new: dict[Connection, None] = {}
+        self.waiting_idle: dict[Connection, None] = {}
+
+
+class Connection(H11Protocol):
+    """A connection of uvicorn that keeps to the limits of this module.
+
+    It parses with h11, which parses one request after the other: what a client sends ahead stays bytes.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+        *,
+        table: ConnectionTable,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self.conn = _Parser(h11.SERVER, MAX_HEADER_BYTES)
+        self.table, self.counted, self.address = table, False, ""
+        self._headers_since: float | None = None
+        self._unread_since: float | None = None
+        self._closing_since: float | None = None
+
+    @property
+    def waits_for_client(self) -> bool:
+        """Whether no request is complete that is not answered yet."""
+        return not self._has_request or bool(self.cycle.more_body)
+
+    @property
+    def _has_request(self) -> bool:
+        """Whether the headers of a request have come that is not answered yet."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """A client has connected (asyncio)."""
+        super().connection_made(transport)
+        self.address, self.counted = self.client[0] if self.client else "", True
+        self._headers_since = self.loop.time()
+        self.table.admit(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is closed (asyncio)."""
+        self.table.remove(self)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes of the client have come (asyncio). They are parsed in pieces, so that headers are refused soon after
+        they exceed their limit."""
+        start = 0
+        while start < len(data) and not self.transport.is_closing():
+            piece = _BODY_PIECE if self._has_request else _HEADER_PIECE
+            super().data_received(data[start : start + piece])
+            start += piece
+        self._note_state()
+
+    def on_response_complete(self) -> None:
+        """A response has been sent (uvicorn)."""
+        super().on_response_complete()
+        self._note_state()
+
+    def _note_state(self) -> None:
+        """Note since when the headers of a request come, and whether the connection waits for its client."""
+        if self._has_request:
+            self._headers_since = None
+        elif self._headers_since is None and self.conn.trailing_data[0]:
+            self._headers_since = self.loop.time()
+        self.table.update(self)
+
+    def pause_writing(self) -> None:
+        """The client does not read (asyncio)."""
+        self._unread_since = self.loop.time()
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has read (asyncio)."""
+        self._unread_since = None
+        super().resume_writing()
+
+    def send_400_response(self, msg: str) -> None:
+        """Refuse what is not HTTP, or is too much of it (uvicorn)."""
+        if self._has_request or len(self.conn.trailing_data[0]) <= MAX_HEADER_BYTES:
+            self._refuse(Problem("malformed", msg))
+        else:
+            self._refuse(
+                Problem("too-large-headers", f"a request may have at most {MAX_HEADER_BYTES:,} bytes of headers")
+            )
+
+    def close_if_late(self, now: float) -> None:
+        """Close the connection where a deadline of this module has passed. now: time of the event loop."""
+        if self.transport.is_closing():
+            self._closing_since = self._closing_since or now
+            if now - self._closing_since > CLOSING_S:
+                self.transport.abort()
+        elif self._unread_since is not None and now - self._unread_since > UNREAD_S:
+            self.transport.abort()
+        elif self._headers_since is not None and now - self._headers_since > HEADERS_S:
+            if self.conn.trailing_data[0]:
+                self._refuse(Problem("too-slow", f"the headers of a request must come within {HEADERS_S:g} s"))
+            self.transport.close()
+
+    def _refuse(self, problem: Problem) -> None:
+        """Answer with a problem document where no response has begun, and close the connection."""
+        if self._has_request:
+            self.cycle.disconnected = True  # the application's answer comes too late
+            self.cycle.message_event.set()
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            response = problem.response()
+            headers = [*response.raw_headers, (b"connection", b"close")]
+            for event in (
+                h11.Response(status_code=problem.status, headers=headers),
+                h11.Data(data=bytes(response.body)),
+                h11.EndOfMessage(),
+            ):
+                self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
+
+
+class _Parser(h11.Connection):
+    """A parser that refuses bodies of many tiny chunks."""
+
+    _chunks = _chunk_bytes = 0
+
+    def next_event(self) -> Any:
+        """The next part of a request (h11). Raises RemoteProtocolError."""
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            self._chunks = self._chunk_bytes = 0
+        elif isinstance(event, h11.Data):
+            self._chunks += event.chunk_start
+            self._chunk_bytes += len(event.data)
+            if self._chunks > FREE_CHUNKS + self._chunk_bytes / MIN_CHUNK_BYTES:
+                raise h11.RemoteProtocolError("the chunks of the body are too small")
+        return event

@@ -1,0 +1,210 @@
+"""Half-sent, flooding and unread connections: they end soon, cost little, and keep no other client out."""
+
+import socket
+import time
+from contextlib import ExitStack, contextmanager
+
+import httpx
+import pytest
+
+from retrieval.serve import connections
+from retrieval.serve.connections import MAX_CONNECTIONS, MAX_CONNECTIONS_OF_ADDRESS, MAX_HEADER_BYTES
+from tests.serving import listening
+from tests.waiting import until
+
+HALF = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\nx-a: "
+
+
+@pytest.fixture(scope="module")
+def service_at(index):
+    with listening(index) as (url, parts):
+        host, port = url.removeprefix("http://").split(":")
+        yield url, (host, int(port)), parts
+
+
+@contextmanager
+def opened(address, count, sent=HALF, source="127.0.0.1"):
+    """So many connections from an address, on each of which this was sent."""
+    with ExitStack() as stack:
+        lines = []
+        for _ in range(count):
+            line = stack.enter_context(socket.create_connection(address, timeout=30, source_address=(source, 0)))
+            line.sendall(sent)
+            lines.append(line)
+        yield lines
+
+
+def received(line):
+    """All that the service sends until it closes the connection."""
+    data = b""
+    try:
+        while more := line.recv(65536):
+            data += more
+    except ConnectionResetError:
+        pass
+    return data
+
+
+def is_closed(line):
+    """Whether the service has closed a connection, on which it sends nothing else."""
+    line.setblocking(False)
+    try:
+        return not line.recv(1)
+    except BlockingIOError:
+        return False
+    except ConnectionResetError:
+        return True
+    finally:
+        line.setblocking(True)
+
+
+def lives(url, source="127.0.0.1"):
+    """Seconds until /healthz answers on a new connection from an address."""
+    began = time.monotonic()
+    with httpx.Client(transport=httpx.HTTPTransport(local_address=source), timeout=10) as client:
+        assert client.get(f"{url}/healthz").status_code == 200
+    return time.monotonic() - began
+
+
+def test_half_sent_headers_end_at_a_deadline_and_a_silent_connection_too(service_at, monkeypatch):
+    _, address, _ = service_at
+    monkeypatch.setattr(connections, "HEADERS_S", 0.3)
+    with opened(address, 1) as (half,), opened(address, 1, b"") as (silent,):
+        told = received(half)
+        assert told.startswith(b"HTTP/1.1 408 ")
+        assert b"urn:touch-retrieval:problem:too-slow" in told
+        assert b"within 0.3 s" in told
+        assert received(silent) == b""
+
+
+def test_headers_that_come_byte_by_byte_do_not_outlive_the_deadline(service_at, monkeypatch):
+    _, address, _ = service_at
+    monkeypatch.setattr(connections, "HEADERS_S", 0.5)
+    with opened(address, 1) as (line,):
+        for _ in range(200):
+            time.sleep(0.05)
+            try:
+                line.sendall(b"a")
+            except OSError:  # broken pipe or reset
+                break
+        else:
+            pytest.fail("the connection lived for 10 s")
+
+
+def test_half_of_a_second_request_ends_at_a_deadline(service_at, monkeypatch):
+    _, address, _ = service_at
+    monkeypatch.setattr(connections, "HEADERS_S", 0.5)
+    with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" + HALF) as (line,):
+        told = received(line)
+        assert told.startswith(b"HTTP/1.1 200 ")
+        assert b"HTTP/1.1 408 " in told
+
+
+def test_a_request_that_takes_longer_than_the_headers_may_is_answered(service_at, monkeypatch):
+    url, _, parts = service_at
+    monkeypatch.setattr(connections, "HEADERS_S", 0.2)
+    monkeypatch.setattr(parts.generations.current.shard, "page", slow(parts.generations.current.shard.page, 1.5))
+    assert httpx.get(f"{url}/v1/catalogue", timeout=30).status_code == 200
+
+
+def slow(function, seconds):
+    def call(*args):
+        time.sleep(seconds)
+        return function(*args)
+
+    return call
+
+
+def test_half_sent_headers_of_512_connections_shut_nobody_out(service_at):
+    url, address, _ = service_at
+    with opened(address, MAX_CONNECTIONS) as lines:
+        assert lives(url, "127.0.0.2") < 5
+        assert lives(url) < 5  # from the same address, too
+        until(lambda: sum(map(is_closed, lines)) >= MAX_CONNECTIONS - MAX_CONNECTIONS_OF_ADDRESS)
+        assert [is_closed(line) for line in (lines[0], lines[-1])] == [True, False]  # the oldest are closed
+
+
+def test_half_sent_headers_from_many_addresses_shut_nobody_out(service_at):
+    url, address, _ = service_at
+    with ExitStack() as stack:
+        for number in range(10, 15):
+            stack.enter_context(opened(address, MAX_CONNECTIONS_OF_ADDRESS, source=f"127.0.0.{number}"))
+        assert lives(url, "127.0.0.2") < 5
+
+
+def test_connections_in_work_are_not_closed_for_new_ones(service_at, monkeypatch):
+    _, address, parts = service_at
+    monkeypatch.setattr(parts.generations.current.shard, "page", slow(parts.generations.current.shard.page, 3))
+    whole = b"GET /v1/catalogue HTTP/1.1\r\nhost: 127.0.0.1\r\nconnection: close\r\n\r\n"
+    with opened(address, 1, whole) as (line,), opened(address, 2 * MAX_CONNECTIONS_OF_ADDRESS):
+        assert received(line).startswith(b"HTTP/1.1 200 ")
+
+
+def test_an_idle_connection_of_a_client_is_closed_after_half_sent_ones(service_at):
+    url, address, _ = service_at
+    with httpx.Client(timeout=10) as client:
+        client.get(f"{url}/healthz")
+        (idle,) = client._transport._pool.connections
+        with opened(address, MAX_CONNECTIONS_OF_ADDRESS + 20):
+            client.get(f"{url}/healthz")
+            assert client._transport._pool.connections == [idle]
+
+
+def test_headers_larger_than_the_limit_are_refused_at_once(service_at):
+    _, address, _ = service_at
+    begin = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    with opened(address, 1, begin + b"x-a: " + b"a" * (MAX_HEADER_BYTES - 100) + b"\r\nconnection: close\r\n\r\n") as (
+        line,
+    ):
+        assert received(line).startswith(b"HTTP/1.1 200 ")
+    for flood in (b"x-a: " + b"a" * 10**6, b"x-a: b\r\n" * 10**5, b"x" * 10**6):
+        with opened(address, 1, begin + flood[: 2 * MAX_HEADER_BYTES]) as (line,):
+            told = received(line)
+            assert told.startswith(b"HTTP/1.1 431 ")
+            assert b"16,384 bytes" in told
+
+
+def test_what_is_not_http_is_answered_by_a_problem_document(service_at):
+    _, address, _ = service_at
+    with opened(address, 1, b"\x16\x03\x01 hello\r\n\r\n") as (line,):
+        told = received(line)
+        assert told.startswith(b"HTTP/1.1 400 ")
+        assert b"urn:touch-retrieval:problem:malformed" in told
+
+
+def test_a_body_of_tiny_chunks_is_refused_and_one_of_larger_chunks_is_read(service_at):
+    url, address, _ = service_at
+    head = b"POST /v1/session HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n"
+    head += b"transfer-encoding: chunked\r\n\r\n"
+    with opened(address, 1, head + b"1\r\n \r\n" * 20_000) as (line,):
+        told = received(line)
+        assert told.startswith(b"HTTP/1.1 400 ")
+        assert b"malformed" in told
+    chunks = (b" " * 300 for _ in range(2_000))
+    answer = httpx.post(f"{url}/v1/query", content=chunks, headers={"content-type": "application/json"}, timeout=30)
+    assert answer.json()["type"].endswith(("malformed", "bad-input"))  # no JSON, but read
+
+
+def test_a_flood_of_pipelined_requests_is_answered_one_by_one(service_at):
+    url, address, _ = service_at
+    with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 1_000) as (line,):
+        assert lives(url) < 5
+        data = b""
+        while data.count(b"HTTP/1.1 200 ") < 1_000:
+            data += (more := line.recv(65536))
+            assert more
+
+
+def test_a_client_that_does_not_read_its_response_is_cut_off(index, monkeypatch):
+    monkeypatch.setattr(connections, "UNREAD_S", 0.5)
+    monkeypatch.setattr(connections, "CLOSING_S", 0.5)
+    with listening(index) as (url, _):
+        host, port = url.removeprefix("http://").split(":")
+        line = socket.socket()
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with line:
+            line.connect((host, int(port)))
+            line.settimeout(30)
+            line.sendall(b"GET /openapi.json HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 500)
+            time.sleep(3)
+            assert 0 < received(line).count(b"HTTP/1.1 200 ") < 500
