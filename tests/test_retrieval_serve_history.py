@@ -123,7 +123,8 @@ def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index,
     name, grasps = next(iter(touches.items()))
     with Full(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
         query, _ = ask(client, grasps)
-        assert say(client, query, "object", name).status_code == 201
+        said = say(client, query, "object", name)
+        assert (said.status_code, said.json()["recorded"]) == (201, False)
         assert b'retrieve_unrecorded_total{what="said"} 1.0' in client.get("/metrics").content
     with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
         client.get("/v1/history")

@@ -140,6 +140,8 @@ class Connection(H11Protocol):
             piece = _BODY_PIECE if self._has_request else _HEADER_PIECE
             super().data_received(data[start : start + piece])
             start += piece
+        if not self._has_request and self._headers_since is None:
+            self._headers_since = self.loop.time()
         self._note_state()
 
     def on_response_complete(self) -> None:

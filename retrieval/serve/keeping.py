@@ -79,5 +79,5 @@ class Keeping:
 
     def close(self) -> None:
         """Close the database."""
-        self._writer.shutdown(wait=False)
+        self._writer.shutdown(wait=False, cancel_futures=True)
         self.store.close()

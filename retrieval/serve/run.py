@@ -21,9 +21,9 @@ from retrieval.serve.service import Service
 
 LAST_CALL_S = 0.5
 """For which, told to end, it still takes requests: those that were sent before, and lie unread in a socket."""
-GRACE_S = 5
+GRACE_S = 4
 """For requests in flight, after the last call."""
-END_S = 9.0
+END_S = 8.0
 """From the signal to the end of the process, whatever hangs."""
 _SWEEP_TICKS = 5
 """Ticks of a tenth of a second from one look at the connections' deadlines to the next."""

@@ -4,6 +4,7 @@ Without a token the service hears this machine alone. A page of a stranger, open
 machine: its requests name the stranger's host or origin, and are refused.
 """
 
+import asyncio
 import hashlib
 import hmac
 import logging
@@ -84,6 +85,10 @@ class Guard:
             return
         try:
             await self.app(scope, receive, with_headers)
+        except asyncio.CancelledError:  # the server ends, and has waited long enough
+            if not begun:
+                ending = Problem("not-ready", "the service ends", {"retry-after": "1", "connection": "close"})
+                await ending.response()(scope, receive, with_headers)
         except Exception as error:
             log.exception("unexpected error at %s", scope["path"])
             if begun:  # the connection is cut off, so that nobody takes half an answer for one
