@@ -27,6 +27,8 @@ CLOSING_S = 2.0
 """For a client that does not read the last bytes of a connection that is being closed."""
 MAX_HEADER_BYTES = 16_384
 """Of the request line and all headers of one request."""
+MAX_HEADERS = 100
+"""Of one request: each costs as much work as a hundred bytes."""
 FREE_CHUNKS, MIN_CHUNK_BYTES = 1_000, 256
 """Chunks of one body beyond the first 1,000 must hold this many bytes on average: each costs as much work as a
 kilobyte."""
@@ -106,6 +108,7 @@ class Connection(H11Protocol):
         super().__init__(config, server_state, app_state, _loop)
         self.conn = _Parser(h11.SERVER, MAX_HEADER_BYTES)
         self.table, self.counted, self.address = table, False, ""
+        self._header_lines = 0
         self._headers_since: float | None = None
         self._unread_since: float | None = None
         self._closing_since: float | None = None
@@ -137,9 +140,16 @@ class Connection(H11Protocol):
         they exceed their limit."""
         start = 0
         while start < len(data) and not self.transport.is_closing():
-            piece = _BODY_PIECE if self._has_request else _HEADER_PIECE
-            super().data_received(data[start : start + piece])
-            start += piece
+            piece = data[start : start + (_BODY_PIECE if self._has_request else _HEADER_PIECE)]
+            start += len(piece)
+            if self.conn.their_state is h11.IDLE:
+                self._header_lines += piece.partition(b"\r\n\r\n")[0].count(b"\n")
+            if self._header_lines > MAX_HEADERS:
+                self._refuse(Problem("too-large-headers", f"a request may have at most {MAX_HEADERS} headers"))
+                return
+            super().data_received(piece)
+            if self._has_request:
+                self._header_lines = 0
         if not self._has_request and self._headers_since is None:
             self._headers_since = self.loop.time()
         self._note_state()
@@ -147,6 +157,7 @@ class Connection(H11Protocol):
     def on_response_complete(self) -> None:
         """A response has been sent (uvicorn)."""
         super().on_response_complete()
+        self._header_lines = 0
         self._note_state()
 
     def _note_state(self) -> None:

@@ -23,7 +23,7 @@ LAST_CALL_S = 0.5
 """For which, told to end, it still takes requests: those that were sent before, and lie unread in a socket."""
 GRACE_S = 4
 """For requests in flight, after the last call."""
-END_S = 8.0
+END_S = 7.5
 """From the signal to the end of the process, whatever hangs."""
 _SWEEP_TICKS = 5
 """Ticks of a tenth of a second from one look at the connections' deadlines to the next."""
@@ -96,6 +96,7 @@ def _end_in_time(stopping: threading.Event) -> None:
     """End the process END_S after `stopping` is set: the interpreter would wait for threads that hang in a driver, in
     the disk or in a decoder."""
     stopping.wait()
+    signal.setitimer(signal.ITIMER_REAL, END_S + 1)  # the system ends it, where the interpreter is too busy ending
     time.sleep(END_S)
     hanging = ", ".join(
         thread.name for thread in threading.enumerate() if not thread.daemon and thread is not threading.main_thread()
