@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import tarfile
 
 import pytest
@@ -10,10 +11,14 @@ from retrieval.data.catalogue import list_catalogue
 from retrieval.data.sources import list_photos
 from retrieval.data.text import is_utf8, utf8_of
 from retrieval.errors import DatasetError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
 from retrieval.search.objects import listed_photo
 from retrieval.serve.errors import Problem
 from robot.errors import RecordingError
-from robot.recording.folder import read_recording
+from robot.recording.folder import RecordingWriter, read_recording
+from tests.serving import service
+from tests.test_retrieval_serve_history import INFO, ask, say
 
 HALF = "\ud83d"  # the first half of an emoji
 NAME = "mug\udcff"  # the byte ff in a file name
@@ -87,3 +92,55 @@ def test_text_that_utf8_can_hold_stays_the_same_object():
 def test_a_problem_that_names_a_file_of_unknown_coding_is_a_document():
     body = Problem("unknown", f"{NAME}.jpg is gone").response().body
     assert json.loads(body)["detail"] == "mug\ufffd.jpg is gone"
+
+
+def test_no_answer_over_an_older_index_with_half_a_character_fails(own, touch, model, tmp_path, monkeypatch):
+    name = sorted(path.name for path in own.iterdir())[0]
+    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": HALF}) + "\n")
+    monkeypatch.setattr("retrieval.data.catalogue.require_utf8", lambda row: None)  # as older versions did
+    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
+    folder = tmp_path / "history"
+    with (
+        RecordingWriter(folder / "recording", INFO) as writer,
+        service(tmp_path / "index", None, writer, history=folder) as client,
+    ):
+        query, answer = ask(client, [[path.read_bytes() for path in touch]], top=8)
+        notes = [one["metadata"] for one in answer["results"] if one["object_id"] == name]
+        assert notes == [{"note": "\ufffd"}]
+        items = client.get("/v1/catalogue", params={"object": name}).json()["items"]
+        assert [item["metadata"] for item in items] == [{"note": "\ufffd"}] * 3
+        assert client.get(f"/v1/history/{query}").json()["answer"] == answer
+        assert client.get("/v1/history").json()["items"][0]["id"] == query
+        assert say(client, query, "object", name).status_code == 201
+
+
+def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served(catalogue, touch, model, tmp_path):
+    folder = tmp_path / NAME
+    shutil.copytree(catalogue, folder / "catalog")
+    build_index(folder / "catalog", load_checkpoint(model), folder / "index", quiet=True)
+    with service(folder / "index") as client:
+        names = {"gelsight": [(path.name, path.read_bytes()) for path in touch]}
+        files = [("gelsight", file) for file in names["gelsight"]]
+        assert client.post("/v1/query", files=files).status_code == 200
+        assert client.get("/v1/index").status_code == 200
+        assert client.get("/v1/catalogue").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/v1/feedback", rb'{"query": "x", "said": "object", "object_id": "mug\ud83d"}'),
+        ("/v1/feedback", rb'{"query": "\ud83d", "said": "none"}'),
+        ("/v1/trials", rb'{"who": "\ud83d"}'),
+        ("/v1/session", rb'{"token": "\ud83d"}'),
+        ("/v1/query", rb'{"touches": [["\ud83d"]], "\ud83d": 1}'),
+    ],
+)
+def test_half_of_a_character_in_a_body_is_refused(index, tmp_path, path, body):
+    with (
+        RecordingWriter(tmp_path / "recording", INFO) as writer,
+        service(index, None, writer, history=tmp_path) as client,
+    ):
+        response = client.post(path, content=body, headers={"content-type": "application/json"})
+        assert response.status_code in (400, 422), response.text
+        assert client.get("/v1/catalogue", params={"object": "mug\ufffd"}).status_code == 200
