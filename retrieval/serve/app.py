@@ -70,15 +70,15 @@ def create_app(
     """
     metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
-    alone = {"workers": 1, "batch_most": 1, "batch_ms": 0.0}
+    alone = replace(settings, workers=1, batch_most=1, batch_ms=0.0)
     parts = Service(
         settings,
         metrics,
         generations,
         Queue(generations, settings, metrics),
-        Queue(generations, replace(settings, queue=MAX_GRASPS, **alone), metrics),
+        Queue(generations, replace(alone, queue=MAX_GRASPS), metrics),
         {
-            name: Queue(generations, replace(settings, queue=settings.streams + MAX_FRAMES, **alone), metrics)
+            name: Queue(generations, replace(alone, queue=settings.streams + MAX_FRAMES), metrics)
             for name in rig.sensors
         },
         rig,
