@@ -25,6 +25,7 @@ from retrieval.search.answer import is_clear
 from retrieval.search.build import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.search.searcher import Searcher
+from retrieval.search.shard import Felt
 from tests.verdicts import interval, redrawn
 
 OBJECTS = 30
@@ -81,15 +82,20 @@ def asked(recording, photos, references, touches):
         with Searcher.open(Path(folder, "index")) as searcher:
             names, draw = np.array(sorted(queries)), np.random.default_rng(0)
             for name in names:
+                codes = searcher.encode(queries[name])
                 for start in range(touches):
-                    order = queries[name][start:] + queries[name][:start]
-                    found = [told for told in searcher.query_growing(order, top=len(names)) if told.results]
-                    logits = [{match.object_id: match.logit for match in told.results} for told in found]
+                    order = np.roll(np.arange(touches), -start)
+                    logits = [logits_of(searcher, codes, order[:count], len(names)) for count in range(1, touches + 1)]
                     others = draw.permutation(names[names != name])
                     for catalogue in (np.append(others[: OBJECTS - 1], name), others[:OBJECTS]):
                         told = [answer(searcher.posterior, own, catalogue, name) for own in enumerate(logits, 1)]
-                        if len(told) == touches:  # each grasp had contact
-                            yield Series(f"{recording.name} {name}", name in catalogue, told)
+                        yield Series(f"{recording.name} {name}", name in catalogue, told)
+
+
+def logits_of(searcher, codes, rows, count):
+    """Logit of each object after these grasps."""
+    found = searcher.shard.ask(Felt(codes.embeddings[rows], codes.halves[rows]), count, None, searcher.posterior)
+    return {one.photo.object_id: one.logit for one in found.best}
 
 
 def arrange(recording, photos, references, touches, catalogue):

@@ -366,25 +366,24 @@ def test_the_probability_if_present_does_not_fade_where_none_of_these_is_certain
 @pytest.mark.parametrize(
     ("missing", "scale", "more"),
     [
-        (110, 1.0, 1),  # of half dependent grasps with logit 100, two weigh 133, three 150, five 167
-        (140, 1.0, 2),
-        (200, 1.0, None),
-        (1.1, 0.01, None),  # one more would do, but the ranking is not clear
+        (110, 10_000, 1),  # of half dependent grasps with logit 100, two weigh 133, three 150, five 167
+        (140, 10_000, 2),
+        (200, 10_000, None),
+        (110, 0.01, None),  # one more would do, but the ranking is not clear
     ],
 )
 def test_more_grasps_are_named_where_the_ranking_is_clear_and_so_few_suffice(
     missing, scale, more, searcher, touch, monkeypatch
 ):
+    """The best object has logit 100, and `missing` is the evidence that a match needs."""
     head = searcher.judge
-    sharp = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
-    monkeypatch.setattr(searcher.shard, "judge", sharp)
-    monkeypatch.setattr(searcher, "posterior", Posterior())
-    lift = 100 - searcher.query([touch]).top.logit
-    level = dataclasses.replace(sharp, out=scale * sharp.out, out_bias=scale * sharp.out_bias + scale * lift)
-    monkeypatch.setattr(searcher.shard, "judge", level)
+    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
+    monkeypatch.setattr(searcher.shard, "judge", scaled)
     monkeypatch.setattr(searcher, "posterior", Posterior(1.0, math.log(8) - missing, dependence=0.5))
+    lift = 100 - searcher.query([touch]).top.logit
+    monkeypatch.setattr(searcher.shard, "judge", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
     result = searcher.query([touch])
-    assert result.top.logit == pytest.approx(100 * scale, rel=0.02)
+    assert result.top.logit == pytest.approx(100, rel=1e-4)
     assert (result.verdict, result.more_grasps) == ("none of these", more)
     assert result.to_dict()["more_grasps"] == more
 
