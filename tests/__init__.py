@@ -8,6 +8,7 @@ Run by hand, each as `python -m tests.structure` is:
     notebooks           runs the notebooks again and stores what they show
     shipped             the checkpoint that comes with the package: made, scored, taught again
     verdicts            what its "match", "none of these", ... are worth
+    answers             verdict, ranking and P(object | present) of answers from 30 objects, and what became of advice
     next_grasp          what another grasp tells, beside what the page says that it may be expected to tell
     scaling             accuracy by the number of objects and grasps to train on
     in_double           a command in float64

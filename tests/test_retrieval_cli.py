@@ -57,7 +57,12 @@ def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys
     assert document["verdict"] == "none of these"
     assert document["none_probability"] > 0.99
     assert len(document["results"]) == 8
-    assert said.err.splitlines()[-1].startswith("none of these: ")
+    best = document["results"][0]
+    assert said.err.splitlines()[-1] == (
+        f"none of these: the catalogue lacks the object with probability {document['none_probability']:.2f}; if it has "
+        f"the object, this is {best['object_id']} with probability {best['probability_if_present']:.2f}. "
+        f"{document['advice']}"
+    )
     assert main([*query, *EVERY_OBJECT_IS_KNOWN, "--json"]) == 0
     said = capsys.readouterr()
     document = json.loads(said.out)
@@ -114,6 +119,7 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {
         *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
+        *("more_grasps", "advice"),
     }
     touches = [["a.png", "b.png"], ["a.png", "b.png"]]
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
@@ -123,7 +129,8 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     }
     assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
     assert [match["rank"] for match in document["results"]] == [1, 2, 3]
-    assert set(document["results"][0]) == {"rank", "object_id", "logit", "probability", "photo", "metadata"}
+    probabilities = ("probability", "probability_if_present")
+    assert set(document["results"][0]) == {"rank", "object_id", "logit", *probabilities, "photo", "metadata"}
 
 
 def test_html_is_written_beside_the_table(workplace, model, capsys):

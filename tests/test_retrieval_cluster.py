@@ -67,8 +67,12 @@ def held(ray, cluster):
         yield searcher
 
 
+def parts(match):
+    return match.logit, match.probability, match.probability_if_present
+
+
 def numbers(answer):
-    return [answer.none_probability, *(part for match in answer.results for part in (match.logit, match.probability))]
+    return [answer.none_probability, *(part for match in answer.results for part in parts(match))]
 
 
 def names(answer):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.commands.demo import PHOTOS, SEED, TOUCHES
+from retrieval.commands.demo import PHOTOS, SEED, TOUCHES, example
 from retrieval.commands.main import main
 from robot.recording.folder import read_recording
 
@@ -22,6 +22,12 @@ def test_the_demo_ends_with_a_page_of_photos_and_gel_images(finished):
     page = (finished / "query.html").read_text()
     assert page.count("data:image/jpeg;base64,") >= 4 + 2 * TOUCHES
     assert (finished / "recording-preview.png").stat().st_size > 10_000
+
+
+def test_the_object_of_the_page_is_chosen_by_its_name_and_its_grasps_alone():
+    grasps = {"mug": [1, 2, 3], "bowl": [1, 2], "cup": [1, 2, 3], "dish": [1, 2, 3]}
+    assert example(grasps) == "cup"
+    assert example({"mug": [1], "bowl": [1]}) == "bowl"
 
 
 def test_no_grasp_gives_both_a_photo_and_a_touch(finished):
@@ -42,6 +48,9 @@ def test_a_second_demo_collects_and_embeds_nothing_again_and_leaves_the_users_de
     assert f"0 embedded, {4 * PHOTOS} unchanged" in said.err
     assert f"--seed {SEED}" in said.err
     assert "the true object comes first for" in said.err
+    shown = min(path.name for path in (finished / "catalog").iterdir())  # each has three grasps to query with
+    assert f"in the hand: {shown}, which the model was never trained on" in said.err
+    assert f"finger a: {shown}-" in (finished / "query.html").read_text()
     assert "rank  object " in said.out
     assert not list(Path(os.environ["XDG_STATE_HOME"]).iterdir())
 

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import SLOPE_BOUNDS, JudgedTouches, Posterior, fit_posterior
+from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, JudgedTouches, Mass, Posterior, fit_posterior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
@@ -61,6 +61,74 @@ def test_large_logits_are_right_where_the_obvious_formula_is_not_a_number():
     belief = ADDING.believe(logits, none_prior=0.5)
     assert belief.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
     assert ADDING.believe(-logits, none_prior=0.5).none == 1.0
+
+
+def test_the_probability_if_present_is_that_reckoned_by_hand_whatever_the_prior_and_the_offset():
+    # Weights 3 and 1, together 4.
+    for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):
+        belief = Posterior(1.0, offset, 0.0).believe([math.log(3), 0.0], none_prior=prior)
+        assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
+    # Four objects, two of them judged: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
+    belief = ADDING.believe([math.log(4), 0.0], unjudged=2, sample=[0.0, math.log(3)])
+    assert belief.objects_if_present == pytest.approx([4 / 9, 1 / 9])
+    # Two grasps: w = 1 / 1.5, so that logits of 1.5 log 3 and 0 weigh 3 and 1.
+    belief = Posterior(1.0, 0.0, 0.5).believe([1.5 * math.log(3), 0.0], 2)
+    assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
+
+
+def test_parts_of_a_catalogue_joined_give_the_probability_if_present_of_the_whole():
+    # Weights 4, 1 | 3, 8: 16 together. The parts' largest logits differ.
+    parts = [ADDING.mass([math.log(4), 0.0]), ADDING.mass([math.log(3), math.log(8)])]
+    belief = ADDING.share([math.log(8), math.log(4)], Mass.joined(parts))
+    assert belief.objects_if_present == pytest.approx([1 / 2, 1 / 4])
+
+
+def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_not_a_number():
+    belief = ADDING.believe([-1000.0, -1001.0])
+    assert belief.none == 1.0
+    with np.errstate(invalid="ignore"):
+        assert np.isnan(belief.objects / (1 - belief.none)).all()
+    assert belief.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
+    # Short of that, the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
+    belief = ADDING.believe([-32.0, -33.0])
+    exact = 1 / (1 + math.exp(-1))
+    assert belief.objects[0] / (1 - belief.none) != pytest.approx(exact, rel=1e-3)
+    assert belief.objects_if_present[0] == pytest.approx(exact)
+
+
+@pytest.mark.parametrize(
+    ("dependence", "logit", "grasps", "prior", "more"),
+    [
+        # Of four objects at even odds w l must exceed log 4 = 1.386. By half dependent, 1 to 5 like grasps of logit 1
+        # together weigh 1, 1.333, 1.5, 1.6 and 1.667.
+        (0.5, 1.0, 1, 0.5, 2),
+        (0.5, 1.1, 1, 0.5, 1),  # 1.1 * 1.333 = 1.467
+        (0.5, 0.85, 1, 0.5, 4),  # 0.85 * 1.6 = 1.36, * 1.667 = 1.417
+        (0.5, 0.8, 1, 0.5, None),  # 0.8 * 1.667 = 1.333
+        (0.5, 2.0, 2, 0.5, 1),  # a sum of two grasps of logit 1
+        (0.5, 4.1, 5, 0.5, None),  # of more than five nothing is known
+        (0.5, -1.0, 1, 0.5, None),
+        (0.0, 0.5, 1, 0.5, 2),  # three independent ones: 1.5
+        (1.0, 1.3, 1, 0.5, None),  # more of the same
+        (0.5, 2.0, 1, 0.8, 2),  # log 4 + log (0.8 / 0.2) = 2.773; 2.667, 3
+    ],
+)
+def test_the_further_grasps_to_a_match_are_those_reckoned_by_hand(dependence, logit, grasps, prior, more):
+    assert Posterior(1.0, 0.0, dependence).more_grasps(logit, 4, grasps, prior) == more
+
+
+@given(st.floats(-5, 5), st.floats(-3, 3), st.floats(0, 1), st.integers(1, 4), st.floats(0.05, 0.95))
+def test_after_the_further_grasps_and_no_fewer_the_best_object_is_likelier_than_none(
+    logit, offset, dependence, grasps, prior
+):
+    """Where these are like those so far."""
+    posterior = Posterior(1.0, offset, dependence)
+    totals = range(grasps, MAX_GRASPS + 1)
+    beliefs = [posterior.believe([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
+    gaps = [belief.objects[0] - belief.none for belief in beliefs]
+    assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # else rounding decides
+    matches = [more for more, gap in enumerate(gaps) if gap > 0]
+    assert posterior.more_grasps(logit, 3, grasps, prior) == (matches[0] if matches else None)
 
 
 def test_grasps_that_are_alike_weigh_less_than_independent_ones():

@@ -15,7 +15,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.answer import Match, QueryResult
+from retrieval.search.answer import Match, QueryResult, in_words
 from retrieval.search.build import build_index
 from retrieval.search.searcher import Searcher
 from tests.pages import Page
@@ -33,11 +33,16 @@ POSTERIOR = Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9).to_dict
 }
 
 
-def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match", none=0.2, posterior=POSTERIOR, grasps=None):
+def made_up(
+    *matches, touches=(("a.png", "b.png"),), verdict="match", none=0.2, posterior=POSTERIOR, grasps=None, more=None
+):
     """A result with these (object, logit, probability, photo, metadata)."""
     index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
     index |= {"catalogue": "catalog", "model": "m.safetensors", "trained_on": "nothing"}
-    ranked = [Match(rank, *match, Path("catalog", match[3])) for rank, match in enumerate(matches, start=1)]
+    ranked = [
+        Match(rank, *match, Path("catalog", match[3]), None, match[2] and match[2] / (1 - none))
+        for rank, match in enumerate(matches, start=1)
+    ]
     return QueryResult(
         touches=[list(touch) for touch in touches],
         grasps=grasps or ["contact"] * len(touches),
@@ -47,6 +52,7 @@ def made_up(*matches, touches=(("a.png", "b.png"),), verdict="match", none=0.2, 
         none_probability=none,
         posterior=posterior,
         results=ranked,
+        more_grasps=more,
     )
 
 
@@ -160,11 +166,55 @@ def test_the_verdict_is_said(tmp_path):
     accepted = Page(query_html(made_up(ONE), tmp_path))
     assert "Most likely mug, probability 80.0 %; none of these: 20.0 %." in accepted.text
     assert firsts(accepted)
-    rejected = Page(query_html(made_up(ONE, verdict="none of these", none=0.9), tmp_path))
+    one = ("mug", 1.5, 0.08, "mug/1.jpg", {})
+    rejected = Page(query_html(made_up(one, verdict="none of these", none=0.9), tmp_path))
     assert "None of these, most likely: the catalogue lacks the object with probability 90.0 %." in rejected.text
+    assert "If it has the object, this is mug with probability 80.0 %." in rejected.text
+    assert "Reference touches or more photos of mug would help." in rejected.text
+    assert "80.0 % if present" in rejected.text
     assert "Most likely" not in rejected.text
     assert "1. mug" in rejected.text
     assert not firsts(rejected)
+
+
+OTHERS = "Reference touches or more photos"
+UNCLEAR = ("mug", 1.5, 0.04, "mug/1.jpg", {})
+CLEAR = ("mug", 1.5, 0.08, "mug/1.jpg", {})
+
+
+@pytest.mark.parametrize(
+    ("match", "grasps", "more", "advice"),
+    [
+        (UNCLEAR, 1, None, f"The ranking is not clear. {OTHERS} of its first objects would help."),
+        (
+            CLEAR,
+            1,
+            None,
+            f"The ranking is clear, but more grasps would hardly change the verdict. {OTHERS} of mug would",
+        ),
+        (CLEAR, 1, 1, 'Another grasp would help: 1 more like this one would make the verdict "match".'),
+        (CLEAR, 2, 3, 'Another grasp would help: 3 more like these would make the verdict "match".'),
+    ],
+)
+def test_the_advice_names_what_would_help(match, grasps, more, advice, tmp_path):
+    touches = [["a.png", "b.png"]] * grasps
+    result = made_up(match, touches=touches, verdict="none of these", none=0.9, more=more)
+    assert result.advice.startswith(advice)
+    assert result.to_dict()["advice"] == result.advice
+    assert QueryResult.from_dict(result.to_dict()) == result
+    assert advice in Page(query_html(result, tmp_path)).text
+    assert in_words(result).endswith(result.advice)
+    assert made_up(ONE).advice is None
+
+
+def test_a_document_of_before_there_was_advice_is_still_read():
+    """The history of a service holds such."""
+    document = made_up(ONE).to_dict()
+    for name in ("more_grasps", "advice"):
+        del document[name]
+    del document["results"][0]["probability_if_present"]
+    result = QueryResult.from_dict(document)
+    assert (result.top.object_id, result.top.probability_if_present, result.more_grasps) == ("mug", None, None)
 
 
 def firsts(page):
@@ -229,6 +279,7 @@ def test_the_table_has_a_line_for_each_object(answer, stdout):
         line = next(line for line in out.splitlines() if match.photo in line)
         assert match.object_id in line
         assert f"{match.probability:.3f}" in line
+        assert f"{match.probability_if_present:.3f}" in line
     assert f"{result.none_probability:.3f}" in next(line for line in out.splitlines() if "none of these" in line)
 
 
@@ -255,11 +306,11 @@ def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, stdo
 def test_a_piped_table_is_plain_and_uncut(capsys):
     """Rich had folded names at 80 columns in a pipe, and drawn frames around them."""
     long = "slab-knurl-with-a-long-name-20000-00010"
-    print_table(made_up((long, 1.5, 0.8, f"{long}/1.jpg", {}), ("mug", -0.25, 0.1, "a very/" + "deep/" * 20, {})))
+    print_table(made_up((long, 1.5, 0.72, f"{long}/1.jpg", {}), ("mug", -0.25, 0.08, "a very/" + "deep/" * 20, {})))
     name = f"{'object':<39}"
     assert capsys.readouterr().out == (
-        f"rank  {name}  probability  logit  photo\n"
-        f"   1  {long}        0.800  +1.50  {long}/1.jpg\n"
-        f"   2  {'mug':<39}        0.100  -0.25  a very/{'deep/' * 20}\n"
+        f"rank  {name}  probability  if present  logit  photo\n"
+        f"   1  {long}        0.720       0.900  +1.50  {long}/1.jpg\n"
+        f"   2  {'mug':<39}        0.080       0.100  -0.25  a very/{'deep/' * 20}\n"
         f"   -  {'none of these':<39}        0.200\n"
     )

@@ -350,6 +350,42 @@ def test_the_probability_is_the_objects_share_beside_none_of_these_and_follows_t
     assert result.none_probability == pytest.approx(none_prior / total, abs=1e-12)
     assert math.fsum([result.none_probability, *probabilities]) == pytest.approx(1, abs=1e-12)
     assert probabilities == sorted(probabilities, reverse=True)
+    if_present = [match.probability_if_present for match in result.results]
+    assert if_present == pytest.approx([term / math.fsum(terms) for term in terms], abs=1e-12)
+
+
+def test_the_probability_if_present_does_not_fade_where_none_of_these_is_certain(searcher, touch, monkeypatch):
+    alone = searcher.query([touch], none_prior=0)
+    monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=-1000.0))
+    result = searcher.query([touch])
+    assert (result.none_probability, result.top.probability) == (1.0, 0.0)
+    shown = [match.probability_if_present for match in result.results]
+    assert shown == pytest.approx([match.probability for match in alone.results], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("missing", "scale", "more"),
+    [
+        (110, 10_000, 1),  # of half dependent grasps with logit 100, two weigh 133, three 150, five 167
+        (140, 10_000, 2),
+        (200, 10_000, None),
+        (110, 0.01, None),  # one more would do, but the ranking is not clear
+    ],
+)
+def test_more_grasps_are_named_where_the_ranking_is_clear_and_so_few_suffice(
+    missing, scale, more, searcher, touch, monkeypatch
+):
+    """The best object has logit 100, and `missing` is the evidence that a match needs."""
+    head = searcher.judge
+    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
+    monkeypatch.setattr(searcher.shard, "judge", scaled)
+    monkeypatch.setattr(searcher, "posterior", Posterior(1.0, math.log(8) - missing, dependence=0.5))
+    lift = 100 - searcher.query([touch]).top.logit
+    monkeypatch.setattr(searcher.shard, "judge", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
+    result = searcher.query([touch])
+    assert result.top.logit == pytest.approx(100, rel=1e-4)
+    assert (result.verdict, result.more_grasps) == ("none of these", more)
+    assert result.to_dict()["more_grasps"] == more
 
 
 def test_the_answer_says_by_what_numbers_its_probabilities_came_about(searcher, grasps, monkeypatch):

@@ -137,6 +137,38 @@ def test_every_verdict_is_said_in_words(opened, files, index, verdict, claim, to
     assert opened.locator(".mark").all_inner_texts() == ([marks[verdict]] if verdict in marks else [])
 
 
+def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened, files, index):
+    """The page computes neither."""
+    with Searcher.open(index) as searcher:
+        document = searcher.query(files[:2], none_prior=0.999).to_dict()
+    assert document["verdict"] == "none of these"
+    document |= {"advice": "Another grasp would help: 2 more."}
+    for place, match in enumerate(document["results"]):
+        match["probability_if_present"] = 0.625 / 2**place
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
+    best = document["results"][0]["object_id"]
+    verdict = opened.locator(".verdict")
+    verdict.get_by_text(f"If it has the object, this is {best} with probability 62.5\u00a0%.").wait_for()
+    assert verdict.locator(".advice").inner_text() == "Another grasp would help: 2 more."
+    shown = opened.locator(".photo.object .if-present").all_inner_texts()
+    assert shown[:2] == ["62.5\u00a0% if present", "31.3\u00a0% if present"]
+    assert len(shown) == len(document["results"])
+
+
+def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, index):
+    """The history of a service holds such."""
+    with Searcher.open(index) as searcher:
+        document = searcher.query(files[:2], none_prior=0.999).to_dict()
+    del document["advice"], document["more_grasps"]
+    for match in document["results"]:
+        del match["probability_if_present"]
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
+    opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
+    assert opened.locator(".advice, .if-present").count() == 0
+
+
 def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()

@@ -23,6 +23,7 @@ from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import Judged, Ranked, merged
 
+NUMBERS = ("logit", "probability", "probability_if_present")
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
 
 
@@ -44,7 +45,7 @@ def same_answers(ours, theirs):
     for document in (ours, theirs):
         document["numbers"] = [
             document.pop("none_probability"),
-            *(match.pop(name) for match in document["results"] for name in ("logit", "probability")),
+            *(match.pop(name) for match in document["results"] for name in NUMBERS),
             *(document["posterior"] or {}).values(),
         ]
         document["numbers"] = [float(one) for one in document["numbers"] if isinstance(one, int | float)]
@@ -89,6 +90,7 @@ def test_probabilities_add_up_to_one_whatever_was_judged(divided, grasps, monkey
         assert answer.none_probability + shown <= 1 + 1e-9
         if len(answer.results) == 8:
             assert answer.none_probability + shown == pytest.approx(1, abs=1e-9)
+            assert math.fsum(match.probability_if_present for match in answer.results) == pytest.approx(1, abs=1e-9)
 
 
 def test_several_objects_and_growing_answers_are_merged_too(divided, searcher, grasps):

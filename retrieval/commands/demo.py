@@ -8,7 +8,7 @@ import os
 import shlex
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,11 +50,14 @@ def demo(
         grasps = PHOTOS + TOUCHES
         _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=jobs, out=recording, preview=True)
         queries = _split(load_grasps(recording), catalogue)
-        in_hand = sorted(queries)[len(queries) // 2]
+        in_hand = example(queries)
         _run(build_index, catalogue, out=index)
         gelsight = [Values(map(str, grasp.touches)) for grasp in queries[in_hand]]
         _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
-        say(f"in the hand: {in_hand}, an object that the model was never trained on")
+        say(
+            f"in the hand: {in_hand}, which the model was never trained on; of the objects with {len(gelsight)} grasps "
+            "to query with it is the first of the catalogue"
+        )
         say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
         say(f"look at {out / 'query.html'} and {out / 'recording-preview.png'}")
         if serve:
@@ -97,6 +100,12 @@ def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]
         for number, grasp in enumerate(own[:PHOTOS], start=1):
             shutil.copyfile(grasp.photo, catalogue / name / f"{number}{grasp.photo.suffix}")
     return {name: own[PHOTOS : PHOTOS + TOUCHES] for name, own in by_object.items() if len(own) > PHOTOS}
+
+
+def example(queries: "Mapping[str, Sequence[Grasp]]") -> str:
+    """The object that the demo's page shows, chosen by name before anything is scored: of the objects with the most
+    grasps to query with, the first in catalogue order."""
+    return max(sorted(queries), key=lambda name: len(queries[name]))
 
 
 def _first_places(index: Path, queries: "dict[str, list[Grasp]]") -> str:

@@ -16,6 +16,11 @@ validation objects, drawn with the true object and without. Grasps of one object
 independent ones (the design effect of cluster sampling; Kish 1965, section 5.4).
 
 Objects that were not judged keep their share of the probability, estimated from a sample of them.
+
+    P(o | present) = exp(w * l(o)) / sum of exp(w * l(o')) over all objects o' of the catalogue
+
+P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
+from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(none) rounds to 1.
 """
 
 import dataclasses
@@ -34,6 +39,8 @@ Numbers = NDArray[np.int64]
 NONE_PRIOR = 0.5
 """That the catalogue lacks the object, where a user says nothing: as likely as not."""
 SLOPE_BOUNDS = (0.01, 100.0)
+MAX_GRASPS = 5
+"""Grasps of an object that the dependence is fitted on; of larger sets nothing is known."""
 _MOST = 1e300
 FORMULA = (
     "P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset), P(none of these) ~ none_prior, "
@@ -47,12 +54,14 @@ class Belief:
     """What is believed of one object in the hand; `none`, `objects` and `unjudged` add up to 1.
 
     none: that it is none of the catalogue's. objects (J,): that it is each of the judged ones, in the order given.
-    unjudged: that it is one of those that were not judged.
+    unjudged: that it is one of those that were not judged. objects_if_present (J,): probabilities of the judged
+    objects given that the catalogue has the object; over all its objects these add up to 1.
     """
 
     none: float
     objects: Floats
     unjudged: float
+    objects_if_present: Floats
 
 
 @dataclass(frozen=True)
@@ -175,9 +184,37 @@ class Posterior:
         # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN. All are told
         # from the best one's.
         none -= each + mass.top
-        whole = float(np.logaddexp.reduce([none, mass.unjudged, mass.judged]))
-        shares = np.exp(np.minimum(self.weight(grasps) * some - mass.top - whole, 0.0))
-        return Belief(math.exp(none - whole), shares, math.exp(mass.unjudged - whole))
+        present = float(np.logaddexp(mass.unjudged, mass.judged))
+        whole = float(np.logaddexp(none, present))
+        logs = self.weight(grasps) * some - mass.top
+        shares, if_present = (np.exp(np.minimum(logs - total, 0.0)) for total in (whole, present))
+        return Belief(math.exp(none - whole), shares, math.exp(mass.unjudged - whole), if_present)
+
+    def more_grasps(self, logit: float, objects: int, grasps: int, none_prior: float = NONE_PRIOR) -> int | None:
+        """Estimate how many further grasps make the best object likelier than "none of these".
+
+        The further grasps are taken to be like the g made so far: their match logits have the same mean, so that n
+        grasps together have the summed logit n / g * l. The best object is likelier than none after the first n with
+
+            slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
+
+        The left side grows by the factor 1 / dependence at most, however many grasps are made. docs/answers.md says how
+        often the estimate comes true.
+
+        Args:
+            logit: of the best object, l; it is not likelier than none yet.
+            objects: of the catalogue.
+            grasps: so far, g.
+            none_prior: p, more than 0.
+
+        Returns:
+            The number of further grasps, n - g; None where none up to `MAX_GRASPS` together suffices.
+        """
+        needed = math.log(objects) + math.log(none_prior) - math.log1p(-none_prior) - self.offset
+        for total in range(grasps + 1, MAX_GRASPS + 1):
+            if self.weight(total) * total * logit / grasps > needed:
+                return total - grasps
+        return None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
@@ -211,7 +248,7 @@ CATALOGUE_SIZES = (20, 1000)
 """Objects of the catalogues that the numbers are fitted on; at most all but one of the validation objects."""
 LEAST_OBJECTS = 3
 """That a posterior is fitted on: a catalogue of two has one of two without the true object beside it."""
-_MOST_GRASPS, _SETS = 5, 4
+_SETS = 4
 _SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 
 
@@ -239,7 +276,7 @@ def fit_posterior(*parts: JudgedTouches, seed: int = 0) -> Posterior:
 def questions_of(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
     """Questions asked by single touches, and then by sets of two grasps, three and so on, as far as objects have grasps
     for them."""
-    for grasps in range(1, _MOST_GRASPS + 1):
+    for grasps in range(1, MAX_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
         sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch
         for name in np.unique(judged.touch_owner):

@@ -24,19 +24,20 @@ def print_table(result: QueryResult) -> None:
             str(match.rank),
             match.object_id,
             "-" if match.probability is None else f"{match.probability:.3f}",
+            "-" if match.probability_if_present is None else f"{match.probability_if_present:.3f}",
             f"{match.logit:+.2f}",
             match.photo,
         )
         for match in result.results
     ]
     if result.none_probability is not None:
-        rows.append(("-", "none of these", f"{result.none_probability:.3f}", "", ""))
-    header: tuple[str, ...] = ("rank", "object", "probability", "logit", "photo")
+        rows.append(("-", "none of these", f"{result.none_probability:.3f}", "", "", ""))
+    header: tuple[str, ...] = ("rank", "object", "probability", "if present", "logit", "photo")
     if any(match.reference for match in result.results):
         header += ("nearest touch", "cosine", "adds")
         nearest = chain((_reference(match.reference) for match in result.results), repeat(_reference(None)))
         rows = [(*row, *told) for row, told in zip(rows, nearest, strict=False)]
-    print_columns("Which object is in the hand?", header, rows, words=(1, 4, 5))
+    print_columns("Which object is in the hand?", header, rows, words=(1, 5, 6))
 
 
 def _reference(nearest: NearestReference | None) -> tuple[str, str, str]:

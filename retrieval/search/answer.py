@@ -1,6 +1,6 @@
 """What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.model.judge import NO_CONTACT, NOT_A_GEL
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
+CLEAR = 0.5
+"""A ranking is clear where its first object, given that the catalogue has the object, has a larger probability: it is
+likelier than all others together."""
 EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_GEL: 5}
 """Of `retrieve query`, by verdict."""
 
@@ -39,6 +42,8 @@ class Match:
 
     * `logit`: what ranks. `probability`: P(object | touches, catalogue); over all objects and "none of these" it adds
       up to 1; None where the model was never calibrated.
+    * `probability_if_present`: P(object | touches, the catalogue has the object); over all objects it adds up to 1;
+      None where the model was never calibrated.
     * `photo`: path of the photo in the catalogue. `photo_path`: its absolute path on the disk. `metadata`: the user's
       own.
     * `reference`: the nearest reference touch of the object; None, and in no document, where it has none.
@@ -57,12 +62,20 @@ class Match:
     metadata: dict[str, Any]
     photo_path: Path
     reference: NearestReference | None = None
+    probability_if_present: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        said = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "photo_path"}
-        reference = said.pop("reference")
-        return said if reference is None else {**said, "reference": reference.to_dict()}
+        said = {
+            "rank": self.rank,
+            "object_id": self.object_id,
+            "logit": self.logit,
+            "probability": self.probability,
+            "probability_if_present": self.probability_if_present,
+            "photo": self.photo,
+            "metadata": self.metadata,
+        }
+        return said if self.reference is None else {**said, "reference": self.reference.to_dict()}
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,9 @@ class QueryResult:
       contact" or "not a gel image"; only grasps with contact were judged.
     * `none_probability`: probability that the object is none of the catalogue's. `posterior`: the formula of the
       probabilities and its numbers (`retrieval.model.posterior`).
+    * `more_grasps`: where the verdict is "none of these" and the ranking is clear (its first object is likelier than
+      all others together, given that the catalogue has the object): further grasps like those so far after which the
+      verdict is expected to be "match" (`Posterior.more_grasps`); None where too many are needed, and else.
     * `index`: what was searched, and with which model. `timing_ms`: milliseconds of this query by stage; of several
       objects at once (`Searcher.query_many`) each has an equal share.
     * `embeddings`: those of the grasps, (G, embedding_dim), where they were encoded in this process; no document holds
@@ -98,12 +114,29 @@ class QueryResult:
     none_probability: float | None
     posterior: dict[str, Any] | None
     results: list[Match]
+    more_grasps: int | None = None
     embeddings: NDArray[np.float32] | None = field(default=None, repr=False, compare=False)
 
     @property
     def top(self) -> Match | None:
         """The best object; None where nothing was ranked."""
         return self.results[0] if self.results else None
+
+    @property
+    def advice(self) -> str | None:
+        """A sentence for people on how to get a clearer answer, where the verdict is "none of these"; else None."""
+        best = self.top
+        if self.verdict != NONE_OF_THESE or best is None or best.probability_if_present is None:
+            return None
+        if not is_clear(best.probability_if_present):
+            return "The ranking is not clear. Reference touches or more photos of its first objects would help."
+        if self.more_grasps is None:
+            return (
+                "The ranking is clear, but more grasps would hardly change the verdict. "
+                f"Reference touches or more photos of {best.object_id} would help."
+            )
+        like = "this one" if self.grasps.count(CONTACT) == 1 else "these"
+        return f'Another grasp would help: {self.more_grasps} more like {like} would make the verdict "match".'
 
     @classmethod
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
@@ -114,6 +147,7 @@ class QueryResult:
             others = {
                 name: document[name] for name in ("index", "timing_ms", "verdict", "none_probability", "posterior")
             }
+            others["more_grasps"] = document.get("more_grasps")  # a service's history holds documents without it
             return cls(touches=asked["touches"], grasps=asked["grasps"], results=matches, **others)
         except (KeyError, TypeError) as error:
             raise BadInput(f"this is not the document of `retrieve query --json`: {error!r}") from error
@@ -126,6 +160,8 @@ class QueryResult:
             "timing_ms": self.timing_ms,
             "verdict": self.verdict,
             "none_probability": self.none_probability,
+            "more_grasps": self.more_grasps,
+            "advice": self.advice,
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],
         }
@@ -137,6 +173,11 @@ def _match(said: dict[str, Any], catalogue: Path) -> Match:
     if reference is not None:
         reference = NearestReference(**{**reference, "touch": tuple(reference["touch"])})
     return Match(**own, photo_path=catalogue / said["photo"], reference=reference)
+
+
+def is_clear(probability_if_present: float) -> bool:
+    """Whether a ranking whose first object has this probability is clear."""
+    return probability_if_present > CLEAR
 
 
 def in_words(result: QueryResult) -> str:
@@ -158,8 +199,7 @@ def in_words(result: QueryResult) -> str:
         return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {none:.2f}{remark}"
     if result.verdict == NONE_OF_THESE:
         return (
-            f"none of these: the catalogue lacks the object with probability {none:.2f}; the nearest is "
-            f"{best.object_id}, {best.probability:.2f}; more grasps may tell, and --none-prior says how likely it is "
-            f"beforehand that the object is missing{remark}"
+            f"none of these: the catalogue lacks the object with probability {none:.2f}; if it has the object, this is "
+            f"{best.object_id} with probability {best.probability_if_present:.2f}{remark}. {result.advice}"
         )
     return f"uncalibrated: {best.object_id} comes first; this model has no probabilities{remark}"

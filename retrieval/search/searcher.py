@@ -28,7 +28,7 @@ from retrieval.model.touches import (
     TouchReader,
     read_grasps,
 )
-from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult
+from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
 from retrieval.search.object_store import is_cluster, read_cluster
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, folder_shard, open_cluster, stored_for
@@ -298,6 +298,7 @@ class Searcher:
         none_prior: float,
     ) -> QueryResult:
         belief = judged.belief if judged else None
+        verdict = _verdict(shown, belief)
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,
@@ -315,11 +316,22 @@ class Searcher:
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },
             timing_ms=timing_ms,
-            verdict=_verdict(shown, belief),
+            verdict=verdict,
             none_probability=belief.none if belief else None,
             posterior=self._meaning(judged, none_prior) if judged else None,
             results=self._ranking(judged) if judged else [],
+            more_grasps=self._more_grasps(judged, none_prior) if verdict == NONE_OF_THESE else None,
             embeddings=embeddings,
+        )
+
+    def _more_grasps(self, judged: "_Judged | None", none_prior: float) -> int | None:
+        """Further grasps after which the verdict is expected to be a match; None where the ranking is not clear."""
+        if self.posterior is None or judged is None or judged.belief is None or judged.found.mass is None:
+            return None
+        if not is_clear(float(judged.belief.objects_if_present[0])):
+            return None
+        return self.posterior.more_grasps(
+            judged.found.best[0].logit, judged.found.mass.objects, judged.grasps, none_prior
         )
 
     def _shares(self, judged: "_Judged | None") -> dict[str, Any]:
@@ -330,10 +342,12 @@ class Searcher:
     def _ranking(self, judged: "_Judged") -> list[Match]:
         ranking, base = [], self.catalogue.absolute()
         for rank, (logit, photo, reference) in enumerate(judged.found.best, start=1):
-            probability = None if judged.belief is None else float(judged.belief.objects[rank - 1])
+            belief = judged.belief
+            probability = None if belief is None else float(belief.objects[rank - 1])
+            if_present = None if belief is None else float(belief.objects_if_present[rank - 1])
             path = base / photo.path
             told = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
-            ranking.append(Match(*told, path, reference))
+            ranking.append(Match(*told, path, reference, if_present))
         return ranking
 
     def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:

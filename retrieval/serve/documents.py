@@ -25,6 +25,8 @@ EXAMPLE: dict[str, Any] = {
     "timing_ms": {"decode": 2.1, "encode": 14.0, "candidates": 0.1, "rerank": 0.6, "total": 17.0},
     "verdict": "match",
     "none_probability": 0.02,
+    "more_grasps": None,
+    "advice": None,
     "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "judged_objects": 20, "unjudged_probability": 0.0},
     "results": [
         {
@@ -32,6 +34,7 @@ EXAMPLE: dict[str, Any] = {
             "object_id": "mug",
             "logit": 3.2,
             "probability": 0.96,
+            "probability_if_present": 0.98,
             "photo": "mug/1.jpg",
             "metadata": {"material": "glazed clay"},
         }
@@ -49,20 +52,23 @@ class ReferenceDocument(BaseModel):
 
 
 class MatchDocument(BaseModel):
-    """One object of a ranking, shown by its best photo, whose id is `photo`. reference: only where the catalogue has
-    touches of the object."""
+    """One object of a ranking, shown by its best photo, whose id is `photo`. probability_if_present: given that the
+    catalogue has the object. reference: only where the catalogue has touches of the object."""
 
     rank: int
     object_id: str
     logit: float
     probability: float | None
+    probability_if_present: float | None = None  # absent in answers that a history keeps from before
     photo: str
     metadata: dict[str, Any]
     reference: ReferenceDocument | None = None
 
 
 class QueryDocument(BaseModel):
-    """The document of `retrieve query --json`."""
+    """The document of `retrieve query --json`. more_grasps: further grasps after which the verdict is expected to be
+    "match"; null for other verdicts than "none of these", and where more grasps do not help. advice: a sentence for
+    people on how to get a clearer answer."""
 
     model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
 
@@ -71,6 +77,8 @@ class QueryDocument(BaseModel):
     timing_ms: dict[str, float]
     verdict: str
     none_probability: float | None
+    more_grasps: int | None = None
+    advice: str | None = None
     posterior: dict[str, Any] | None
     results: list[MatchDocument]
 

@@ -60,6 +60,7 @@ function verdictBlock(answer, held) {
     h("p", { class: "above" }, said.above),
     h("h2", { class: "claim" }, said.claim),
     h("p", { class: "below" }, said.below),
+    answer.advice && h("p", { class: "advice" }, answer.advice),
     held && h("p", { class: "held" }, "The jaws closed on ", h("strong", {}, held), `: ${where}.`),
   );
 }
@@ -98,6 +99,8 @@ function card(part, answer, open) {
         h("span", { style: { width: `${100 * p}%` } }),
       ),
     p !== null && h("span", { class: "p" }, percent(p)),
+    match?.probability_if_present != null &&
+      h("span", { class: "if-present" }, `${percent(match.probability_if_present)} if present`),
     kind === "object" && p === null && h("span", { class: "p faint" }, `match logit ${match.logit.toFixed(2)}`),
   ];
   const given = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < LEAST_SHOWN ? " unlikely" : ""}` };
@@ -180,6 +183,11 @@ function found(answer) {
       rows.map(([term, text]) => [h("dt", {}, term), h("dd", {}, text)]),
     ),
     posterior &&
-      h("p", { class: "faint" }, "The probabilities of all objects of the catalogue and of none of these add up to 1."),
+      h(
+        "p",
+        { class: "faint" },
+        "The probabilities of all objects of the catalogue and of none of these add up to 1. ",
+        "\u201cIf present\u201d: the probability given that the catalogue has the object.",
+      ),
   );
 }

@@ -34,7 +34,7 @@ export function verdict(answer) {
         claim: "None of these",
         below:
           `The catalogue lacks the object with probability ${percent(answer.none_probability)}. ` +
-          "The nearest objects are shown.",
+          ifPresent(best),
       };
     case "no contact":
       return {
@@ -55,6 +55,12 @@ export function verdict(answer) {
         below: "This model was never calibrated: it ranks the objects and gives no probabilities.",
       };
   }
+}
+
+/** The first object given that the catalogue has it; answers that a history keeps from before do not say. */
+function ifPresent(best) {
+  if (best.probability_if_present == null) return "The nearest objects are shown.";
+  return `If it has the object, this is ${best.object_id} with probability ${percent(best.probability_if_present)}.`;
 }
 
 /** How near a reference touch is, and what it did. */
