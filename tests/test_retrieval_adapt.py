@@ -17,7 +17,7 @@ from retrieval.commands.main import main
 from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.methods.cca_towers import RIDGES, Affine, fit_codes
+from retrieval.methods.cca_towers import GRID, Affine, CcaSettings, fit_codes
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
@@ -52,7 +52,7 @@ def test_codes_tell_objects_that_no_fit_saw():
     touch, photo, owner = seen_alike()
     other = seen_alike(seed=1)
     codes = dict(fit_codes(touch, photo, owner, ([12], [10])))
-    assert set(codes) == set(RIDGES)
+    assert set(codes) == set(GRID)
     assert all(first_rank(found, *other) > 0.9 for found in codes.values())  # chance 1 / 30
     dealt = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
     nothing = dict(fit_codes(touch, photo[np.argsort(dealt, kind="stable")], owner, ([12], [10])))
@@ -62,7 +62,7 @@ def test_codes_tell_objects_that_no_fit_saw():
 def test_towers_side_by_side_weigh_the_same_whatever_their_unit():
     touch, photo, owner = seen_alike()
     louder = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
-    plain, loud = (dict(fit_codes(x, photo, owner, ([4, 8], [10])))[1.0] for x in (touch, louder))
+    plain, loud = (dict(fit_codes(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, louder))
     assert np.allclose(plain.cosines(touch, photo), loud.cosines(louder, photo), atol=1e-4)
 
 

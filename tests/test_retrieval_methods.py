@@ -9,7 +9,8 @@ import pytest
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, build_method
 from retrieval.methods.base import Method, Setting
-from retrieval.methods.cca_towers import blocks_of, fit_codes
+from retrieval.methods import cca_towers
+from retrieval.methods.cca_towers import GRID, CcaSettings, blocks_of, choose, fit_codes
 from retrieval.methods.selection import Validator, judged_rows, neighbours, ranking_auc
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
@@ -263,17 +264,57 @@ def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left
     np.testing.assert_allclose(standardise(x).std(0), 1.0)
 
 
-def test_once_its_ridge_is_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
+def settings_of(method):
+    return CcaSettings(*(method.chosen[name] for name in CcaSettings._fields))
+
+
+def test_once_settings_are_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
     both = TRAIN.joined(VALIDATION)
     method = build_method("cca_towers", Setting(CONFIG, all_teach=True))
     method.fit(TRAIN, VALIDATION)
-    assert method.chosen == fitted("cca_towers").chosen
     blocks = blocks_of(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES])
-    ridge = method.chosen["ridge"]
-    codes_of = dict(fit_codes(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, ridges=(ridge,)))
-    wanted = codes_of[ridge].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
+    chosen = settings_of(method)
+    codes_of = dict(fit_codes(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [chosen]))
+    wanted = codes_of[chosen].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
     np.testing.assert_array_equal(method.score(*codes(method)), wanted)
+
+
+@pytest.mark.parametrize("name", ["cca", "cca_pca"])
+def test_where_all_objects_teach_cca_is_fitted_on_validation_objects_too(name):
+    alone, taught = fitted(name), build_method(name, Setting(CONFIG, all_teach=True))
+    taught.fit(TRAIN, VALIDATION)
+    assert {**taught.chosen, "rank": None, "most_components": None} == {
+        **alone.chosen, "rank": None, "most_components": None
+    }  # fmt: skip
+    assert taught.chosen["most_components"] == 12 + 4 - 1 > alone.chosen["most_components"]
+
+
+@pytest.mark.parametrize("all_teach", [False, True])
+def test_settings_are_chosen_by_objects_that_are_held_out_of_the_fit_and_by_no_others(all_teach, monkeypatch):
+    calls = []
+    monkeypatch.setattr(cca_towers, "choose", lambda *asked: calls.append(asked) or choose(*asked))
+    method = build_method("cca_towers", Setting(CONFIG, all_teach=all_teach))
+    method.fit(TRAIN, VALIDATION)
+    ((features, _, folds),) = calls
+    known = {*TRAIN.object_ids, *VALIDATION.object_ids}
+    assert set(features.object_ids) == known
+    held = [name for fold in folds for name in fold]
+    assert len(held) == len(set(held))
+    assert set(held) == (known if all_teach else set(VALIDATION.object_ids))
+    # By two plain loops: the reduction is that of all, the fit that of the objects outside the fold.
+    assert method.chosen["validation_auc"] == pytest.approx(choose(features, blocks_of(CONFIG, TRAIN), folds)[1])
+
+
+def test_the_setting_that_ranks_held_out_objects_best_is_chosen_not_the_one_that_fits_best():
+    hard = planted(12, 7, noise=4.0)
+    folds = [tuple(sorted(set(hard.object_ids)))[start::2] for start in range(2)]
+    blocks = blocks_of(CONFIG, hard)
+    alone = {one: choose(hard, blocks, folds, [one])[1] for one in GRID}
+    best, worth = choose(hard, blocks, folds)
+    assert worth == pytest.approx(max(alone.values()))
+    assert alone[best] == pytest.approx(worth)
+    assert len({round(one, 6) for one in alone.values()}) > 1
 
 
 def with_references(features):

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from retrieval.adaptation.folds import Fold, best_ridge, draw_folds, first_guesses, fit_folds, measure
+from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, fit_folds, measure
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import AsItIs
 from retrieval.console.output import say
 from retrieval.errors import BadInput
+from retrieval.methods.cca_towers import CcaSettings, choose
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
@@ -19,11 +20,12 @@ from retrieval.model.encode import one_thread
 class Estimate:
     """What the fit is worth on objects left out; the same of blurred touches is the control.
 
-    ridge: the one chosen. folds: the fits behind it. first, below: first guesses among a fold's objects, and pairs.
+    settings: those of a fit to all objects, chosen by the folds. folds: the fits behind the estimate, each with
+    settings chosen among the objects that taught it. first, below: first guesses among a fold's objects, and pairs.
     known: the model that one starts from, with nothing fitted; known_first, known_below: what it is worth.
     """
 
-    ridge: float
+    settings: CcaSettings
     folds: list[Fold]
     known: AsItIs
     first: Measure
@@ -92,18 +94,18 @@ def interval(summary: dict[str, Any]) -> str:
 def judge(material: Material, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool) -> Estimate | None:
     """The estimate from objects left out; None where there are too few of them."""
     try:
-        drawn = draw_folds(material.grasps, seed)
+        drawn = draw_folds(material.grasps, material.groups, seed)
     except BadInput as error:
         if not quiet:
             say(f"nothing is known of how good this is: {error}")
         return None
     folds, blurred = (
-        list(fit_folds(features, drawn, material.blocks, what=what, quiet=quiet))
+        list(fit_folds(features, drawn, material.blocks, seed=seed, what=what, quiet=quiet))
         for features, what in ((material.features, "touches"), (material.blurred, "blurred touches"))
     )
-    ridge, its = best_ridge(folds), best_ridge(blurred)
-    told, control = [first_guesses(fold, ridge) for fold in folds], [first_guesses(fold, its) for fold in blurred]
+    settings, _ = choose(material.features, material.blocks, drawn)
+    told, control = list(map(first_guesses, folds)), list(map(first_guesses, blurred))
     known = AsItIs.of(start, material.grasps, cache, quiet)
     rows = (told, control, known.told(drawn))
     measures = (measure(parts, column) for parts in rows for column in ("first", "below"))
-    return Estimate(ridge, folds, known, *measures)
+    return Estimate(settings, folds, known, *measures)

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import Fold
+from retrieval.adaptation.folds import Fold, fit_one
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import first_rows
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.methods.cca import unit_rows
-from retrieval.methods.cca_towers import Affine, Codes, fit_codes
+from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, Affine, Codes
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
@@ -25,19 +25,13 @@ from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, by_image
 from retrieval.training.judgement import with_verdicts
 
-MOST_JUDGED = 60
-"""Touches of an object that the posterior is fitted on, and what references are worth."""
-
 
 @one_thread()
 def fit_matcher(material: Material, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridge."""
+    """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridges."""
     features, config, matcher = material.features, material.config, material.matcher
-    by_ridge = dict(
-        fit_codes(features.touch.reshape(len(features), -1), features.photo, features.owner, material.blocks)
-    )
-    codes = by_ridge[estimate.ridge if estimate else max(by_ridge)]
-    scale, offset = _log_odds(estimate.folds, estimate.ridge) if estimate else (1.0, 0.0)
+    codes = fit_one(features, material.blocks, estimate.settings if estimate else max(GRID))
+    scale, offset = _log_odds(estimate.folds) if estimate else (1.0, 0.0)
     install(matcher, codes, scale, offset)
     objects = tuple(sorted(set(features.object_ids)))
     return Checkpoint(
@@ -56,12 +50,12 @@ def fit_matcher(material: Material, estimate: Estimate | None, out: Path) -> Che
     )
 
 
-def _log_odds(folds: list[Fold], ridge: float) -> tuple[float, float]:
+def _log_odds(folds: list[Fold]) -> tuple[float, float]:
     """Scale and offset that make of a cosine the log-odds of a match, with as many pairs that match as do not."""
     cosines, labels = [], []
     for fold in folds:
         same = fold.left_out.owner[:, None] == fold.left_out.owner
-        given = fold.cosines(ridge).ravel()
+        given = fold.cosines().ravel()
         rng = np.random.default_rng(0)
         pairs = [rng.permutation(np.flatnonzero(part.ravel())) for part in (same, ~same)]
         count = min(len(pairs[0]), len(pairs[1]), 20_000)
@@ -113,7 +107,9 @@ def start_with_probabilities(start: Checkpoint, material: Material, estimate: Es
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": material.source, "data_digest": data_digest(material.grasps)}
     provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
-    return _calibrated(dataclasses.replace(made, provenance=provenance), estimate.known.felt(folds, MOST_JUDGED))
+    return _calibrated(
+        dataclasses.replace(made, provenance=provenance), estimate.known.felt(folds, MAX_CALIBRATION_TOUCHES)
+    )
 
 
 def _calibrated(made: Checkpoint, left_out: list[FeltTouches]) -> Checkpoint:
@@ -138,10 +134,10 @@ def _left_out(matcher: Matcher, estimate: Estimate) -> list[FeltTouches]:
     scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
     parts = []
     for fold in estimate.folds:
-        rows = first_rows(fold.left_out, MOST_JUDGED)
-        logits = scale * fold.cosines(estimate.ridge)[np.ix_(rows, rows)] + offset
+        rows = first_rows(fold.left_out, MAX_CALIBRATION_TOUCHES)
+        logits = scale * fold.cosines()[np.ix_(rows, rows)] + offset
         owner = fold.left_out.owner[rows]
         touch = fold.left_out.touch.reshape(len(fold.left_out), -1)[rows]
-        codes = unit_rows(fold.codes[estimate.ridge].touch(touch))
+        codes = unit_rows(fold.codes.touch(touch))
         parts.append(FeltTouches(JudgedTouches(logits, owner, owner, np.eye(len(rows), dtype=np.bool_)), codes))
     return parts

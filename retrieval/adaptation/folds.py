@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, linked_objects
 from retrieval.errors import BadInput
-from retrieval.methods.cca_towers import RIDGES, Blocks, Codes, fit_codes
+from retrieval.methods.cca_towers import INNER_FOLD, Blocks, CcaSettings, Codes, choose, fit_codes
+from retrieval.methods.held_out import held_out_folds, look_alikes
 from retrieval.metrics.guesses import guess_curves
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features
@@ -22,46 +23,46 @@ FEWEST = 6
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """Objects that are left out together, the codes of each ridge that the others taught, and the features of these
-    objects' grasps."""
+    """Objects that are left out together, the features of their grasps, and the codes that the others taught, with
+    settings that were chosen among these others."""
 
     left_out: Features
-    codes: dict[float, Codes]
+    codes: Codes
+    settings: CcaSettings
 
-    def cosines(self, ridge: float) -> NDArray[np.float32]:
+    def cosines(self) -> NDArray[np.float32]:
         """(n, n) of the touch of every grasp left out with the photo of every such grasp."""
-        return self.codes[ridge].cosines(self.left_out.touch.reshape(len(self.left_out), -1), self.left_out.photo)
+        return self.codes.cosines(self.left_out.touch.reshape(len(self.left_out), -1), self.left_out.photo)
 
 
-def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
-    """Objects in folds of about `GALLERY`; objects that share a sequence stay together. Raises BadInput for fewer
-    than `FEWEST` objects."""
-    groups = linked_objects(grasps)
-    total = sum(map(len, groups))
+def draw_folds(grasps: Sequence[Grasp], groups: Sequence[Sequence[str]], seed: int) -> list[tuple[str, ...]]:
+    """Objects in folds of about `GALLERY`: half of each group is left out together, and objects that share a sequence.
+
+    groups: objects of one kind (`look_alike_groups`). Raises BadInput for fewer than `FEWEST` objects.
+    """
+    total = len({grasp.object_id for grasp in grasps})
     if total < FEWEST:
         raise BadInput(f"{FEWEST} objects or more can be judged by leaving each out once; got {total}")
-    folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3))]
-    for place in np.random.default_rng([seed, 7]).permutation(len(groups)):
-        min(folds, key=len).extend(groups[place])
-    return [tuple(sorted(fold)) for fold in folds]
+    return held_out_folds(groups, GALLERY, seed, linked_objects(grasps))
 
 
 def fit_folds(
-    features: Features, folds: Sequence[Sequence[str]], blocks: Blocks, *, what: str, quiet: bool
+    features: Features, folds: Sequence[Sequence[str]], blocks: Blocks, *, seed: int, what: str, quiet: bool
 ) -> Iterator[Fold]:
-    """Each fold, and what the objects outside it teach."""
+    """Each fold, and what the objects outside it teach: settings are chosen among these, then fitted to all of them."""
     everyone = {name for fold in folds for name in fold}
     with Bar(f"judge {what}", len(folds), "folds", quiet=quiet) as bar:
         for fold in folds:
             learned = features.of_objects(everyone.difference(fold))
-            touch = learned.touch.reshape(len(learned), -1)
-            yield Fold(features.of_objects(fold), dict(fit_codes(touch, learned.photo, learned.owner, blocks)))
+            settings, _ = choose(learned, blocks, held_out_folds(look_alikes(learned), INNER_FOLD, seed))
+            yield Fold(features.of_objects(fold), fit_one(learned, blocks, settings), settings)
             bar.advance()
 
 
-def best_ridge(folds: Sequence[Fold]) -> float:
-    """The ridge by which touches left out are told apart best; of equals the larger."""
-    return max(RIDGES, key=lambda ridge: (pair_accuracy([first_guesses(fold, ridge) for fold in folds]), ridge))
+def fit_one(features: Features, blocks: Blocks, settings: CcaSettings) -> Codes:
+    """Codes that all of these grasps teach."""
+    touch = features.touch.reshape(len(features), -1)
+    return dict(fit_codes(touch, features.photo, features.owner, blocks, [settings]))[settings]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +86,10 @@ class ToldApart:
         return Measure(getattr(self, column)[:, None], owner, np.array([chance]), f"{self.objects} objects left out")
 
 
-def first_guesses(fold: Fold, ridge: float, seed: int = 0) -> ToldApart:
+def first_guesses(fold: Fold, seed: int = 0) -> ToldApart:
     """Tell each touch of a fold by one photo, drawn, of each of the fold's objects; the photo of its own object is of
     another grasp where there is one."""
-    return tell_apart(fold.cosines(ridge), fold.left_out, seed)
+    return tell_apart(fold.cosines(), fold.left_out, seed)
 
 
 def tell_apart(scores: NDArray[np.float32], features: Features, seed: int = 0) -> ToldApart:

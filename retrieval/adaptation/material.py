@@ -7,7 +7,9 @@ from pathlib import Path
 
 from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps, recording_source
 from retrieval.errors import BadInput
+from retrieval.evaluation.real.protocol import read_facts
 from retrieval.methods.cca_towers import Blocks
+from retrieval.methods.held_out import grouped, look_alikes
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
@@ -26,13 +28,17 @@ NOTHING = "none"
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Own grasps, the towers side by side, and what these make of them; blurred: of an 8 x 6 blur of each touch."""
+    """Own grasps, the towers side by side, and what these make of them; blurred: of an 8 x 6 blur of each touch.
+
+    groups: objects of one kind: of one class where the recording names classes, else those that look alike.
+    """
 
     grasps: list[Grasp]
     config: Config
     matcher: Matcher
     features: Features
     blurred: Features
+    groups: list[list[str]]
     source: str
 
     @property
@@ -61,7 +67,17 @@ def encode(
     shown = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
     features = shown()
     blurred = shown(variant="blurred", photos_of=features)
-    return Material(grasps, config, matcher, features, blurred, recording_source(recording))
+    groups = groups_of(features, recording)
+    return Material(grasps, config, matcher, features, blurred, groups, recording_source(recording))
+
+
+def groups_of(features: Features, recording: Path) -> list[list[str]]:
+    """Objects of one kind: of one class where recording.json names the class of every object, else `look_alikes`."""
+    said = read_facts(recording).objects
+    names = sorted(set(features.object_ids))
+    if all("class" in said.get(name, {}) for name in names):
+        return grouped(names, {name: said[name]["class"] for name in names})
+    return look_alikes(features)
 
 
 def config_for(start: Checkpoint, fingers: int, *, beside: bool, seed: int) -> Config:

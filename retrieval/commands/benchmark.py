@@ -17,6 +17,8 @@ from retrieval.evaluation.real import PROTOCOLS
 HELP = "Judge methods on public data sets of real touches, with controls."
 PRESET = "real"
 METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
+METHODS_OF = {"adapt": "cca_towers,chance"}
+"""Of presets that are made for one of the methods."""
 WRITTEN = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
 
 app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metavar="DATA_KIND [ARGS]...")
@@ -41,7 +43,12 @@ def real(
         str | None,
         typer.Option(help=f"which to ask, with commas between: {', '.join(PROTOCOLS)} (default: those with data)"),
     ] = None,
-    methods: Annotated[str, typer.Option(help="methods to fit, with commas between")] = METHODS,
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            help=f"methods to fit, with commas between (default: {METHODS}; of preset adapt {METHODS_OF['adapt']})"
+        ),
+    ] = None,
     preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
@@ -79,7 +86,7 @@ def real(
             config=config,
             preset=Path(preset).stem,
             protocols=[name for name in asked if name not in skipped],
-            methods=[name for name in methods.split(",") if name],
+            methods=[name for name in (methods or METHODS_OF.get(preset, METHODS)).split(",") if name],
             models=_models(model or ()),
             seeds=seeds,
             skipped=skipped,

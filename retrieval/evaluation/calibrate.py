@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import Calibration, fit_calibration
+from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration
 from retrieval.metrics.reliability import reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import LEAST_OBJECTS, JudgedTouches, Posterior, Questions, fit_questions
 
+MIN_THRESHOLD_OBJECTS = 10
+"""Validation objects that a threshold of pairs is fitted on."""
 _PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
 
@@ -67,6 +69,38 @@ def calibrate(validation: Mapping[int, ScoreTable], *, seed: int = 0) -> Calibra
 def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
     """Log-odds of a row of the table with a photo, fitted on drawn pairs."""
     return fit_calibration(*drawn_pairs(validation, seed))
+
+
+@dataclass(frozen=True)
+class PairRule:
+    """Which pairs are called matches, where that comes from, or why there is no such rule.
+
+    source: "the checkpoint" or "validation objects"; empty where there is none.
+    """
+
+    rule: Calibration | Threshold | None
+    source: str = ""
+    why_not: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The "pair_threshold" of results.json: {"at", "from", "why_not"}; at: the score above which a pair matches."""
+        at = -self.rule.intercept / self.rule.slope if isinstance(self.rule, Calibration) else None
+        at = self.rule.at if isinstance(self.rule, Threshold) else at
+        return {"at": at, "from": self.source or None, "why_not": self.why_not or None}
+
+
+def pair_rule(chosen: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairRule:
+    """The threshold that a checkpoint brings with it (`chosen["pair_threshold"]`), else one fitted on validation
+    objects, of which `MIN_THRESHOLD_OBJECTS` are needed: between fewer a threshold falls anywhere."""
+    if (own := chosen.get("pair_threshold")) is not None:
+        return PairRule(Threshold(own), "the checkpoint")
+    if (count := len(validation.asked.objects)) < MIN_THRESHOLD_OBJECTS:
+        return PairRule(
+            None,
+            why_not=f"pair accuracy needs a threshold: a checkpoint's own, or one fitted on {MIN_THRESHOLD_OBJECTS} "
+            f"validation objects; there are {count}",
+        )
+    return PairRule(calibrate_pairs(validation, seed=seed), "validation objects")
 
 
 def enough_objects(table: ScoreTable) -> bool:
@@ -150,6 +184,12 @@ def reliability(
 
 
 def _choice_reliability(logits: NDArray[np.float64], posterior: Posterior) -> dict[str, Any]:
+    return reliability_bins(*stated_first_guesses(logits, posterior).T)
+
+
+def stated_first_guesses(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:
+    """(Q, 2): the stated probability of the first guess among candidates of which one is true, and whether it is right
+    (equals share it); logits (Q, k), the true candidate first."""
     tied = logits == logits.max(1, keepdims=True)
     said = [posterior.believe(row, none_prior=0).objects.max() for row in logits]
-    return reliability_bins(said, tied[:, 0] / tied.sum(1))
+    return np.column_stack([said, tied[:, 0] / tied.sum(1)])

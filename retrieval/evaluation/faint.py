@@ -81,6 +81,6 @@ def score_faint(
 
 def _measures(judged: MethodScores, rows: NDArray[np.bool_]) -> dict[str, Measure]:
     """The measures of some test touches (`rows`) with all test photos."""
-    fitted, table = judged.calibration, judged.touches("test", "test")
+    table = judged.touches("test", "test")
     part = table.select(rows, np.arange(len(table.photo_owner)))
-    return take(Scored(part, part, {}, fitted, judged.seed), MEASURED) if part.askable.any() else {}
+    return take(Scored(part, part, {}, judged.pair_rule.rule, judged.seed), MEASURED) if part.askable.any() else {}

@@ -177,8 +177,8 @@ def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[st
         {"a": first, "b": other, "measure": key}
         | compare([one[key] for one in measures[first]], [one[key] for one in measures[other]], draws=DRAWS, seed=seed)
         for key in COMPARED
-        if key in measures[first][0]
         for other in others
+        if key in measures[first][0] and key in measures[other][0]
     ]
 
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from retrieval.evaluation.calibrate import (
     Calibrations,
     KWayTest,
+    PairRule,
     calibrate,
-    calibrate_pairs,
     enough_objects,
+    pair_rule,
     reliability,
 )
 from retrieval.evaluation.predictions import Predictions
@@ -23,7 +24,6 @@ from retrieval.evaluation.shown import Shown
 from retrieval.metrics import protocols
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.pairs import Calibration
 from retrieval.metrics.registry import SHOWN_PHOTOS, Scored, guesses, take
 from retrieval.metrics.table import ScoreTable
 
@@ -87,24 +87,24 @@ class MethodScores:
             [grasp_ids[row] for row in asked.photos[_of(asked, asked.photo_owner, part)]],
         )
 
-    def scored(self, calibration: Calibration) -> Scored:
-        """What metrics are taken of; calibration: of single touches, fitted on validation objects."""
+    def scored(self) -> Scored:
+        """What metrics are taken of."""
         return Scored(
             test=self.touches("test", "test"),
             among_all=self.touches("test", None),
             sets=self.sets("test"),
-            calibration=calibration,
+            rule=self.pair_rule.rule,
             seed=self.seed,
         )
 
     def measures(self, names: Iterable[str]) -> Measures:
-        """The metrics of these names, with pairs calibrated on validation objects."""
-        return take(self.scored(self.calibration), names)
+        """The metrics of these names."""
+        return take(self.scored(), names)
 
     @cached_property
-    def calibration(self) -> Calibration:
-        """The calibration of single touches, fitted on validation objects."""
-        return calibrate_pairs(self.touches("validation", "validation"), seed=self.seed)
+    def pair_rule(self) -> PairRule:
+        """Which pairs of a single touch and a photo are called matches."""
+        return pair_rule(self.predictions.chosen, self.touches("validation", "validation"), seed=self.seed)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
@@ -127,9 +127,10 @@ def score_method(
     judged = [MethodScores(queries, predictions, seed) for predictions in by_seed]
     shown = Shown(judged[0].touches("test", "test"), queries.objects, *judged[0].ids(grasp_ids, "test"))
     calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in judged]
-    measures = [take(one.scored(fitted.pairs[1])) for one, fitted in zip(judged, calibrations, strict=True)]
+    measures = [take(one.scored()) for one in judged]
     entry = {
         "chosen": [predictions.chosen for predictions in by_seed],
+        "pair_threshold": judged[0].pair_rule.to_dict(),
         "measures": summaries(measures, draws, seed),
         "per_object": _per_object(queries, judged, measures, seed),
         "confusions": _confusions(queries, judged, shown, seed),

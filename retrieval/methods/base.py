@@ -22,8 +22,8 @@ class Setting:
     """What a method is made with.
 
     folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
-    all_teach: a method that can (`cca_towers`) learns from validation objects, too, once they have chosen its settings;
-    what is calibrated on their scores is then too sure.
+    all_teach: a method that can (`cca_towers`, `cca`, `cca_pca`) learns from validation objects, too, once its settings
+    are chosen; what is calibrated on their scores is then too sure.
     """
 
     config: Config

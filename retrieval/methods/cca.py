@@ -26,6 +26,8 @@ Matrix = NDArray[np.float64]
 
 RANK_CUT = 1e-7
 """Directions thinner than this share of the widest are the rounding of float32 features."""
+LEADING_CUT = 1e-6
+"""The same where singular values come from a squared matrix."""
 MOST_ROWS, LEADING = 2048, 512
 """From so many items on only so many directions are kept: all of them take minutes, and a ridge silences the others."""
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
@@ -77,11 +79,25 @@ def decompose(x: NDArray[Any], most: int | None = None) -> View:
 
 
 def factored(x: NDArray[Any], standardise: Standardiser, most: int | None = None) -> View:
-    """The same of finite items, standardised as is said."""
-    shown = standardise(x)
-    left, singular, right = svd(shown) if len(x) <= MOST_ROWS else leading(shown, most or LEADING)
-    rank = min(int((singular > RANK_CUT * singular[0]).sum()), len(singular) if most is None else most)
-    return View(standardise, left[:, :rank], singular[:rank], right[:rank])
+    """The same of finite items, standardised as is said.
+
+    Equal items, such as a photo that several grasps share, are decomposed once, weighted by their number.
+    """
+    first, place, counts = _distinct(x)
+    weight = np.sqrt(counts)[:, None]
+    shown = standardise(x[first]) * weight
+    whole = most is None and len(x) <= MOST_ROWS
+    left, singular, right = svd(shown) if whole else leading(shown, most or LEADING)
+    rank = min(int((singular > (RANK_CUT if whole else LEADING_CUT) * singular[0]).sum()), most or len(singular))
+    return View(standardise, (left[:, :rank] / weight)[place], singular[:rank], right[:rank])
+
+
+def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The first row of each distinct item, the place of every item among these, and how often each is there."""
+    seen: dict[bytes, int] = {}
+    place = np.array([seen.setdefault(row.tobytes(), len(seen)) for row in np.ascontiguousarray(x)])
+    first = np.unique(place, return_index=True)[1]
+    return first, place, np.bincount(place)
 
 
 def canonical(
@@ -144,8 +160,7 @@ def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
 def _whitened_means(view: View, owner: NDArray[np.int64], ridge: float) -> Matrix:
     """(r, objects): E times the whitened left vectors, turned over."""
     objects, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(objects), view.rank))
-    np.add.at(sums, place, view.left)
+    sums = np.eye(len(objects))[:, place] @ view.left
     shrink = view.singular / np.sqrt(len(view.left)) / view.damped(ridge)
     return np.asarray((sums / np.sqrt(counts)[:, None] * shrink).T)
 
@@ -187,7 +202,13 @@ class Cca(Method):
         # The decompositions are made once; a ridge only damps them.
         found = ((ridge, canonical(touch, photo, train.owner, ridge)) for ridge in RIDGES)
         cells = (cell for ridge, one in found for cell in self._cells(ridge, one, Validator.of(validation)))
-        self._keep(*max(cells, key=lambda cell: cell[0].auc))
+        choice, found_by = max(cells, key=lambda cell: cell[0].auc)
+        if self.setting.all_teach:
+            known = train.joined(validation)
+            touch, photo = (decompose(part, self.most_directions) for part in (known.touch, known.photo))
+            self._standardise = touch.standardise, photo.standardise
+            found_by = canonical(touch, photo, known.owner, choice.ridge)
+        self._keep(choice, found_by)
         self.chosen["rank"] = {"touch": touch.rank, "photo": photo.rank}
 
     def _cells(self, ridge: float, found: Canonical, judged: Validator) -> Iterator[tuple[CcaCell, Canonical]]:

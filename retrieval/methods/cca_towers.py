@@ -3,10 +3,13 @@
 Features of each tower are first reduced to their widest directions, every tower weighing the same; then come canonical
 correlations with a ridge (`retrieval.methods.cca`). On a few dozen objects nothing with more freedom did better
 (docs/adapting.md). A map of maps is one matrix, so that the result is stored as the projections of an ordinary matcher.
+
+Settings are chosen from `GRID` by training objects that are held out (`choose`), never by objects that test.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby, product
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
@@ -15,9 +18,11 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import LEADING, View, canonical, cosine, decompose, factored, unit_rows
-from retrieval.methods.selection import Validator
+from retrieval.methods.held_out import held_out_folds, look_alikes
+from retrieval.methods.selection import Validator, judged_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
+from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.side_by_side import widths_of
 
@@ -26,14 +31,33 @@ if TYPE_CHECKING:
 
 Matrix = NDArray[np.float64]
 Rows = NDArray[np.float32]
+Numbers = NDArray[np.int64]
 Blocks = tuple[Sequence[int], Sequence[int]]
 """How wide the features are of towers that stand side by side, of a touch and of a photo."""
-DIRECTIONS = 256
-"""Of each tower's features that are kept."""
 COMPONENTS = 64
-RIDGES = (0.1, 0.3, 1.0)
-PHOTO_RIDGE = 1.0
-"""Photos of an object are fewer than its touches, and more alike."""
+INNER_FOLD = 6
+"""Training objects, about, that are held out together to choose settings."""
+MAX_CHOICE_TOUCHES = 240
+"""Touches of a fold that settings are chosen by."""
+MAX_CALIBRATION_TOUCHES = 60
+"""Touches of an object that a posterior is fitted on."""
+
+
+class CcaSettings(NamedTuple):
+    """Settings of one fit.
+
+    ridge, photo_ridge: shares of the mean variance, of touches and of photos. directions: kept of each tower's
+    features. power: of the correlation by which a canonical variate is weighted.
+    """
+
+    ridge: float = 0.3
+    photo_ridge: float = 1.0
+    directions: int = 256
+    power: int = 1
+
+
+GRID = tuple(CcaSettings(*one) for one in product((0.1, 0.3, 1.0), (0.3, 1.0, 3.0), (64, 128, 256), (1, 2)))
+WIDEST = max(one.directions for one in GRID)
 
 
 class Affine(NamedTuple):
@@ -57,77 +81,147 @@ class Codes(NamedTuple):
     touch: Affine
     photo: Affine
 
-    def cosines(self, touch: Rows, photo: Rows) -> Rows:
+    def cosines(self, touch: NDArray[np.floating], photo: NDArray[np.floating]) -> Rows:
         """(T, N) of features (T, F) and (N, F')."""
         return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """One modality of n items: the map to the widest directions of each tower's features, and the items there."""
+    """One modality of n items in the widest directions of each tower's features.
 
-    map: Affine
-    view: View
+    views: a decomposition for each tower, of `WIDEST` directions at most. widths: how wide each tower's features are.
+    """
+
+    views: tuple[View, ...]
+    widths: tuple[int, ...]
 
     @classmethod
-    def of(cls, x: Rows, blocks: Sequence[int]) -> Self:
-        """The reduction of features x (n, F), which come from towers that stand side by side, as wide as `blocks` say;
-        a block that does not vary is left out."""
-        parts = [_widest(part) for part in np.split(x, np.cumsum(blocks)[:-1], axis=1)]
-        weight = np.zeros((x.shape[1], sum(part.weight.shape[1] for part in parts)))
+    def of(cls, x: Rows, blocks: Sequence[int], most: int = WIDEST) -> Self:
+        """The reduction of features x (n, F), which come from towers that stand side by side, as wide as `blocks`
+        say."""
+        parts = np.split(x, np.cumsum(blocks)[:-1], axis=1)
+        return cls(tuple(decompose(part, most) for part in parts), tuple(blocks))
+
+    def items(self, directions: int) -> Matrix:
+        """(n, k): the items in so many directions of each tower, the variances of each tower adding up to 1."""
+        shown = slice(directions)
+        parts = [view.left[:, shown] * view.singular[shown] / _size(view, directions) for view in self.views]
+        return np.concatenate(parts, axis=1)
+
+    def map(self, directions: int) -> Affine:
+        """The map from features to `items`."""
+        ranks = [min(view.rank, directions) for view in self.views]
+        weight, bias = np.zeros((sum(self.widths), sum(ranks))), []
         row = column = 0
-        for width, part in zip(blocks, parts, strict=True):
-            weight[row : row + width, column : column + part.weight.shape[1]] = part.weight
-            row, column = row + width, column + part.weight.shape[1]
-        found = Affine(weight, np.concatenate([part.bias for part in parts]))
-        return cls(found, _centred(found(x)))
+        for view, width, rank in zip(self.views, self.widths, ranks, strict=True):
+            part = view.right[:rank].T / view.standardise.scale[:, None] / _size(view, directions)
+            weight[row + view.standardise.kept, column : column + rank] = part
+            bias.append(-(view.standardise.mean @ part))
+            row, column = row + width, column + rank
+        return Affine(weight, np.concatenate(bias))
 
 
-def _widest(x: Rows) -> Affine:
-    """The map of x (n, F) to its directions of largest variance, scaled so that all variances add up to 1."""
-    view = decompose(x, DIRECTIONS)
-    size = np.sqrt((view.singular**2).sum() / len(x))
-    weight = np.zeros((x.shape[1], view.rank))
-    weight[view.standardise.kept] = view.right.T / view.standardise.scale[:, None] / size
-    return Affine(weight, -(view.standardise.mean @ weight[view.standardise.kept]))
-
-
-def _centred(x: Matrix) -> View:
-    """The decomposition of items that are centred already and are not to be scaled: their spread has a meaning."""
-    as_it_is = Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1]))
-    return factored(x, as_it_is, LEADING)
+def _size(view: View, directions: int) -> float:
+    return float(np.sqrt((view.singular[:directions] ** 2).sum() / len(view.left)))
 
 
 def fit_codes(
-    touch: Rows,
-    photo: Rows,
-    owner: NDArray[np.int64],
-    blocks: Blocks,
-    ridges: Sequence[float] = RIDGES,
-) -> Iterator[tuple[float, Codes]]:
-    """The codes of each ridge, from features of grasps: touch (n, F), photo (n, F'), owner (n,) objects from 0.
+    touch: Rows, photo: Rows, owner: Numbers, blocks: Blocks, settings: Sequence[CcaSettings] = GRID
+) -> Iterator[tuple[CcaSettings, Codes]]:
+    """Codes of each of the settings, from features of grasps: touch (n, F), photo (n, F'), owner (n,) objects from 0.
 
-    blocks: how wide the towers' features are that stand side by side, of touches and of photos. Variates are weighted
-    by their correlation; a ridge is a share of the mean variance, that of photos is `PHOTO_RIDGE`.
+    blocks: how wide the towers' features are that stand side by side, of touches and of photos.
     """
-    felt, seen = Reduced.of(touch, blocks[0]), Reduced.of(photo, blocks[1])
-    for ridge in ridges:
-        found = canonical(felt.view, seen.view, owner, ridge, PHOTO_RIDGE)
-        weights = found.correlations[:COMPONENTS]
-        yield (
-            ridge,
-            Codes(
-                *(
-                    part.map.then(Affine(variates[:, :COMPONENTS] * weights, np.zeros(len(weights))))
-                    for part, variates in ((felt, found.touch_weights), (seen, found.photo_weights))
-                )
-            ),
-        )
+    most = max(one.directions for one in settings)
+    felt, seen = Reduced.of(touch, blocks[0], most), Reduced.of(photo, blocks[1], most)
+    for one, codes in _fit(felt, seen, np.arange(len(owner)), owner, settings):
+        maps = felt.map(one.directions), seen.map(one.directions)
+        yield one, Codes(maps[0].then(codes.touch), maps[1].then(codes.photo))
+
+
+def _fit(
+    touch: Reduced, photo: Reduced, rows: Numbers, owner: Numbers, settings: Sequence[CcaSettings]
+) -> Iterator[tuple[CcaSettings, Codes]]:
+    """Codes of reduced items, from some of their rows."""
+    for directions, some in groupby(sorted(settings, key=lambda one: one.directions), lambda one: one.directions):
+        items = [part.items(directions)[rows] for part in (touch, photo)]
+        means = [part.mean(0) for part in items]
+        views = [_as_it_is(part - mean) for part, mean in zip(items, means, strict=True)]
+        for ridges, alike in groupby(sorted(some), lambda one: one[:2]):
+            found = canonical(*views, owner[rows], *ridges)
+            for one in alike:
+                weights = found.correlations[:COMPONENTS] ** one.power
+                variates = (each[:, :COMPONENTS] * weights for each in (found.touch_weights, found.photo_weights))
+                yield one, Codes(*(Affine(each, -mean @ each) for each, mean in zip(variates, means, strict=True)))
+
+
+def _as_it_is(x: Matrix) -> View:
+    """The decomposition of items that are centred already and are not to be scaled: their spread has a meaning."""
+    return factored(x, Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1])), LEADING)
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Settings that were chosen by objects held out of a fit.
+
+    auc: their mean AUC on these. codes: fitted to all objects. held_out: for each fold, cosines of its touches with its
+    photos by codes that its objects did not teach, as a posterior is fitted on them.
+    """
+
+    settings: CcaSettings
+    auc: float
+    codes: Codes
+    held_out: list[JudgedTouches]
+
+
+def choose(
+    features: "Features", blocks: Blocks, folds: Sequence[Sequence[str]], settings: Sequence[CcaSettings] = GRID
+) -> Choice:
+    """Choose the settings that rank photos of held-out objects best; of equals the largest.
+
+    folds: objects of `features` that are held out together; the others are fitted on. Only the reduction to the widest
+    directions, which knows no object, sees all of them.
+    """
+    felt, seen = Reduced.of(_rows(features), blocks[0]), Reduced.of(features.photo, blocks[1])
+    shown = {one: (felt.items(one), seen.items(one)) for one in {each.directions for each in settings}}
+    found: dict[CcaSettings, list[tuple[float, Codes]]] = {one: [] for one in settings}
+    rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
+    for rows in rows_of:
+        out = features.select(rows)
+        some = judged_rows(out, MAX_CHOICE_TOUCHES)
+        judged, places = Validator(out.select(some)), rows[some]
+        others = np.setdiff1d(np.arange(len(features)), rows)
+        for one, codes in _fit(felt, seen, others, features.owner, settings):
+            touch, photo = shown[one.directions]
+            found[one].append((judged.touches(codes.cosines(touch[places], photo[places])), codes))
+    aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
+    best = max(aucs, key=lambda one: (aucs[one], one))
+    parts = [
+        held_out(features.select(rows), codes, *(part[rows] for part in shown[best.directions]))
+        for rows, (_, codes) in zip(rows_of, found[best], strict=True)
+    ]
+    every = np.arange(len(features))
+    codes = dict(_fit(felt, seen, every, features.owner, [best]))[best]
+    maps = felt.map(best.directions), seen.map(best.directions)
+    return Choice(best, aucs[best], Codes(maps[0].then(codes.touch), maps[1].then(codes.photo)), parts)
+
+
+def held_out(
+    features: "Features", codes: Codes, touch: NDArray[np.floating], photo: NDArray[np.floating]
+) -> JudgedTouches:
+    """Cosines of touches (n, k) with photos (n, k') of objects that the codes have not seen: of each object at most
+    `MAX_CALIBRATION_TOUCHES` grasps, evenly spaced."""
+    rows = judged_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
+    owner = features.owner[rows]
+    return JudgedTouches(codes.cosines(touch[rows], photo[rows]), owner, owner, np.eye(len(rows), dtype=bool))
 
 
 class CcaTowers(Method):
-    """CCA on the features of towers that stand side by side: a pair's score is the cosine of its two codes, and the
-    ridge is chosen by ranking on validation objects.
+    """CCA on the features of towers that stand side by side: a pair's score is the cosine of its two codes.
+
+    Settings are chosen by ranking on validation objects; where all objects teach, by cross-validation within them, and
+    the same held-out objects say what a cosine means (the "posterior" among what was chosen).
 
     Where features of a reference touch stand behind those of each photo, a catalogue's entry is both. A touch's cosine
     with the photo and its cosine with the reference, which is encoded as a touch, are then weighed as the log-odds of
@@ -137,21 +231,24 @@ class CcaTowers(Method):
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = blocks_of(self.setting.config, train)
         self._width = sum(blocks[1])
-        judged = Validator.of(validation)
-        shown = judged.features
-        fits = dict(fit_codes(_rows(train), train.photo[:, : self._width], train.owner, blocks))
-        photo = shown.photo[:, : self._width]
-        aucs = {ridge: judged.touches(codes.cosines(_rows(shown), photo)) for ridge, codes in fits.items()}
-        best = max(aucs, key=lambda ridge: (aucs[ridge], ridge))
-        self.chosen = {"ridge": best, "validation_auc": aucs[best]}
-        self._weights: list[float] | None = None
-        if self._width < train.photo.shape[1]:
-            self._weights = _weights(fits[best], shown, self._width)
-            self.chosen |= dict(zip(("photo_weight", "reference_weight"), self._weights, strict=True))
+        seen, shown = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
+        known, folds = seen.joined(shown), [tuple(sorted(set(shown.object_ids)))]
         if self.setting.all_teach:
-            known = train.joined(validation)
-            fits = dict(fit_codes(_rows(known), known.photo[:, : self._width], known.owner, blocks, ridges=(best,)))
-        self._codes = fits[best]
+            folds = held_out_folds(look_alikes(known), INNER_FOLD, self.setting.seed)
+        choice = choose(known, blocks, folds)
+        self._codes = choice.codes
+        self.chosen = {**choice.settings._asdict(), "validation_auc": choice.auc}
+        self._weights: list[float] | None = None
+        with_references = self._width < train.photo.shape[1]
+        if with_references or not self.setting.all_teach:
+            codes = dict(fit_codes(_rows(seen), seen.photo, seen.owner, blocks, [choice.settings]))[choice.settings]
+            if with_references:
+                self._weights = _weights(codes, Validator.of(validation).features, self._width)
+                self.chosen |= dict(zip(("photo_weight", "reference_weight"), self._weights, strict=True))
+            if not self.setting.all_teach:
+                self._codes = codes
+        elif posterior := _posterior(choice):
+            self.chosen["posterior"] = posterior.to_dict()
 
     def _encode_touch(self, touch: Array) -> Array:
         code = unit_rows(self._codes.touch(touch.reshape(len(touch), -1)))
@@ -170,6 +267,14 @@ class CcaTowers(Method):
 
 def _rows(features: "Features") -> Rows:
     return features.touch.reshape(len(features), -1)
+
+
+def _posterior(choice: Choice) -> Posterior | None:
+    """What a cosine means, by held-out objects; None where these are too few, or have one photo each."""
+    try:
+        return fit_posterior(*choice.held_out)
+    except BadInput:
+        return None
 
 
 def _weights(codes: Codes, shown: "Features", width: int) -> list[float]:

@@ -32,6 +32,8 @@ class LateFusion(Method):
         """The method as a checkpoint has it; it is not fitted again."""
         method = cls(setting)
         method._take(checkpoint)
+        if checkpoint.posterior is not None:  # where a photo's object is as likely as one that the catalogue lacks
+            method.chosen["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
         fingers, touch, photo = _feature_counts(checkpoint.matcher)
         method._shapes, method.fitted = ((fingers, touch), (photo,)), True
         return method

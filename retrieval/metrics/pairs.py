@@ -54,6 +54,17 @@ class Calibration:
         return dataclasses.asdict(self)
 
 
+@dataclass(frozen=True)
+class Threshold:
+    """A fixed rule: scores above `at` are matches."""
+
+    at: float
+
+    def log_odds(self, score: ArrayLike) -> NDArray[np.float64]:
+        """How far scores lie above the threshold."""
+        return np.asarray(score, dtype=np.float64) - self.at
+
+
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
     """Fit slope and intercept by maximum likelihood with Platt's smoothed targets (Platt 1999, section 2.2).
 

@@ -13,20 +13,20 @@ from retrieval.metrics import ranking
 from retrieval.metrics.auc import weight_below
 from retrieval.metrics.guesses import guess_curves
 from retrieval.metrics.measure import Measure, object_means, object_weights
-from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable, object_scores
 
 
-def pair_accuracy(table: ScoreTable, calibration: Calibration) -> Measure:
+def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
     """The paper's test, half true and half false pairs, in closed form over ALL pairs.
 
     A row is right on a photo of its object where the calibrated log-odds are above 0, on another object's where they
     are below; exactly 0 is half right, as a coin would be. Value: half the share over its object's photos and half
-    that over other photos (the object uniform, then its photo). `calibration`: that of rows like these, fitted on
-    validation objects. Chance is 1/2.
+    that over other photos (the object uniform, then its photo). rule: a calibration of rows like these, fitted on
+    validation objects, or a threshold that comes with the scores. Chance is 1/2.
     """
     kept = table.asked
-    odds = calibration.log_odds(kept.scores)
+    odds = rule.log_odds(kept.scores)
     own, others = _halves(kept, (np.sign(odds) + 1) / 2)
     return _measure(table, (own + 1 - others) / 2, 0.5)
 

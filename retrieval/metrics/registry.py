@@ -9,7 +9,7 @@ from functools import cached_property
 
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.pairs import Calibration
+from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable
 
 SET_SIZES = (1, 2, 3, 5, 8, 12, 20)
@@ -25,14 +25,14 @@ class Scored:
     """What metrics are taken of: the scores of one method and seed, as tables.
 
     test: touches with photos of test objects; among_all: the same touches with the photos of all objects; sets: by
-    number of grasps, sets of test touches with photos of test objects; calibration: of single touches, fitted on
-    validation objects; seed: of what is drawn.
+    number of grasps, sets of test touches with photos of test objects; rule: which pairs of a single touch and a photo
+    are called matches, None where nothing says so; seed: of what is drawn.
     """
 
     test: ScoreTable
     among_all: ScoreTable
     sets: dict[int, ScoreTable]
-    calibration: Calibration
+    rule: Calibration | Threshold | None
     seed: int
 
     @cached_property
@@ -94,7 +94,10 @@ TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 METRICS: dict[str, Metric] = {
     "pair_accuracy": Metric(
-        "pair accuracy", "pair accuracy", "main", lambda of: protocols.pair_accuracy(of.test, of.calibration)
+        "pair accuracy",
+        "pair accuracy",
+        "main",
+        lambda of: protocols.pair_accuracy(of.test, of.rule) if of.rule else None,
     ),
     "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda of: protocols.pair_auc(of.test)),
     "guesses_k5": Metric("first guess of 5", "first guess of 5", "main", lambda of: guesses(of.test, 5, of.seed)),

@@ -50,6 +50,7 @@ def _explained(table: Table) -> Table:
 
 
 def _table(results: Results, columns: Sequence[Column]) -> Table | None:
+    notes = _without_threshold(results) if any(key == "pair_accuracy" for _, key, _ in columns) else []
     columns = [column for column in columns if any(results.summary(name, column[1]) for name in results.methods)]
     if not columns:
         return None
@@ -65,10 +66,19 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
         Table(
             ("method, %", *(heading for heading, _, _ in columns)),
             (*rows, tuple(chance)),
-            tuple(_basis(results, list(dict.fromkeys(key for _, key, _ in columns)))),
+            (*_basis(results, list(dict.fromkeys(key for _, key, _ in columns))), *notes),
             bold=frozenset(_best(results, columns)),
         )
     )
+
+
+def _without_threshold(results: Results) -> list[str]:
+    """Which methods have no pair accuracy, and why."""
+    reasons: dict[str, list[str]] = {}
+    for name in results.methods:
+        if why := (results.data["methods"][name].get("pair_threshold") or {}).get("why_not"):
+            reasons.setdefault(why, []).append(method_label(name))
+    return [f"No pair accuracy of {', '.join(names)}: {why}." for why, names in reasons.items()]
 
 
 def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:

@@ -8,8 +8,9 @@ from retrieval.errors import ConfigError
 if TYPE_CHECKING:
     from retrieval.evaluation.real.protocol import Protocol
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 PROTOCOLS = {
+    "vt60-choices": "retrieval.evaluation.real.vt60:CHOICES",
     "vt60-seen-classes": "retrieval.evaluation.real.vt60:SEEN_CLASSES",
     "vt60-random": "retrieval.evaluation.real.vt60:RANDOM",
     "vt60-classes": "retrieval.evaluation.real.vt60:CLASSES",

@@ -3,6 +3,7 @@
 import numpy as np
 
 from retrieval.data.dataset import Split
+from retrieval.evaluation.calibrate import MIN_THRESHOLD_OBJECTS
 from retrieval.evaluation.real.protocol import Facts, Protocol, fold, registered
 
 _OBJECTS, _TEST = 98, 18
@@ -13,14 +14,14 @@ def _paper(facts: Facts, seed: int) -> list[Split]:
     rng = np.random.default_rng(37)
     names = [facts.names[place] for place in rng.permutation(len(facts.names))[:_OBJECTS]]
     tested = max(2, round(_TEST / _OBJECTS * len(names)))
-    return [fold(names[tested:], names[:tested], (seed, 0))]
+    return [fold(names[tested:], names[:tested], (seed, 0), MIN_THRESHOLD_OBJECTS)]
 
 
 PAPER = Protocol(
     "feeling-of-success",
     "The Feeling of Success, as the paper asks",
-    "98 objects by lot, of which 18 test and 80 train (five of these choose settings); grasps that held. A touch is "
-    "never shown the photo of its own grasp.",
+    "98 objects by lot, of which 18 test and 80 train (ten of these choose settings and the threshold of pairs); "
+    "grasps that held. A touch is never shown the photo of its own grasp.",
     _paper,
     registered("guesses_k5", "guesses_k10", "pair_accuracy", "pair_auc"),
     anchors=(

@@ -1,5 +1,6 @@
 """From the predictions of one fold to its measures: the galleries of the protocol, then one measure of all of them."""
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -10,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.evaluation.calibrate import calibrate_pairs
+from retrieval.evaluation.calibrate import KWayTest, drawn_choices, pair_rule, stated_first_guesses
 from retrieval.evaluation.real.protocol import Facts, Protocol
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.evaluation.shown import Shown
@@ -20,16 +23,21 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import Scored
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.checkpoint import read_tensors, write_tensors
+from retrieval.model.posterior import Posterior
+
+QUARTILES = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
     """What came out of one fold: measures by name, whose owners are numbers in `Units`; chosen: what the method chose;
-    examples: best and worst queries."""
+    examples: best and worst queries. stated (Q, 2): of each query with a posterior, the probability of the first guess
+    and the share of it that is right."""
 
     measures: Mapping[str, Measure]
     chosen: Mapping[str, Any]
     examples: Mapping[str, Any]
+    stated: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,22 +55,51 @@ class Units:
         return cls(names, {name: names.index(unit) for name, unit in unit_of.items()})
 
 
-def measure(judged: MethodScores, protocol: Protocol, facts: Facts, units: Units, grasp_ids: Sequence[str]) -> Measured:
-    """The measures of one fold by one method. Raises BadInput where its main measure cannot be taken."""
-    objects = judged.queries.objects
+def quartile_name(measure: str, quartile: int) -> str:
+    """The name of a measure of one quartile of contact, 1 to `QUARTILES`."""
+    return f"{measure}_contact{quartile}"
+
+
+def contact_quartiles(contact: NDArray[np.float64], owner: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(Q,) quartile of each touch, 1 (weakest contact) to 4, within its object; equals in the order given.
+
+    contact (Q,): how much a touch changes the gel image; owner (Q,): the object of each. Quartiles are of each object,
+    so that all hold the same objects.
+    """
+    found = np.empty(len(contact), np.int64)
+    for name in np.unique(owner):
+        rows = np.flatnonzero(owner == name)
+        found[rows[np.argsort(contact[rows], kind="stable")]] = 1 + np.arange(len(rows)) * QUARTILES // len(rows)
+    return found
+
+
+def measure(
+    judged: MethodScores,
+    protocol: Protocol,
+    facts: Facts,
+    split: Split,
+    grasp_ids: Sequence[str],
+    contact: Mapping[str, float] | None = None,
+) -> Measured:
+    """The measures of one fold by one method; of its main measure also those of each quartile of contact, where
+    `contact` says how much each grasp changes the gel image. Raises BadInput where its main measure cannot be taken."""
+    objects, units = judged.queries.objects, Units.of(facts, protocol)
 
     def shown(table: ScoreTable) -> ScoreTable:
         return table.with_own() if protocol.own_photos else table
 
-    calibration = calibrate_pairs(shown(judged.touches("validation", "validation")), seed=judged.seed)
+    validation = shown(judged.touches("validation", "validation"))
+    rule = pair_rule(judged.predictions.chosen, validation, seed=judged.seed).rule
     whole = shown(judged.touches("test", "test"))
     sets = {size: shown(table) for size, table in judged.sets("test").items()}
-    sequence_of = [facts.sequence_of[name] for name in objects] if protocol.by_sequence else [""] * len(objects)
+    gallery_of = protocol.gallery_of(facts, split)
     found: dict[str, list[Measure]] = {}
     shown_ids = judged.ids(grasp_ids, "test")
     queries: dict[str, list[Any]] = {"best": [], "worst": []}
-    for sequence in sorted({sequence_of[number] for number in whole.objects}):
-        mine = np.array([one == sequence for one in sequence_of])
+    stated = [np.empty((0, 2))]
+    levels = np.array([contact[name] for name in shown_ids[0]]) if contact else None
+    for one in sorted(set(gallery_of.values())):
+        mine = np.array([gallery_of.get(name) == one for name in objects])
         gallery = _of(whole, mine)
         ids = (
             list(compress(*pair))
@@ -70,12 +107,20 @@ def measure(judged: MethodScores, protocol: Protocol, facts: Facts, units: Units
         )
         for kind, some in Shown(gallery, objects, *ids).examples(one_of_each=True).items():
             queries[kind] += some
-        scored = Scored(
-            gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, calibration, judged.seed
-        )
+        scored = Scored(gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, rule, judged.seed)
         for name, metric in protocol.measures.items():
             if (taken := metric.take(scored)) is not None:
                 found.setdefault(name, []).append(taken)
+        if levels is not None:
+            quartiles = contact_quartiles(levels[mine[whole.touch_owner]], gallery.touch_owner)
+            for quartile in range(1, QUARTILES + 1):
+                part = dataclasses.replace(scored, test=gallery.select(quartiles == quartile, np.arange(len(gallery.photo_owner))))
+                if (taken := protocol.measures[protocol.main].take(part)) is not None:
+                    found.setdefault(quartile_name(protocol.main, quartile), []).append(taken)
+        if "posterior" in judged.predictions.chosen:
+            posterior = Posterior.from_dict(judged.predictions.chosen["posterior"])
+            candidates = drawn_choices(gallery, KWayTest(len(gallery.objects)), judged.seed, posterior)
+            stated.append(stated_first_guesses(candidates, posterior))
     if protocol.main not in found:
         raise BadInput(
             f"{protocol.title}: a gallery holds {len(whole.objects)} objects, too few for "
@@ -86,6 +131,7 @@ def measure(judged: MethodScores, protocol: Protocol, facts: Facts, units: Units
         {name: pooled(parts, [number] * len(parts)) for name, parts in found.items()},
         judged.predictions.chosen,
         queries,
+        np.concatenate(stated),
     )
 
 
@@ -105,7 +151,7 @@ def digest(made_by: Mapping[str, Any]) -> str:
 
 def write_measured(path: Path, measured: Measured, made_by: str) -> None:
     """Keep the measures of a fold; `made_by` is a digest."""
-    tensors = {
+    tensors = {"stated": torch.from_numpy(measured.stated)} | {
         f"{name}/{part}": torch.from_numpy(np.ascontiguousarray(getattr(found, part)))
         for name, found in measured.measures.items()
         for part in ("values", "owner", "chance")
@@ -134,7 +180,7 @@ def read_measured(path: Path, made_by: str) -> Measured | None:
         )
         for name, gallery in header["galleries"].items()
     }
-    return Measured(measures, header["chosen"], header["examples"])
+    return Measured(measures, header["chosen"], header["examples"], tensors["stated"].numpy())
 
 
 def joined(folds: Sequence[Measured]) -> dict[str, Measure]:

@@ -69,7 +69,9 @@ class Protocol:
     them by lot, or has one photo of an object). by_sequence: a gallery holds the objects of one sequence, and sequences
     are what intervals resample. counted: a measure of right and wrong answers alone, which are counted too, with an
     exact binomial interval. anchors: what others reached, a sentence each. entry: what an object's entries in the
-    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.references`).
+    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.references`). galleries: the gallery
+    in which each test object of a split stands, where there are several. choices: every fold is another choice of test
+    objects, which share objects with those of others; values are means over the folds, and intervals cover the choice.
     """
 
     data_set: str
@@ -82,6 +84,14 @@ class Protocol:
     counted: str | None = None
     anchors: tuple[str, ...] = ()
     entry: str = PHOTO
+    galleries: Callable[[Facts, Split], Mapping[str, str]] | None = None
+    choices: bool = False
+
+    def gallery_of(self, facts: Facts, split: Split) -> Mapping[str, str]:
+        """The name of the gallery in which each test object of a split stands."""
+        if self.galleries:
+            return self.galleries(facts, split)
+        return {name: facts.sequence_of[name] if self.by_sequence else "" for name in split.test}
 
     @property
     def main(self) -> str:
@@ -89,11 +99,11 @@ class Protocol:
         return next(iter(self.measures))
 
 
-def fold(rest: Sequence[str], test: Sequence[str], seed: Sequence[int]) -> Split:
-    """A split that tests on `test`; of the other objects `CHOOSING`, or a quarter where that is fewer, validate, and
+def fold(rest: Sequence[str], test: Sequence[str], seed: Sequence[int], choosing: int = CHOOSING) -> Split:
+    """A split that tests on `test`; of the other objects `choosing`, or a quarter where that is fewer, validate, and
     the rest train."""
     order = np.random.default_rng([*seed, 17]).permutation(len(rest))
-    count = max(2, min(CHOOSING, len(rest) // 4))
+    count = max(2, min(choosing, len(rest) // 4))
     return Split(
         seed=seed[0],
         train=tuple(sorted(rest[place] for place in order[count:])),

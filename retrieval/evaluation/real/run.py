@@ -10,18 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from indexes.store.files import write_atomically
+from indexes.store.regular import read_json
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.errors import BadInput, Interrupted
 from retrieval.evaluation.experiment import Experiment
+from retrieval.evaluation.faint import change
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.real import SCHEMA_VERSION, load_protocol
 from retrieval.evaluation.real.controls import CONTROL_METHOD, CONTROLS, by_clock, why_not_untouched
-from retrieval.evaluation.real.measuring import Measured, Units, digest, joined, measure, read_measured, write_measured
+from retrieval.evaluation.real.measuring import Measured, digest, joined, measure, read_measured, write_measured
 from retrieval.evaluation.real.protocol import PHOTO, Facts, Protocol, read_facts
 from retrieval.evaluation.real.references import FITTED, referenced, references_of, shown_by_references
 from retrieval.evaluation.real.towers import Row, Towers
-from retrieval.evaluation.real.verdict import control_entry, row_entry
+from retrieval.evaluation.real.verdict import BySeed, Summing, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import KNOW_NOTHING, require_known
 from retrieval.model.config import Config
@@ -149,6 +151,25 @@ class _Asked:
     quiet: bool
 
     @cached_property
+    def _contact(self) -> dict[str, float] | None:
+        """How much each grasp changes the gel image, in grey levels; None where frames before the contact are missing.
+        It reads every touch, so it is kept."""
+        grasps = self.all_facts.grasps
+        if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
+            return None
+        path = self.cache / "contact" / f"{data_digest(grasps)[:32]}.json"
+        if path.is_file():
+            return dict(read_json(path))
+        with Bar("compare with untouched", len(grasps), "grasps", quiet=self.quiet) as bar:
+            found = {}
+            for grasp in grasps:
+                found[grasp.grasp_id] = change(grasp)
+                bar.advance()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(found).encode())
+        return found
+
+    @cached_property
     def facts(self) -> Facts:
         """What is known of the grasps that ask: of all, or where reference touches are asked for, of those that have
         one, which then stands in place of their photo."""
@@ -166,7 +187,8 @@ class _Asked:
 
     def entry(self) -> dict[str, Any]:
         """The protocol's entry of results.json."""
-        folds = {seed: self.protocol.folds(self.facts, seed) for seed in self.seeds}
+        seeds = self.seeds[:1] if self.protocol.choices else self.seeds
+        folds = {seed: self.protocol.folds(self.facts, seed) for seed in seeds}
         lines = self._lines()
         found: dict[str, list[list[Measured]]] = {line.key: [] for line in lines}
         count = len(lines) * sum(map(len, folds.values()))
@@ -185,7 +207,7 @@ class _Asked:
             "main": self.protocol.main,
             "labels": [[name, metric.label] for name, metric in self.protocol.measures.items()],
             "entry": self.protocol.entry,
-            "unit": "sequence" if self.protocol.by_sequence else "object",
+            "unit": "choice" if self.protocol.choices else "sequence" if self.protocol.by_sequence else "object",
             "recording": {
                 "data_set": self.protocol.data_set,
                 "source": self.facts.source,
@@ -194,8 +216,8 @@ class _Asked:
                 "grasps": len(self.facts.grasps),
             },
             "folds": [[dataclasses.asdict(split) for split in splits] for splits in folds.values()],
-            "rows": {row.name: self._row(row, found) for row in self.rows},
-            "controls": self._controls(found),
+            "rows": {row.name: self._row(row, found, self._summing(folds)) for row in self.rows},
+            "controls": self._controls(found, self._summing(folds)),
             "examples": self._examples(found),
         }
 
@@ -216,23 +238,36 @@ class _Asked:
             return "an object is shown by touches"
         return why_not_untouched(self.facts.grasps) if kind == "untouched" else None
 
-    def _row(self, row: Row, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
-        touch = [joined(folds) for folds in found[f"{row.name}-touch"]]
-        blurred = [joined(folds) for folds in found.get(f"{row.name}-blurred", ())]
-        model = row.towers.checkpoint
+    def _summing(self, folds: Mapping[int, Sequence[Split]]) -> Summing:
+        if not self.protocol.choices:
+            return Summing(DRAWS, self.seeds[0])
+        splits = [split for some in folds.values() for split in some]
+        test = sum(len(split.test) for split in splits)
+        return Summing(DRAWS, self.seeds[0], test / sum(len(split.train + split.validation) for split in splits))
+
+    def _taken(self, folds_of: Sequence[Sequence[Measured]]) -> BySeed:
+        """Measures by seed, over all its folds; of a protocol of choices those of each fold."""
+        if self.protocol.choices:
+            return [joined([one]) for folds in folds_of for one in folds]
+        return [joined(folds) for folds in folds_of]
+
+    def _row(self, row: Row, found: Mapping[str, list[list[Measured]]], summing: Summing) -> dict[str, Any]:
+        lines = (f"{row.name}-touch", f"{row.name}-blurred", "order")
+        touch, blurred, order = (self._taken(found.get(key, ())) for key in lines)
+        model, mine = row.towers.checkpoint, found[lines[0]]
         return {
             "method": row.method,
             "model": model.digest if model else None,
-            **row_entry(self.protocol, touch, blurred, draws=DRAWS, seed=self.seeds[0]),
-            "chosen": [[one.chosen for one in folds] for folds in found[f"{row.name}-touch"]],
+            **row_entry(self.protocol, touch, blurred, order, summing),
+            "reliability": reliability_entry([one.stated for folds in mine for one in folds]),
+            "chosen": [[one.chosen for one in folds] for folds in mine],
         }
 
-    def _controls(self, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
+    def _controls(self, found: Mapping[str, list[list[Measured]]], summing: Summing) -> dict[str, Any]:
         entries: dict[str, Any] = {}
         for kind, what in CONTROLS.items():
-            taken = [joined(folds) for folds in found.get(kind, ())]
-            why = self._why_not(kind)
-            entries[kind] = control_entry(self.protocol, what, why, taken, draws=DRAWS, seed=self.seeds[0])
+            taken = self._taken(found.get(kind, ()))
+            entries[kind] = control_entry(self.protocol, what, self._why_not(kind), taken, summing)
         return entries
 
     def _examples(self, found: Mapping[str, list[list[Measured]]]) -> dict[str, Any]:
@@ -255,7 +290,11 @@ class _Asked:
             {
                 "protocol": self.name,
                 "measures": list(self.protocol.measures),
-                "shown": [self.protocol.own_photos, self.protocol.by_sequence],
+                "shown": [
+                    self.protocol.own_photos,
+                    self.protocol.by_sequence,
+                    self.protocol.gallery_of(self.facts, split),
+                ],
                 "line": [line.key, line.method],
                 "features": features.digest,
                 "split": split.to_dict(),
@@ -284,8 +323,7 @@ class _Asked:
         )
         experiment.predict(line.method, seed)
         judged = MethodScores(experiment.queries, experiment.predictions(line.method, seed), seed)
-        units = Units.of(self.facts, self.protocol)
-        measured = measure(judged, self.protocol, self.facts, units, features.grasp_ids)
+        measured = measure(judged, self.protocol, self.facts, split, features.grasp_ids, self._contact)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_measured(path, measured, made_by)
         shutil.rmtree(work)

@@ -1,68 +1,133 @@
-"""Summing up over seeds: values with intervals, what is left when touches are blurred, and whether that is touch."""
+"""Summing up: values with intervals, paired differences from the controls, and whether a result counts as touch."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from retrieval.evaluation.real.protocol import Protocol
 from retrieval.metrics.binomial import clopper_pearson
+from retrieval.metrics.choices import compare_choices, summarise_choices
 from retrieval.metrics.intervals import LEVEL, compare, summarise
 from retrieval.metrics.measure import Measure
 
 RULE = (
-    "A result counts as touch only where its first measure beats that of the same method on blurred touches by more "
-    "than the difference's interval."
+    "A result counts as touch only where its first measure beats two controls, each by more than the interval of the "
+    "paired difference: the same method on blurred touches, and the order of capture in place of the touch."
 )
+CONTROL_NAMES = {"differences": "the blurred control", "order_differences": "the order of capture"}
+"""Key of a row's paired differences -> what the control is called."""
+STATED_BINS = 10
 
 BySeed = Sequence[Mapping[str, Measure]]
 
 
-def row_entry(protocol: Protocol, touch: BySeed, blurred: BySeed, *, draws: int, seed: int) -> dict[str, Any]:
-    """The numbers of a row: measures of touches, of blurred touches, the paired differences, and the verdict.
+@dataclass(frozen=True)
+class Summing:
+    """How measures become numbers: over seeds, intervals resampling objects; or over choices of test objects.
 
-    blurred is empty for a method that looks at nothing, which has no verdict.
+    ratio: test objects of a choice for each training object; None: measures are those of seeds.
     """
-    measures = _summaries(touch, draws, seed)
-    entry: dict[str, Any] = {"measures": measures, "blurred": None, "differences": None, "verdict": None}
+
+    draws: int
+    seed: int
+    ratio: float | None = None
+
+    def summaries(self, taken: BySeed) -> dict[str, Any]:
+        """Values with intervals, by name; those that all have."""
+        return {name: self._summary([one[name] for one in taken]) for name in _shared(taken)}
+
+    def differences(self, a: BySeed, b: BySeed) -> dict[str, Any]:
+        """Paired differences `a` - `b`, by name."""
+        names = [name for name in _shared(a) if name in _shared(b)]
+        return {name: self._difference([one[name] for one in a], [one[name] for one in b]) for name in names}
+
+    def _summary(self, measures: Sequence[Measure]) -> dict[str, Any]:
+        if self.ratio is not None:
+            return summarise_choices(measures, self.ratio)
+        return summarise(measures, draws=self.draws, seed=self.seed)
+
+    def _difference(self, a: Sequence[Measure], b: Sequence[Measure]) -> dict[str, Any]:
+        if self.ratio is not None:
+            return compare_choices(a, b, self.ratio)
+        return compare(a, b, draws=self.draws, seed=self.seed)
+
+
+def _shared(taken: BySeed) -> list[str]:
+    return [name for name in taken[0] if all(name in one for one in taken)]
+
+
+def row_entry(protocol: Protocol, touch: BySeed, blurred: BySeed, order: BySeed, summing: Summing) -> dict[str, Any]:
+    """The numbers of a row: measures of touches, of blurred touches, paired differences from the controls, verdict.
+
+    blurred is empty for a method that looks at nothing, which has no verdict. order: of the control of that name.
+    """
+    measures = summing.summaries(touch)
+    entry: dict[str, Any] = {"measures": measures, "blurred": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
     entry["counted"] = _counted(touch, protocol.counted)
     if blurred:
-        entry["blurred"] = _summaries(blurred, draws, seed)
-        entry["differences"] = {
-            name: compare([one[name] for one in touch], [one[name] for one in blurred], draws=draws, seed=seed)
-            for name in measures
+        entry["blurred"] = summing.summaries(blurred)
+        entry |= {
+            key: summing.differences(touch, one) for key, one in zip(CONTROL_NAMES, (blurred, order), strict=True)
         }
-        entry["verdict"] = verdict(measures[protocol.main], entry["differences"][protocol.main])
+        entry["verdict"] = verdict(measures[protocol.main], *(entry[key][protocol.main] for key in CONTROL_NAMES))
     return entry
 
 
 def control_entry(
-    protocol: Protocol, what: str, why_not: str | None, taken: BySeed, *, draws: int, seed: int
+    protocol: Protocol, what: str, why_not: str | None, taken: BySeed, summing: Summing
 ) -> dict[str, Any]:
     """The numbers of a control, or why there are none."""
     return {
         "what": what,
         "why_not": why_not,
-        "measures": _summaries(taken, draws, seed) if taken else None,
+        "measures": summing.summaries(taken) if taken else None,
         "counted": _counted(taken, protocol.counted),
     }
 
 
-def verdict(summary: Mapping[str, Any], difference: Mapping[str, Any]) -> dict[str, Any]:
-    """Whether a row's main measure counts as touch, and why, in words."""
-    counts = difference["low"] > 0
+def verdict(summary: Mapping[str, Any], *differences: Mapping[str, Any]) -> dict[str, Any]:
+    """Whether a row's main measure counts as touch, and why, in words.
+
+    differences: paired, from each control of `CONTROL_NAMES` in turn; all must lie above 0 with their whole interval.
+    """
+    counts = all(one["low"] > 0 for one in differences)
+    found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=True)]
+    words = f"{'counts' if counts else 'does not count'} as touch: {'; '.join(found)}"
+    above = summary["low"][0] > summary["chance"][0]
+    return {"counts_as_touch": counts, "above_chance": bool(above), "words": words}
+
+
+def _against(difference: Mapping[str, Any], control: str) -> str:
     by, low, high = (100 * difference[key] for key in ("difference", "low", "high"))
     points = f"{by:+.1f} points [{low:+.1f}, {high:+.1f}]"
-    above = summary["low"][0] > summary["chance"][0]
-    if counts:
-        words = f"counts as touch: {points} over the blurred control"
-    elif difference["high"] < 0:
-        words = f"does not count as touch: {points} below the blurred control"
-    else:
-        words = f"does not count as touch: {points} against the blurred control, an interval that holds 0"
-    return {"counts_as_touch": bool(counts), "above_chance": bool(above), "words": words}
+    if low > 0:
+        return f"{points} over {control}"
+    if high < 0:
+        return f"{points} below {control}"
+    return f"{points} against {control}, an interval that holds 0"
 
 
-def _summaries(by_seed: BySeed, draws: int, seed: int) -> dict[str, Any]:
-    return {name: summarise([found[name] for found in by_seed], draws=draws, seed=seed) for name in by_seed[0]}
+def reliability_entry(stated: Sequence[NDArray[np.float64]]) -> list[dict[str, Any]]:
+    """Whether stated probabilities of first guesses came true: {"from", "to", "stated", "true", "count"} by bins of .1,
+    empty ones left out.
+
+    stated: for each fold (Q, 2), the probability and the share that is right.
+    """
+    said, right = np.concatenate(stated).T
+    which = np.minimum((said * STATED_BINS).astype(int), STATED_BINS - 1)
+    return [
+        {
+            "from": place / STATED_BINS,
+            "to": (place + 1) / STATED_BINS,
+            "stated": float(said[which == place].mean()),
+            "true": float(right[which == place].mean()),
+            "count": int((which == place).sum()),
+        }
+        for place in np.unique(which).tolist()
+    ]
 
 
 def _counted(by_seed: BySeed, name: str | None) -> dict[str, Any] | None:

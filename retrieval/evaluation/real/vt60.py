@@ -2,6 +2,7 @@
 and 02_bottleempty are the same things, and no photo tells them apart."""
 
 from collections import defaultdict
+from itertools import combinations
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from retrieval.evaluation.real.protocol import BOTH, REFERENCE, Facts, Protocol,
 
 LEFT_OUT = "bottlefull"
 GALLERY = 9
+DRAWN_CHOICES = 9
 _CLASSES_OF_A_FOLD = 3
 _MEASURES = {
     **first_guess(GALLERY),
@@ -53,6 +55,27 @@ def _seen_classes(facts: Facts, seed: int) -> list[Split]:
     return folds([name for names in classes.values() for name in names], tests, seed)
 
 
+def _choices(facts: Facts, seed: int) -> list[Split]:
+    """Two instances of every class: all pairs of instance numbers, the same in every class, then seeded draws."""
+    classes = by_class(facts)
+    rng = np.random.default_rng([seed, 31])
+    least = min(map(len, classes.values()))
+    tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(least), 2)]
+    for _ in range(DRAWN_CHOICES):
+        tests.append([name for names in classes.values() for name in rng.choice(names, 2, replace=False).tolist()])
+    return folds([name for names in classes.values() for name in names], tests, seed)
+
+
+def _one_of_each_class(facts: Facts, split: Split) -> dict[str, str]:
+    """Galleries of one test object of each class: the first of each, the second, and so on."""
+    test = set(split.test)
+    return {
+        name: f"instance {place}"
+        for names in by_class(facts).values()
+        for place, name in enumerate(name for name in names if name in test)
+    }
+
+
 def _random(facts: Facts, seed: int) -> list[Split]:
     names = [name for members in by_class(facts).values() for name in members]
     order = [names[place] for place in np.random.default_rng([seed, 19]).permutation(len(names))]
@@ -77,6 +100,19 @@ SEEN_CLASSES = Protocol(
     _seen_classes,
     _MEASURES,
     own_photos=True,
+)
+CHOICES = Protocol(
+    "vt60",
+    "VT60: two unseen instances of each class, over choices of them",
+    "A fold tests two instances of each of nine classes and learns from the others. All pairs of instance numbers are "
+    f"held out, the same in every class, and {DRAWN_CHOICES} seeded draws of two instances in each class. A gallery "
+    "holds one test object of each class, and both galleries are asked. 08_bottlefull is left out, which is "
+    "02_bottleempty filled. Settings are chosen within the training objects of each fold.",
+    _choices,
+    _MEASURES,
+    own_photos=True,
+    galleries=_one_of_each_class,
+    choices=True,
 )
 RANDOM = Protocol(
     "vt60",
