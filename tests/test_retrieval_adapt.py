@@ -2,12 +2,14 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import retrieval
+from retrieval.adaptation import folds
 from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, tell_apart
@@ -17,7 +19,9 @@ from retrieval.commands.main import main
 from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.methods.cca_towers import GRID, Affine, CcaSettings, fit_codes
+from retrieval.methods import cca_towers
+from retrieval.methods.cca_towers import GRID, Affine, CcaSettings, choose, fit_codes
+from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
@@ -89,6 +93,62 @@ def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(reco
     few = [grasp for grasp in grasps if grasp.object_id in names[:5]]
     with pytest.raises(BadInput, match="6 objects or more"):
         draw_folds(few, 0)
+
+
+def hidden_in(features, names, seed):
+    """The same grasps, those of `names` replaced by noise."""
+    rng, rows = np.random.default_rng(seed), np.isin(features.object_ids, names)
+    touch, photo = features.touch.copy(), features.photo.copy()
+    touch[rows], photo[rows] = (rng.standard_normal(part[rows].shape) for part in (touch, photo))
+    return dataclasses.replace(features, touch=touch, photo=photo)
+
+
+def test_a_fold_that_is_left_out_chooses_no_settings_and_teaches_nothing(monkeypatch):
+    touch, photo, owner = seen_alike(objects=24)
+    names = tuple(f"object-{number:02}" for number in owner)
+    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+    material = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
+    asked = []
+    monkeypatch.setattr(folds, "choose", lambda *given: asked.append(given) or choose(*given))
+
+    def fit(shown):
+        return list(folds.fit_folds(shown, drawn, material, seed=0, what="touches", quiet=True))
+
+    for fold, (shown, _, inner) in zip(fit(features), asked, strict=False):
+        assert not set(fold.left_out.object_ids) & {*shown.object_ids, *(name for part in inner for name in part)}
+    first = fit(features)[0]
+    noise, other = (fit(hidden_in(features, drawn[0], seed))[0] for seed in range(2))
+    for found in (noise, other):
+        assert found.settings == first.settings
+        np.testing.assert_array_equal(found.codes.touch.weight, first.codes.touch.weight)
+    # The objects that do teach matter, so that the same assertion can fail.
+    taught = fit(hidden_in(features, drawn[1], 0))[0]
+    assert not np.array_equal(taught.codes.touch.weight, first.codes.touch.weight)
+
+
+def test_a_setting_that_is_best_on_the_left_out_fold_alone_is_not_chosen(monkeypatch):
+    """Planted: one setting ranks the objects of one fold perfectly and all others not at all."""
+    touch, photo, owner = seen_alike(objects=24)
+    names = tuple(f"object-{number:02}" for number in owner)
+    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+    material = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
+    planted, plain = GRID[0], GRID[-1]
+    current = []
+    fit = cca_towers._fit
+    monkeypatch.setattr(cca_towers, "_fit", lambda *given: (current.append(one[0]) or one for one in fit(*given)))
+    monkeypatch.setattr(
+        Validator,
+        "touches",
+        lambda self, _: float(
+            current[-1] == planted if set(self.features.object_ids) <= set(drawn[0]) else current[-1] == plain
+        ),
+    )
+    found = list(folds.fit_folds(features, drawn, material, seed=0, what="touches", quiet=True))
+    assert found[0].settings == plain
+    # Had the fold been asked, the planted setting would have been chosen.
+    assert choose(features, ([12], [10]), drawn[:1]).settings == planted
 
 
 def test_places_of_hand_made_scores():

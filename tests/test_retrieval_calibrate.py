@@ -14,10 +14,12 @@ from retrieval.evaluation.calibrate import (
     calibrate_pairs,
     drawn_choices,
     drawn_pairs,
+    pair_rule,
     questions,
     reliability,
 )
 from retrieval.metrics.pairs import fit_calibration
+from retrieval.metrics.protocols import pair_accuracy
 from retrieval.metrics.reliability import reliability_bins
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
@@ -45,6 +47,37 @@ def sets_of(table, grasps, shared, seed=0):
     common = np.sqrt(2 * shared) * rng.normal(size=signs.shape) * grasps
     single = np.sqrt(2 * (1 - shared) * grasps) * rng.normal(size=signs.shape)
     return table_of(grasps * signs + common + single, owner)
+
+
+# Which pairs are matches -----------------------------------------------------------------------------------
+
+
+def test_no_threshold_is_fitted_on_fewer_than_ten_objects_and_the_reason_is_said():
+    found = pair_rule({}, planted(objects=9))
+    assert found.rule is None
+    assert found.to_dict() == {
+        "at": None,
+        "from": None,
+        "why_not": "pair accuracy needs a threshold: a checkpoint's own, or one fitted on 10 validation objects; "
+        "there are 9",
+    }
+
+
+def test_of_ten_objects_a_threshold_is_fitted_where_the_log_odds_are_0():
+    table = planted(objects=10)
+    found = pair_rule({}, table)
+    assert found.rule == calibrate_pairs(table)
+    assert found.to_dict()["from"] == "validation objects"
+    assert found.rule.log_odds(found.to_dict()["at"]) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_checkpoints_own_threshold_goes_before_one_that_validation_objects_would_give():
+    for objects in (2, 20):
+        found = pair_rule({"pair_threshold": 1.5}, planted(objects=objects))
+        assert found.to_dict() == {"at": 1.5, "from": "the checkpoint", "why_not": None}
+        # By hand: a match scores above 1.5, exactly 1.5 is a coin.
+        table = table_of([[9, 2.0], [1.5, 1]], [0, 1], own=np.zeros((2, 2), bool))
+        assert pair_accuracy(table, found.rule).values.ravel().tolist() == [(1 + 0) / 2, (0 + 0.5) / 2]
 
 
 # What is drawn ---------------------------------------------------------------------------------------------

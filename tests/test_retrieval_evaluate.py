@@ -20,6 +20,7 @@ from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.run import evaluate
 from retrieval.methods.base import Method
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.report.evaluation import write_report
 from retrieval.training.features import Features
 from retrieval.training.train import Trainer, train
 from tests import synthetic
@@ -106,13 +107,22 @@ def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_
 
 def test_each_measure_has_its_interval_and_ten_candidates_need_ten_objects(made):
     for method in made[0]["methods"].values():
-        assert {"pair_accuracy", "pair_auc", "guesses_k5", "guesses_k5_g1_p3", "map", "paired_top1"} <= set(
-            method["measures"]
-        )
+        assert {"pair_auc", "guesses_k5", "guesses_k5_g1_p3", "map", "paired_top1"} <= set(method["measures"])
         assert "guesses_k10" not in method["measures"]
         for summary in method["measures"].values():
             parts = {"value", "low", "high", "chance", "queries", "objects", "few_objects", "gallery", "by_seed"}
             assert parts == set(summary)
+
+
+def test_four_validation_objects_give_no_threshold_and_pair_accuracy_is_missing_with_the_reason(made):
+    results, folder = made
+    why = "one fitted on 10 validation objects; there are 4"
+    for method in results["methods"].values():
+        assert "pair_accuracy" not in method["measures"]
+        assert method["pair_threshold"]["why_not"].endswith(why)
+    assert not any("pair_accuracy" in one["measures"] for one in results["controls"].values())
+    write_report(folder, None)
+    assert f"{why}." in (folder / "report.md").read_text()
 
 
 def test_a_method_that_says_nothing_is_exactly_at_chance_in_every_measure(made):
@@ -311,9 +321,17 @@ def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run,
     assert no_fits_of_heads == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
     assert results["split"] == {**model.split.to_dict(), "from": "the model's own"}
     assert results["setting"]["model"] == model.digest
+    own = -model.posterior.offset / model.posterior.slope  # where slope * logit + offset is 0
     assert results["methods"]["late_fusion"]["chosen"] == [
-        {"step": model.provenance["step"], **model.provenance["metrics"]}
+        {"step": model.provenance["step"], **model.provenance["metrics"], "pair_threshold": pytest.approx(own)}
     ]
+    assert results["methods"]["late_fusion"]["pair_threshold"] == {
+        "at": pytest.approx(own), "from": "the checkpoint", "why_not": None
+    }  # fmt: skip
+    assert "pair_accuracy" in results["methods"]["late_fusion"]["measures"]
+    assert results["methods"]["cca"]["pair_threshold"]["from"] is None  # there are four validation objects
+    assert "pair_accuracy" not in results["methods"]["cca"]["measures"]
+    assert all(one["measure"] != "pair_accuracy" for one in results["comparisons"])
     times = json.loads((tmp_path / "out" / "timings.json").read_text())["methods"]
     assert times["late_fusion"]["fit_s"] is None  # nobody measured it
     assert times["cca"]["fit_s"] > 0

@@ -1,12 +1,15 @@
-"""Which objects are held out together: half of each kind, so that none is judged with all of its kind known."""
+"""Which objects are held out together: half of each kind, so that some of its look-alikes train and some do not."""
+
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from retrieval.methods.held_out import grouped, held_out_folds, look_alikes
+from retrieval.methods.held_out import by_looks, held_out_folds
 from retrieval.training.features import Features
 
 KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]
+NAMES = sorted(name for kind in KINDS for name in kind)
 
 
 def photographed(kinds, noise=0.3, seed=0):
@@ -24,41 +27,48 @@ def photographed(kinds, noise=0.3, seed=0):
     return Features(ids, tuple(names), np.zeros((len(names), 1, 1), np.float32), np.array(photos, np.float32))
 
 
-def test_objects_that_look_alike_are_grouped_though_nobody_names_their_kind():
-    assert sorted(map(sorted, look_alikes(photographed(KINDS)))) == KINDS
+@pytest.mark.parametrize("named", [False, True])
+def test_half_of_each_kind_is_held_out_together_though_nobody_names_the_kinds(named):
+    kind_of = {name: name[0] for name in NAMES} if named else None
+    folds = held_out_folds(photographed(KINDS), kind_of)
+    assert sorted(name for fold in folds for name in fold) == NAMES
+    assert list(map(len, folds)) == [9, 9, 9, 9]
+    shares = [sorted(len(set(kind) & set(fold)) for fold in folds) for kind in KINDS]
+    assert shares.count([0, 0, 2, 2]) == 8  # of four look-alikes two are held out, two train
+    assert shares.count([1, 1, 1, 1]) == 1  # and the kind in the middle, which the chunks cut
 
 
-def test_few_objects_are_one_group():
-    assert look_alikes(photographed([["a", "b", "c"]])) == [["a", "b", "c"]]
+def test_objects_that_look_alike_are_neighbours():
+    order = by_looks(photographed(KINDS))
+    assert sorted(order) == NAMES
+    assert sum(one[0] != other[0] for one, other in pairwise(order)) == len(KINDS) - 1
 
 
-def test_objects_that_nobody_names_a_group_of_stand_alone():
-    assert grouped("abcd", {"a": 1, "c": 1}) == [["a", "c"], ["b"], ["d"]]
+def test_kinds_that_are_named_go_before_looks_and_a_kind_that_is_missing_for_one_object_counts_for_none():
+    crossed = {name: name[1] for name in NAMES}  # not what the photos show
+    seen = photographed(KINDS)
+    parts = held_out_folds(seen, crossed)
+    assert {sum(name[1] == number for fold in parts[:2] for name in fold) for number in "0123"} <= {4, 5}
+    assert held_out_folds(seen, {name: name[1] for name in NAMES[1:]}) == held_out_folds(seen)
 
 
-@pytest.mark.parametrize("size", [6, 9, 18])
-@pytest.mark.parametrize("seed", range(5))
-def test_half_of_each_kind_is_held_out_together_while_the_other_half_teaches(size, seed):
-    folds = held_out_folds(KINDS, size, seed)
-    assert sorted(name for fold in folds for name in fold) == sorted(name for kind in KINDS for name in kind)
-    assert len(folds) == 36 // size
-    assert max(map(len, folds)) - min(map(len, folds)) <= 4
-    for kind in KINDS:
-        assert sorted(len(set(kind) & set(fold)) for fold in folds if set(kind) & set(fold)) == [2, 2]
-
-
-def test_of_an_odd_kind_the_larger_half_is_held_out_together():
-    folds = held_out_folds([["a1", "a2", "a3"], ["b"], ["c1", "c2"]], 3, 0)
-    assert sorted(len({"a1", "a2", "a3"} & set(fold)) for fold in folds) == [1, 2]
-    assert sorted(len({"c1", "c2"} & set(fold)) for fold in folds) == [1, 1]
+def test_kinds_of_odd_numbers_even_out_over_the_held_out_folds():
+    kinds = [["a1", "a2", "a3"], ["b1"], ["c1", "c2", "c3"], ["d1"]]
+    parts = held_out_folds(photographed(kinds), {name: name[0] for kind in kinds for name in kind})
+    assert list(map(len, parts)) == [4, 4]
+    assert {sum(name[0] == "a" for name in part) for part in parts} == {1, 2}
 
 
 def test_objects_of_one_sequence_stay_together_though_they_are_of_two_kinds():
-    for seed in range(5):
-        folds = held_out_folds(KINDS, 9, seed, linked=[["a0", "b3"]])
-        assert any({"a0", "b3"} <= set(fold) for fold in folds)
-        assert sorted(name for fold in folds for name in fold) == sorted(name for kind in KINDS for name in kind)
+    parts = held_out_folds(photographed(KINDS), linked=[["a0", "b3"]])
+    assert any({"a0", "b3"} <= set(part) for part in parts)
+    assert sorted(name for fold in parts for name in fold) == NAMES
 
 
-def test_the_seed_draws_other_halves():
-    assert held_out_folds(KINDS, 9, 0) == held_out_folds(KINDS, 9, 0) != held_out_folds(KINDS, 9, 1)
+def test_the_seed_draws_other_held_out_folds_of_named_kinds():
+    seen, kind_of = photographed(KINDS), {name: name[0] for name in NAMES}
+    assert held_out_folds(seen, kind_of) == held_out_folds(seen, kind_of) != held_out_folds(seen, kind_of, seed=1)
+
+
+def test_two_objects_are_a_half_each():
+    assert held_out_folds(photographed([["a", "b"]])) == [("a",), ("b",)]

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput, ConfigError, NumericalError
-from retrieval.methods import METHODS, build_method
+from retrieval.methods import METHODS, build_method, cca_towers
 from retrieval.methods.base import Method, Setting
-from retrieval.methods import cca_towers
 from retrieval.methods.cca_towers import GRID, CcaSettings, blocks_of, choose, fit_codes
 from retrieval.methods.selection import Validator, judged_rows, neighbours, ranking_auc
 from retrieval.methods.standardise import Standardiser

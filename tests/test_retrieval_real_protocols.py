@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from retrieval.data.dataset import Grasp, Split
-from retrieval.errors import ConfigError, DatasetError
+from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS, load_protocol
 from retrieval.evaluation.real.controls import by_clock, clock, why_not_untouched
+from retrieval.evaluation.real.measuring import contact_quartiles
 from retrieval.evaluation.real.protocol import Facts
 from retrieval.evaluation.real.references import ASKED, references_of, shown_by_references, with_references
-from retrieval.evaluation.real.verdict import verdict
+from retrieval.evaluation.real.verdict import reliability_entry, verdict
+from retrieval.metrics.choices import compare_choices, summarise_choices
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features
 
@@ -38,6 +40,7 @@ def billets():
 
 
 MADE = {
+    "vt60-choices": vt60(),
     "vt60-seen-classes": vt60(),
     "vt60-random": vt60(),
     "vt60-classes": vt60(),
@@ -75,8 +78,41 @@ def test_no_object_stands_in_two_parts_and_two_objects_at_least_in_each(name):
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_every_seed_tests_the_same_objects_each_once(name):
     tested = [Counter(each for split in folds(name, seed) for each in split.test) for seed in range(3)]
-    assert tested[0] == tested[1] == tested[2]
-    assert set(tested[0].values()) == {1}
+    if load_protocol(name).choices:
+        assert all(set(each) == set(tested[0]) for each in tested)  # each of them, by some choice
+    else:
+        assert tested[0] == tested[1] == tested[2]
+        assert set(tested[0].values()) == {1}
+
+
+def test_choices_hold_out_all_pairs_of_instance_numbers_and_then_drawn_ones():
+    splits = folds("vt60-choices")
+    assert [len(split.test) for split in splits] == [18] * 15
+    assert [len(split.train + split.validation) for split in splits] == [18] * 15
+    numbers = [[{name[-1] for name in split.test}, Counter(name[:-2] for name in split.test)] for split in splits]
+    assert [sorted(one) for one, _ in numbers[:6]] == [list(f"{i}{j}") for i in range(4) for j in range(i + 1, 4)]
+    assert all(set(classes.values()) == {2} for _, classes in numbers)
+    assert len({split.test for split in splits}) == 15
+    assert [split.test for split in folds("vt60-choices", 1)][:6] == [split.test for split in splits[:6]]
+
+
+def test_a_choice_has_two_galleries_of_one_object_of_each_class():
+    protocol = load_protocol("vt60-choices")
+    for split in folds("vt60-choices"):
+        gallery_of = protocol.gallery_of(MADE["vt60-choices"], split)
+        assert set(gallery_of) == set(split.test)
+        for gallery in set(gallery_of.values()):
+            members = [name[:-2] for name in split.test if gallery_of[name] == gallery]
+            assert (len(members), len(set(members))) == (9, 9)
+
+
+def test_a_protocol_without_galleries_of_its_own_has_one_or_one_of_each_sequence():
+    split = folds("vt60-random")[0]
+    assert set(load_protocol("vt60-random").gallery_of(MADE["vt60-random"], split).values()) == {""}
+    places = load_protocol("billets-places")
+    assert set(places.gallery_of(MADE["billets-places"], folds("billets-places")[0]).values()) == {
+        f"welded{number}" for number in range(5)
+    }
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -248,28 +284,82 @@ def test_one_untouched_frame_for_all_and_none_at_all_cannot_stand_in_for_touches
     assert why_not_untouched(with_frames("xxxy")) is None
 
 
+ABOVE = {"difference": 0.1, "low": 0.01, "high": 0.2}
+
+
 @pytest.mark.parametrize(
     ("low", "high", "counts", "words"),
     [
-        (0.01, 0.2, True, "counts as touch: +10.0 points [+1.0, +20.0] over"),
-        (-0.01, 0.2, False, "does not count as touch: +10.0 points [-1.0, +20.0] against the blurred control, an"),
-        (0.0, 0.2, False, "does not count as touch"),
-        (-0.2, -0.01, False, "does not count as touch: +10.0 points [-20.0, -1.0] below"),
+        (0.01, 0.2, True, "+10.0 points [+1.0, +20.0] over"),
+        (-0.01, 0.2, False, "+10.0 points [-1.0, +20.0] against the {}, an interval that holds 0"),
+        (0.0, 0.2, False, "+10.0 points [+0.0, +20.0] against the {}"),
+        (-0.2, -0.01, False, "+10.0 points [-20.0, -1.0] below the {}"),
     ],
 )
-def test_a_result_counts_as_touch_only_where_the_whole_interval_lies_above_the_blurred_control(
-    low, high, counts, words
-):
-    summary = {"low": [0.3], "chance": [0.2]}
-    found = verdict(summary, {"difference": 0.1, "low": low, "high": high})
-    assert found["counts_as_touch"] is counts
-    assert found["words"].startswith(words)
-    assert found["above_chance"]
+def test_a_result_counts_as_touch_only_where_both_whole_intervals_lie_above_0(low, high, counts, words):
+    summary, tried = {"low": [0.3], "chance": [0.2]}, {"difference": 0.1, "low": low, "high": high}
+    for control, found in (
+        ("blurred control", verdict(summary, tried, ABOVE)),
+        ("order of capture", verdict(summary, ABOVE, tried)),
+    ):
+        assert found["counts_as_touch"] is counts
+        assert found["words"].startswith("counts as touch: +10" if counts else "does not count as touch: ")
+        assert words.format(control) in found["words"]
+        assert found["above_chance"]
 
 
 def test_a_value_whose_interval_holds_chance_is_not_above_it():
-    found = verdict({"low": [0.2], "chance": [0.2]}, {"difference": 0.1, "low": 0.01, "high": 0.2})
+    found = verdict({"low": [0.2], "chance": [0.2]}, ABOVE, ABOVE)
     assert not found["above_chance"]
+
+
+def of_choices(*values):
+    """A measure of each choice: its value for two objects that differ from it by .1 either way."""
+    numbers = ((0, 1), (1, 2), (0, 2))
+    return [
+        Measure(np.array([[value - 0.1], [value + 0.1], [value + 0.1]]), np.array([a, b, b]), np.array([0.25]), "four")
+        for value, (a, b) in zip(values, numbers, strict=True)
+    ]
+
+
+def test_an_interval_over_choices_is_that_of_the_corrected_resampled_t_test():
+    found = summarise_choices(of_choices(0.5, 0.6, 0.7), ratio=1.0)
+    # s^2 = .01; (1 / 3 + 1) s^2 = .01333; t of 2 degrees of freedom at .975: 4.30265
+    half = 4.30265 * np.sqrt((1 / 3 + 1) * 0.01)
+    assert found["value"] == [pytest.approx(0.6)]
+    assert found["low"] == [pytest.approx(0.6 - half, abs=1e-5)]
+    assert found["high"] == [1.0]  # .6 + .4968, but a share
+    assert (found["least"], found["most"]) == ([pytest.approx(0.5)], [pytest.approx(0.7)])
+    assert (found["objects"], found["queries"], found["few_objects"]) == (3, 9, True)
+    difference = compare_choices(of_choices(0.5, 0.6, 0.7), of_choices(0.4, 0.4, 0.4), ratio=1.0)
+    assert difference["difference"] == pytest.approx(0.2)
+    assert difference["low"] == pytest.approx(0.2 - half, abs=1e-5)
+    assert (difference["least"], difference["most"]) == (pytest.approx(0.1), pytest.approx(0.3))
+    # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it hold 1 - t / sqrt(t^2 + 2)
+    assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
+    with pytest.raises(BadInput, match="needs two choices at least; got 1"):
+        summarise_choices(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
+
+
+def test_quartiles_of_contact_are_of_each_object_and_equals_go_by_their_order():
+    contact = np.array([5.0, 1, 3, 7, 2, 9, 4, 8, 0.3, 0.1, 0.1])
+    owner = np.array([0] * 8 + [1] * 3)
+    # Of object 0, weakest first: 1 2 | 3 4 | 5 7 | 8 9. Of object 1: .1 (row 9), .1 (row 10), .3.
+    assert contact_quartiles(contact, owner).tolist() == [3, 1, 2, 3, 1, 4, 2, 4, 3, 1, 2]
+
+
+def test_reliability_is_counted_in_bins_of_a_tenth():
+    stated = [
+        {"gallery": np.array([[0.72, 1.0], [0.78, 0.0]]), "all": np.array([[1.0, 1.0]])},
+        {"gallery": np.array([[0.7, 0.5], [0.05, 0.0]])},
+    ]
+    found = reliability_entry(stated)
+    assert list(found) == ["gallery", "all"]
+    low, high = found["gallery"]
+    assert (low["from"], low["count"], low["true"]) == (0.0, 1, 0.0)
+    assert (high["from"], high["to"], high["count"]) == (0.7, 0.8, 3)
+    assert (high["stated"], high["true"]) == (pytest.approx(2.2 / 3), pytest.approx(0.5))
+    assert found["all"] == [{"from": 0.9, "to": 1.0, "stated": 1.0, "true": 1.0, "count": 1}]
 
 
 def test_pooled_galleries_hold_every_query_of_each_under_its_unit():

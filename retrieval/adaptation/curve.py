@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.files import write_atomically
-from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, fit_one, measure
+from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, measure
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import AsItIs
 from retrieval.console.files import MARKED
 from retrieval.console.progress import Bar
-from retrieval.methods.cca_towers import Blocks, CcaSettings
+from retrieval.methods.cca_towers import Blocks, CcaSettings, fit_codes
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
@@ -26,6 +26,8 @@ from retrieval.version import __version__
 
 OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
 """What is tried: so many own objects, of which all outside the fold at most, and so many touches of each."""
+SETTINGS = CcaSettings()
+"""Of every fit on the curve: few objects leave none to choose by."""
 BOTH, TAUGHT, PUBLISHED = "adapted", "towers of the model alone", "published towers alone"
 BLURRED, AS_IT_IS = "adapted, touches blurred", "the model as it is"
 COLOURS = ("#9ecae1", "#56b4e9", "#0072b2", "#08306b")
@@ -67,7 +69,7 @@ def learning_curve(
 
     cache: where the features of that last one are kept. Raises BadInput for fewer than six objects.
     """
-    folds = draw_folds(material.grasps, material.groups, seed)
+    folds = draw_folds(material.grasps, seed)
     features, blocks = material.features, material.blocks
     most = min(len(set(features.object_ids)) - len(fold) for fold in folds)
     held = int(np.bincount(features.owner).min())
@@ -101,8 +103,9 @@ def _point(
         chosen = rng.permutation(sorted(everyone.difference(fold)))[:objects]
         rows = [rng.permutation(np.flatnonzero(features.owner == number_of[name]))[:touches] for name in chosen]
         learned = features.select(np.sort(np.concatenate(rows)))
-        codes = fit_one(learned, blocks, CcaSettings())
-        parts.append(first_guesses(Fold(features.of_objects(fold), codes, CcaSettings())))
+        touch = learned.touch.reshape(len(learned), -1)
+        codes = dict(fit_codes(touch, learned.photo, learned.owner, blocks, [SETTINGS]))[SETTINGS]
+        parts.append(first_guesses(Fold(features.of_objects(fold), codes, SETTINGS)))
     return Point.of(what, objects, touches, measure(parts, "first"), measure(parts, "below"))
 
 

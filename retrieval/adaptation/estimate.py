@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, fit_folds, measure
+from retrieval.adaptation.folds import Fold, choose_settings, draw_folds, first_guesses, fit_folds, measure
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import AsItIs
 from retrieval.console.output import say
 from retrieval.errors import BadInput
-from retrieval.methods.cca_towers import CcaSettings, choose
+from retrieval.methods.cca_towers import Choice
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
@@ -20,12 +20,13 @@ from retrieval.model.encode import one_thread
 class Estimate:
     """What the fit is worth on objects left out; the same of blurred touches is the control.
 
-    settings: those of a fit to all objects, chosen by the folds. folds: the fits behind the estimate, each with
-    settings chosen among the objects that taught it. first, below: first guesses among a fold's objects, and pairs.
+    choice: the fit to all objects, whose settings were chosen by holding out half of each kind. folds: the fits behind
+    the estimate, each with settings chosen in the same way among the objects that taught it. first, below: first
+    guesses among a fold's objects, and pairs.
     known: the model that one starts from, with nothing fitted; known_first, known_below: what it is worth.
     """
 
-    settings: CcaSettings
+    choice: Choice
     folds: list[Fold]
     known: AsItIs
     first: Measure
@@ -94,18 +95,18 @@ def interval(summary: dict[str, Any]) -> str:
 def judge(material: Material, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool) -> Estimate | None:
     """The estimate from objects left out; None where there are too few of them."""
     try:
-        drawn = draw_folds(material.grasps, material.groups, seed)
+        drawn = draw_folds(material.grasps, seed)
     except BadInput as error:
         if not quiet:
             say(f"nothing is known of how good this is: {error}")
         return None
     folds, blurred = (
-        list(fit_folds(features, drawn, material.blocks, seed=seed, what=what, quiet=quiet))
+        list(fit_folds(features, drawn, material, seed=seed, what=what, quiet=quiet))
         for features, what in ((material.features, "touches"), (material.blurred, "blurred touches"))
     )
-    settings, _ = choose(material.features, material.blocks, drawn)
+    choice = choose_settings(material.features, material, seed)
     told, control = list(map(first_guesses, folds)), list(map(first_guesses, blurred))
     known = AsItIs.of(start, material.grasps, cache, quiet)
     rows = (told, control, known.told(drawn))
     measures = (measure(parts, column) for parts in rows for column in ("first", "below"))
-    return Estimate(settings, folds, known, *measures)
+    return Estimate(choice, folds, known, *measures)

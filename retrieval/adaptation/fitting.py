@@ -1,6 +1,7 @@
 """The checkpoint: codes fitted on all own objects become a matcher's projections, folds say what its logits mean."""
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import Fold, fit_one
 from retrieval.adaptation.material import Material
-from retrieval.adaptation.start import first_rows
 from retrieval.data.dataset import Grasp, Split, data_digest
-from retrieval.methods.cca import unit_rows
-from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, Affine, Codes
+from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, Affine, Codes, fit_codes
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
@@ -30,8 +28,13 @@ from retrieval.training.judgement import with_verdicts
 def fit_matcher(material: Material, estimate: Estimate | None, out: Path) -> Checkpoint:
     """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridges."""
     features, config, matcher = material.features, material.config, material.matcher
-    codes = fit_one(features, material.blocks, estimate.settings if estimate else max(GRID))
-    scale, offset = _log_odds(estimate.folds) if estimate else (1.0, 0.0)
+    if estimate:
+        codes = estimate.choice.codes
+        scale, offset = _log_odds(part.judged for part in estimate.choice.held_out)
+    else:
+        touch, most = features.touch.reshape(len(features), -1), max(GRID)
+        codes = dict(fit_codes(touch, features.photo, features.owner, material.blocks, [most]))[most]
+        scale, offset = 1.0, 0.0
     install(matcher, codes, scale, offset)
     objects = tuple(sorted(set(features.object_ids)))
     return Checkpoint(
@@ -50,16 +53,15 @@ def fit_matcher(material: Material, estimate: Estimate | None, out: Path) -> Che
     )
 
 
-def _log_odds(folds: list[Fold]) -> tuple[float, float]:
+def _log_odds(parts: Iterable[JudgedTouches]) -> tuple[float, float]:
     """Scale and offset that make of a cosine the log-odds of a match, with as many pairs that match as do not."""
     cosines, labels = [], []
-    for fold in folds:
-        same = fold.left_out.owner[:, None] == fold.left_out.owner
-        given = fold.cosines().ravel()
+    for part in parts:
+        same = part.touch_owner[:, None] == part.photo_owner
         rng = np.random.default_rng(0)
-        pairs = [rng.permutation(np.flatnonzero(part.ravel())) for part in (same, ~same)]
+        pairs = [rng.permutation(np.flatnonzero(some.ravel())) for some in (same & ~part.own, ~same)]
         count = min(len(pairs[0]), len(pairs[1]), 20_000)
-        cosines += [given[part[:count]] for part in pairs]
+        cosines += [part.logits.ravel()[some[:count]] for some in pairs]
         labels += [np.ones(count), np.zeros(count)]
     found = fit_calibration(np.concatenate(cosines), np.concatenate(labels))
     return found.slope, found.intercept
@@ -130,14 +132,10 @@ def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: b
 
 
 def _left_out(matcher: Matcher, estimate: Estimate) -> list[FeltTouches]:
+    """Touches of objects that were held out, half of each kind together, with the match logits of the matcher."""
     assert matcher.cosine_scale is not None
     scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
-    parts = []
-    for fold in estimate.folds:
-        rows = first_rows(fold.left_out, MAX_CALIBRATION_TOUCHES)
-        logits = scale * fold.cosines()[np.ix_(rows, rows)] + offset
-        owner = fold.left_out.owner[rows]
-        touch = fold.left_out.touch.reshape(len(fold.left_out), -1)[rows]
-        codes = unit_rows(fold.codes.touch(touch))
-        parts.append(FeltTouches(JudgedTouches(logits, owner, owner, np.eye(len(rows), dtype=np.bool_)), codes))
-    return parts
+    return [
+        FeltTouches(dataclasses.replace(part.judged, logits=scale * part.judged.logits + offset), part.codes)
+        for part in estimate.choice.held_out
+    ]

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.adaptation.material import Material
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, linked_objects
 from retrieval.errors import BadInput
-from retrieval.methods.cca_towers import INNER_FOLD, Blocks, CcaSettings, Codes, choose, fit_codes
-from retrieval.methods.held_out import held_out_folds, look_alikes
+from retrieval.methods.cca_towers import CcaSettings, Choice, Codes, choose
+from retrieval.methods.held_out import held_out_folds
 from retrieval.metrics.guesses import guess_curves
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features
@@ -35,34 +36,35 @@ class Fold:
         return self.codes.cosines(self.left_out.touch.reshape(len(self.left_out), -1), self.left_out.photo)
 
 
-def draw_folds(grasps: Sequence[Grasp], groups: Sequence[Sequence[str]], seed: int) -> list[tuple[str, ...]]:
-    """Objects in folds of about `GALLERY`: half of each group is left out together, and objects that share a sequence.
-
-    groups: objects of one kind (`look_alike_groups`). Raises BadInput for fewer than `FEWEST` objects.
-    """
-    total = len({grasp.object_id for grasp in grasps})
+def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
+    """Objects in folds of about `GALLERY`; objects that share a sequence stay together. Raises BadInput for fewer
+    than `FEWEST` objects."""
+    groups = linked_objects(grasps)
+    total = sum(map(len, groups))
     if total < FEWEST:
         raise BadInput(f"{FEWEST} objects or more can be judged by leaving each out once; got {total}")
-    return held_out_folds(groups, GALLERY, seed, linked_objects(grasps))
+    folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3))]
+    for place in np.random.default_rng([seed, 7]).permutation(len(groups)):
+        min(folds, key=len).extend(groups[place])
+    return [tuple(sorted(fold)) for fold in folds]
 
 
 def fit_folds(
-    features: Features, folds: Sequence[Sequence[str]], blocks: Blocks, *, seed: int, what: str, quiet: bool
+    features: Features, folds: Sequence[Sequence[str]], material: Material, *, seed: int, what: str, quiet: bool
 ) -> Iterator[Fold]:
-    """Each fold, and what the objects outside it teach: settings are chosen among these, then fitted to all of them."""
+    """Each fold, and what the objects outside it teach: settings, too, are chosen among these alone."""
     everyone = {name for fold in folds for name in fold}
     with Bar(f"judge {what}", len(folds), "folds", quiet=quiet) as bar:
         for fold in folds:
-            learned = features.of_objects(everyone.difference(fold))
-            settings, _ = choose(learned, blocks, held_out_folds(look_alikes(learned), INNER_FOLD, seed))
-            yield Fold(features.of_objects(fold), fit_one(learned, blocks, settings), settings)
+            choice = choose_settings(features.of_objects(everyone.difference(fold)), material, seed)
+            yield Fold(features.of_objects(fold), choice.codes, choice.settings)
             bar.advance()
 
 
-def fit_one(features: Features, blocks: Blocks, settings: CcaSettings) -> Codes:
-    """Codes that all of these grasps teach."""
-    touch = features.touch.reshape(len(features), -1)
-    return dict(fit_codes(touch, features.photo, features.owner, blocks, [settings]))[settings]
+def choose_settings(features: Features, material: Material, seed: int) -> Choice:
+    """Settings chosen by holding out half of each kind of these objects, and the codes that all of them teach."""
+    parts = held_out_folds(features, material.kind_of, linked_objects(material.grasps), seed)
+    return choose(features, material.blocks, parts)
 
 
 @dataclass(frozen=True, eq=False)

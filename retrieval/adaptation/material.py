@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps, recording_source
+from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps
 from retrieval.errors import BadInput
 from retrieval.evaluation.real.protocol import read_facts
 from retrieval.methods.cca_towers import Blocks
-from retrieval.methods.held_out import grouped, look_alikes
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
@@ -30,7 +29,7 @@ NOTHING = "none"
 class Material:
     """Own grasps, the towers side by side, and what these make of them; blurred: of an 8 x 6 blur of each touch.
 
-    groups: objects of one kind: of one class where the recording names classes, else those that look alike.
+    kind_of: the class of each object, where the recording names it.
     """
 
     grasps: list[Grasp]
@@ -38,7 +37,7 @@ class Material:
     matcher: Matcher
     features: Features
     blurred: Features
-    groups: list[list[str]]
+    kind_of: dict[str, str] | None
     source: str
 
     @property
@@ -67,17 +66,8 @@ def encode(
     shown = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
     features = shown()
     blurred = shown(variant="blurred", photos_of=features)
-    groups = groups_of(features, recording)
-    return Material(grasps, config, matcher, features, blurred, groups, recording_source(recording))
-
-
-def groups_of(features: Features, recording: Path) -> list[list[str]]:
-    """Objects of one kind: of one class where recording.json names the class of every object, else `look_alikes`."""
-    said = read_facts(recording).objects
-    names = sorted(set(features.object_ids))
-    if all("class" in said.get(name, {}) for name in names):
-        return grouped(names, {name: said[name]["class"] for name in names})
-    return look_alikes(features)
+    facts = read_facts(recording)
+    return Material(grasps, config, matcher, features, blurred, facts.kind_of, facts.source)
 
 
 def config_for(start: Checkpoint, fingers: int, *, beside: bool, seed: int) -> Config:

@@ -1,6 +1,7 @@
 """Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ class Experiment:
 
     pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
     and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
-    each part before fitting, so that nothing can be learned. all_teach: as in `Setting`. role: what it is beside the
-    evaluation itself, such as "control: blurred", for people who watch.
+    each part before fitting, so that nothing can be learned. all_teach, kind_of: as in `Setting`. role: what it is
+    beside the evaluation itself, such as "control: blurred", for people who watch.
     """
 
     folder: Path
@@ -45,6 +46,7 @@ class Experiment:
     shuffled: bool
     quiet: bool
     all_teach: bool = False
+    kind_of: Mapping[str, str] | None = None
     role: str = ""
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
@@ -90,7 +92,9 @@ class Experiment:
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
         config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn
-        method = build_method(name, Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach))
+        method = build_method(
+            name, Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach, self.kind_of)
+        )
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))

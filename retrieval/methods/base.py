@@ -1,6 +1,7 @@
 """What every method owes the harness; a method only writes `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,8 @@ class Setting:
 
     folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
     all_teach: a method that can (`cca_towers`, `cca`, `cca_pca`) learns from validation objects, too, once its settings
-    are chosen; what is calibrated on their scores is then too sure.
+    are chosen; what is calibrated on their scores is then too sure. kind_of: the kind of each object, where the
+    recording names it: half of each kind is then held out together to choose settings.
     """
 
     config: Config
@@ -31,6 +33,7 @@ class Setting:
     folder: Path | None = None
     quiet: bool = True
     all_teach: bool = False
+    kind_of: Mapping[str, str] | None = None
 
 
 class Method(ABC):

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import LEADING, View, canonical, cosine, decompose, factored, unit_rows
-from retrieval.methods.held_out import held_out_folds, look_alikes
+from retrieval.methods.held_out import held_out_folds
 from retrieval.methods.selection import Validator, judged_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
 from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
+from retrieval.model.references import FeltTouches
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.side_by_side import widths_of
 
@@ -35,8 +36,6 @@ Numbers = NDArray[np.int64]
 Blocks = tuple[Sequence[int], Sequence[int]]
 """How wide the features are of towers that stand side by side, of a touch and of a photo."""
 COMPONENTS = 64
-INNER_FOLD = 6
-"""Training objects, about, that are held out together to choose settings."""
 MAX_CHOICE_TOUCHES = 240
 """Touches of a fold that settings are chosen by."""
 MAX_CALIBRATION_TOUCHES = 60
@@ -166,13 +165,14 @@ class Choice:
     """Settings that were chosen by objects held out of a fit.
 
     auc: their mean AUC on these. codes: fitted to all objects. held_out: for each fold, cosines of its touches with its
-    photos by codes that its objects did not teach, as a posterior is fitted on them.
+    photos by codes that its objects did not teach, and the codes of these touches, as a posterior and the worth of
+    reference touches are fitted on them.
     """
 
     settings: CcaSettings
     auc: float
     codes: Codes
-    held_out: list[JudgedTouches]
+    held_out: list[FeltTouches]
 
 
 def choose(
@@ -209,12 +209,13 @@ def choose(
 
 def held_out(
     features: "Features", codes: Codes, touch: NDArray[np.floating], photo: NDArray[np.floating]
-) -> JudgedTouches:
-    """Cosines of touches (n, k) with photos (n, k') of objects that the codes have not seen: of each object at most
+) -> FeltTouches:
+    """Touches (n, k) and photos (n, k') of objects that the codes have not seen: of each object at most
     `MAX_CALIBRATION_TOUCHES` grasps, evenly spaced."""
     rows = judged_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
-    owner = features.owner[rows]
-    return JudgedTouches(codes.cosines(touch[rows], photo[rows]), owner, owner, np.eye(len(rows), dtype=bool))
+    owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
+    judged = JudgedTouches(codes.cosines(touch[rows], photo[rows]), owner, owner, own)
+    return FeltTouches(judged, unit_rows(codes.touch(touch[rows])))
 
 
 class CcaTowers(Method):
@@ -234,7 +235,7 @@ class CcaTowers(Method):
         seen, shown = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
         known, folds = seen.joined(shown), [tuple(sorted(set(shown.object_ids)))]
         if self.setting.all_teach:
-            folds = held_out_folds(look_alikes(known), INNER_FOLD, self.setting.seed)
+            folds = held_out_folds(known, self.setting.kind_of, seed=self.setting.seed)
         choice = choose(known, blocks, folds)
         self._codes = choice.codes
         self.chosen = {**choice.settings._asdict(), "validation_auc": choice.auc}
@@ -272,7 +273,7 @@ def _rows(features: "Features") -> Rows:
 def _posterior(choice: Choice) -> Posterior | None:
     """What a cosine means, by held-out objects; None where these are too few, or have one photo each."""
     try:
-        return fit_posterior(*choice.held_out)
+        return fit_posterior(*(part.judged for part in choice.held_out))
     except BadInput:
         return None
 

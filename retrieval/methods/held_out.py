@@ -1,7 +1,7 @@
-"""Which training objects are held out together: several look-alikes at once.
+"""Which objects are held out together, to choose settings and to say what a score means: half of a kind at once.
 
-A held-out object of which many look-alikes train is told more easily than an object that a user adds tomorrow. So
-look-alikes are held out half of them together, the other half training.
+A held-out object, all of whose look-alikes train, is told more easily than one that a user adds tomorrow. So half of
+the objects of a kind are held out together, while the other half trains.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,56 +12,47 @@ import numpy as np
 if TYPE_CHECKING:
     from retrieval.training.features import Features
 
-LOOK_ALIKES = 4
-"""Objects of a group, on average, where nobody names the groups."""
+
+FEWEST_FOR_FOUR = 12
+"""Objects that four folds need, three in each; fewer make two folds."""
 
 
-def look_alikes(features: "Features") -> list[list[str]]:
-    """Objects in groups that look alike, of `LOOK_ALIKES` on average: average linkage of the correlation of mean photo
-    features, each standardised over the objects."""
-    from scipy.cluster.hierarchy import fcluster, linkage  # slow to import
+def held_out_folds(
+    features: "Features",
+    kind_of: Mapping[str, str] | None = None,
+    linked: Iterable[Sequence[str]] = (),
+    seed: int = 0,
+) -> list[tuple[str, ...]]:
+    """The objects in four folds, or two: of each kind every second object stands in one fold, the others in another.
 
+    kind_of: the kind of each object, where the recording names it; otherwise objects that look alike are of one kind
+    (`by_looks`). linked: objects that stay together, such as those of one sequence.
+    """
     names = sorted(set(features.object_ids))
-    count = round(len(names) / LOOK_ALIKES)
-    if count < 2:
-        return [names]
-    owner = features.owner
+    if kind_of is not None and all(name in kind_of for name in names):
+        shuffled = [names[place] for place in np.random.default_rng([seed, 29]).permutation(len(names))]
+        order = sorted(shuffled, key=lambda name: kind_of[name])
+    else:
+        order = by_looks(features)
+    unit_of = {name: tuple(each for each in sorted(unit) if each in names) for unit in linked for name in unit}
+    sides: list[list[str]] = [[], []]
+    for unit in dict.fromkeys(unit_of.get(name, (name,)) for name in order):
+        min(sides, key=len).extend(unit)
+    if len(names) < FEWEST_FOR_FOUR or any(len(unit) > 1 for unit in unit_of.values()):
+        return [tuple(sorted(side)) for side in sides]
+    return [tuple(sorted(part.tolist())) for side in sides for part in np.array_split(side, 2)]
+
+
+def by_looks(features: "Features") -> list[str]:
+    """The objects in an order in which neighbours look alike: leaves of average linkage, in optimal order (Bar-Joseph,
+    Gifford and Jaakkola 2001), of the mean photo features of each object, standardised over the objects."""
+    from scipy.cluster.hierarchy import leaves_list, linkage  # slow to import
+
+    names, owner = sorted(set(features.object_ids)), features.owner
+    if len(names) < 3:
+        return names
     means = np.stack([features.photo[owner == place].mean(0, dtype=np.float64) for place in range(len(names))])
     spread = means.std(0)
     shown = (means - means.mean(0))[:, spread > 0] / spread[spread > 0]
     shown = shown / np.maximum(np.linalg.norm(shown, axis=1, keepdims=True), 1e-12)
-    group_of = fcluster(linkage(shown, "average"), count, "maxclust")
-    return grouped(names, dict(zip(names, group_of.tolist(), strict=True)))
-
-
-def grouped(names: Iterable[str], group_of: Mapping[str, object]) -> list[list[str]]:
-    """Objects in the groups that are named; an object of no group stands alone."""
-    found: dict[object, list[str]] = {}
-    for name in sorted(names):
-        found.setdefault(group_of.get(name, ("alone", name)), []).append(name)
-    return list(found.values())
-
-
-def held_out_folds(
-    groups: Sequence[Sequence[str]], size: int, seed: int, linked: Sequence[Sequence[str]] = ()
-) -> list[tuple[str, ...]]:
-    """Objects in folds of about `size`, each object in one: of each group one half stands in one fold, the other half
-    in another.
-
-    linked: objects that must stay together, such as those of one sequence. Raises nothing: of fewer than twice `size`
-    objects there are two folds.
-    """
-    rng = np.random.default_rng([seed, 29])
-    unit_of = {name: tuple(sorted(unit)) for unit in linked for name in unit}
-    total = sum(map(len, groups))
-    folds: list[list[str]] = [[] for _ in range(max(2, min(round(total / size), total // 3)))]
-    for place in rng.permutation(len(groups)):
-        group = sorted(groups[place])
-        units = list(dict.fromkeys(unit_of.get(name, (name,)) for name in group))
-        order = [units[turn] for turn in rng.permutation(len(units))]
-        middle = -(-len(order) // 2)
-        targets = sorted(folds, key=len)[:2]
-        for half, fold in zip((order[:middle], order[middle:]), targets, strict=True):
-            known = {name for one in folds for name in one}
-            fold += [name for unit in half for name in unit if name not in known]
-    return [tuple(sorted(fold)) for fold in folds if fold]
+    return [names[place] for place in leaves_list(linkage(shown, "average", optimal_ordering=True))]

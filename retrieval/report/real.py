@@ -11,9 +11,10 @@ from retrieval.console.output import show
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
+from retrieval.evaluation.real.measuring import QUARTILES, quartile_name
 from retrieval.evaluation.real.protocol import PHOTO
 from retrieval.evaluation.real.references import with_references
-from retrieval.evaluation.real.verdict import RULE
+from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report import galleries
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
 from retrieval.report.document import (
@@ -48,6 +49,12 @@ INTERVALS = (
     "In percent; brackets hold 95 % intervals that resample {unit}s, since queries of one {unit} are alike; seeds are "
     "averaged first. Equal scores count by their expected rank, so that a constant scorer gets exactly chance."
 )
+OVER_CHOICES = (
+    "In percent: the mean over choices of test objects. Brackets hold 95 % intervals that cover the choice of objects "
+    "that test and of those that train (corrected resampled t-test: choices share objects). Equal scores count by "
+    "their expected rank, so that a constant scorer gets exactly chance."
+)
+SEARCHED = {"gallery": "a gallery", "all": "all test objects, look-alikes among them"}
 BLURRED = "the same, touches blurred to 8 x 6"
 
 
@@ -127,14 +134,17 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     seeds = len(entry["folds"])
     yield Text(
         f"{entry['rule']} {recording['objects']} objects, {recording['grasps']:,} grasps, {seeds} seed(s), "
-        f"{len(entry['folds'][0])} fold(s) each."
+        f"{len(entry['folds'][0])} {entry['unit'] if entry['unit'] == 'choice' else 'fold'}(s) each."
     )
     yield from (Text(line, warn="does not count" in line) for line in verdicts(entry))
     yield numbers(entry)
     yield from (Text(anchor) for anchor in entry["anchors"])
     yield Text("Controls:")
     yield controls(entry)
-    yield Details("Against the blurred control, all measures", (differences(entry),))
+    for table in (choices(entry), contact(entry), reliability(entry)):
+        if table:
+            yield table
+    yield Details("Against the blurred control and the order of capture, all measures", (differences(entry),))
     for kind in ("best", "worst"):
         if grasps and (queries := entry["examples"][kind]):
             file = f"{file_name(name)}-{kind}.jpg"
@@ -187,9 +197,11 @@ def numbers(entry: Entry) -> Table:
     chance = [percent(first[key]["chance"][0]) if key in first else NOTHING for key in labels]
     rows.append(("chance, closed form", *chance, *_counts(None, counted), ""))
     basis = next(iter(first.values()))
+    over_choices = entry["unit"] == "choice"
+    asked = f"{basis['queries']:,} queries of {basis['objects']} {'object' if over_choices else entry['unit']}s"
     notes = [
-        INTERVALS.format(unit=entry["unit"]),
-        f"{basis['queries']:,} queries of {basis['objects']} {entry['unit']}s a seed. Gallery: {basis['gallery']}.",
+        OVER_CHOICES if over_choices else INTERVALS.format(unit=entry["unit"]),
+        f"{asked} {'in all' if over_choices else 'a seed'}. Gallery: {basis['gallery']}.",
     ]
     if counted:
         notes.append(
@@ -228,18 +240,85 @@ def controls(entry: Entry) -> Table:
 
 
 def differences(entry: Entry) -> Table:
-    """Paired differences of each row from the same with blurred touches."""
+    """Paired differences of each row from its controls."""
+    rows = [
+        (_label(name, row), entry["labels"][key], control, _points(one), probability(one["p"]))
+        for name, row in entry["rows"].items()
+        for which, control in CONTROL_NAMES.items()
+        for key, one in (row[which] or {}).items()
+        if key in entry["labels"]
+    ]
+    header = ("method", "measure", "control", "touch less control, points", "p")
+    return Table(header, tuple(rows), words=frozenset({1, 2}))
+
+
+def _points(one: Mapping[str, Any]) -> str:
+    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}"
+
+
+def choices(entry: Entry) -> Table | None:
+    """How much the measure that decides differs between choices of test objects; None where there are none."""
+    if entry["unit"] != "choice":
+        return None
+    rows = []
+    for name, row in entry["rows"].items():
+        for label, measures in ((_label(name, row), row["measures"]), (BLURRED, row["blurred"])):
+            if measures:
+                rows.append((label, *_spread(measures[entry["main"]])))
+    for name, one in entry["controls"].items():
+        if one["measures"]:
+            rows.append((f"control: {name}", *_spread(one["measures"][entry["main"]])))
+    label = entry["labels"][entry["main"]]
+    return Table((f"{label}, over choices", "mean, %", "least, %", "most, %", "choices"), tuple(rows))
+
+
+def _spread(summary: Mapping[str, Any]) -> list[str]:
+    values = (summary[key][0] for key in ("value", "least", "most"))
+    return [*map(percent, values), str(len(summary["by_choice"]))]
+
+
+def contact(entry: Entry) -> Table | None:
+    """The measure that decides by quartile of contact; None where the gel before the contact was not recorded."""
+    names = [quartile_name(entry["main"], quartile) for quartile in range(1, QUARTILES + 1)]
+    rows = []
+    for name, row in entry["rows"].items():
+        if not row["verdict"] or names[0] not in row["measures"]:
+            continue
+        rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
+        rows.append((BLURRED, *(with_interval(row["blurred"][key]) for key in names)))
+        for which, control in CONTROL_NAMES.items():
+            rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
+    if not rows:
+        return None
+    header = ("by contact", "weakest quarter", "second", "third", "strongest quarter")
+    note = "Quarters of each object's touches, by the mean difference of the gel image from the untouched one."
+    return Table(header, tuple(rows), (note,))
+
+
+def reliability(entry: Entry) -> Table | None:
+    """Whether stated probabilities of first guesses came true; None where no row states any."""
     rows = [
         (
             _label(name, row),
-            entry["labels"][key],
-            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}",
-            probability(one["p"]),
+            SEARCHED[searched],
+            f"{one['from']:.1f} to {one['to']:.1f}",
+            f"{one['stated']:.3f}",
+            f"{one['true']:.3f}",
+            f"{one['stated'] - one['true']:+.3f}",
+            f"{one['count']:,}",
         )
         for name, row in entry["rows"].items()
-        for key, one in (row["differences"] or {}).items()
+        for searched, bins in row["reliability"].items()
+        for one in bins
     ]
-    return Table(("method", "measure", "touch less blurred, points", "p"), tuple(rows), words=frozenset({1}))
+    if not rows:
+        return None
+    note = (
+        "First guesses of one touch among the objects searched, each shown by one photo, one of them known to be "
+        "true; the posterior is fitted on held-out training objects of each fold."
+    )
+    header = ("method", "searched", "stated", "mean stated", "true", "difference", "answers")
+    return Table(header, tuple(rows), (note,), words=frozenset({1}))
 
 
 # Figure ------------------------------------------------------------------------------------------------

@@ -31,13 +31,13 @@ QUARTILES = 4
 @dataclass(frozen=True, eq=False)
 class Measured:
     """What came out of one fold: measures by name, whose owners are numbers in `Units`; chosen: what the method chose;
-    examples: best and worst queries. stated (Q, 2): of each query with a posterior, the probability of the first guess
-    and the share of it that is right."""
+    examples: best and worst queries. stated: by what was searched ("gallery", or "all" test objects where galleries are
+    several), (Q, 2): the probability of each first guess, where a posterior states one, and the share that is right."""
 
     measures: Mapping[str, Measure]
     chosen: Mapping[str, Any]
     examples: Mapping[str, Any]
-    stated: NDArray[np.float64]
+    stated: Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,8 @@ def measure(
     found: dict[str, list[Measure]] = {}
     shown_ids = judged.ids(grasp_ids, "test")
     queries: dict[str, list[Any]] = {"best": [], "worst": []}
-    stated = [np.empty((0, 2))]
+    stated: dict[str, list[NDArray[np.float64]]] = {}
+    posterior = judged.predictions.chosen.get("posterior")
     levels = np.array([contact[name] for name in shown_ids[0]]) if contact else None
     for one in sorted(set(gallery_of.values())):
         mine = np.array([gallery_of.get(name) == one for name in objects])
@@ -114,13 +115,15 @@ def measure(
         if levels is not None:
             quartiles = contact_quartiles(levels[mine[whole.touch_owner]], gallery.touch_owner)
             for quartile in range(1, QUARTILES + 1):
-                part = dataclasses.replace(scored, test=gallery.select(quartiles == quartile, np.arange(len(gallery.photo_owner))))
+                part = dataclasses.replace(
+                    scored, test=gallery.select(quartiles == quartile, np.arange(len(gallery.photo_owner)))
+                )
                 if (taken := protocol.measures[protocol.main].take(part)) is not None:
                     found.setdefault(quartile_name(protocol.main, quartile), []).append(taken)
-        if "posterior" in judged.predictions.chosen:
-            posterior = Posterior.from_dict(judged.predictions.chosen["posterior"])
-            candidates = drawn_choices(gallery, KWayTest(len(gallery.objects)), judged.seed, posterior)
-            stated.append(stated_first_guesses(candidates, posterior))
+        if posterior:
+            stated.setdefault("gallery", []).append(_stated(gallery, posterior, judged.seed))
+    if posterior and protocol.galleries:
+        stated["all"] = [_stated(whole, posterior, judged.seed)]
     if protocol.main not in found:
         raise BadInput(
             f"{protocol.title}: a gallery holds {len(whole.objects)} objects, too few for "
@@ -131,8 +134,14 @@ def measure(
         {name: pooled(parts, [number] * len(parts)) for name, parts in found.items()},
         judged.predictions.chosen,
         queries,
-        np.concatenate(stated),
+        {name: np.concatenate(parts) for name, parts in stated.items()},
     )
+
+
+def _stated(gallery: ScoreTable, posterior: Mapping[str, Any], seed: int) -> NDArray[np.float64]:
+    """(Q, 2) of first guesses among the objects of a gallery, each shown by one photo."""
+    fitted = Posterior.from_dict(posterior)
+    return stated_first_guesses(drawn_choices(gallery, KWayTest(len(gallery.objects)), seed, fitted), fitted)
 
 
 def _of(table: ScoreTable, mine: Any) -> ScoreTable:
@@ -151,7 +160,7 @@ def digest(made_by: Mapping[str, Any]) -> str:
 
 def write_measured(path: Path, measured: Measured, made_by: str) -> None:
     """Keep the measures of a fold; `made_by` is a digest."""
-    tensors = {"stated": torch.from_numpy(measured.stated)} | {
+    tensors = {f"stated/{name}": torch.from_numpy(part) for name, part in measured.stated.items()} | {
         f"{name}/{part}": torch.from_numpy(np.ascontiguousarray(getattr(found, part)))
         for name, found in measured.measures.items()
         for part in ("values", "owner", "chance")
@@ -180,7 +189,10 @@ def read_measured(path: Path, made_by: str) -> Measured | None:
         )
         for name, gallery in header["galleries"].items()
     }
-    return Measured(measures, header["chosen"], header["examples"], tensors["stated"].numpy())
+    stated = {
+        name.removeprefix("stated/"): tensor.numpy() for name, tensor in tensors.items() if name.startswith("stated/")
+    }
+    return Measured(measures, header["chosen"], header["examples"], stated)
 
 
 def joined(folds: Sequence[Measured]) -> dict[str, Measure]:

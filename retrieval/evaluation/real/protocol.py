@@ -36,6 +36,12 @@ class Facts:
         return sorted({grasp.object_id for grasp in self.grasps})
 
     @property
+    def kind_of(self) -> dict[str, str] | None:
+        """The class of every object; None where the recording does not name it of all."""
+        found = {name: str(self.objects[name]["class"]) for name in self.names if "class" in self.objects.get(name, {})}
+        return found if len(found) == len(self.names) else None
+
+    @property
     def sequence_of(self) -> dict[str, str]:
         """The sequence of each object's first grasp; the object itself where there is none."""
         found: dict[str, str] = {}

@@ -320,6 +320,7 @@ class _Asked:
             shuffled=line.kind == "dealt",
             quiet=True,
             all_teach=True,
+            kind_of=self.facts.kind_of,
         )
         experiment.predict(line.method, seed)
         judged = MethodScores(experiment.queries, experiment.predictions(line.method, seed), seed)

@@ -110,13 +110,18 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
     return f"{points} against {control}, an interval that holds 0"
 
 
-def reliability_entry(stated: Sequence[NDArray[np.float64]]) -> list[dict[str, Any]]:
-    """Whether stated probabilities of first guesses came true: {"from", "to", "stated", "true", "count"} by bins of .1,
-    empty ones left out.
+def reliability_entry(stated: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
+    """Whether stated probabilities of first guesses came true, by what was searched: for each bin of .1 that is not
+    empty {"from", "to", "stated", "true", "count"}.
 
-    stated: for each fold (Q, 2), the probability and the share that is right.
+    stated: for each fold, by what was searched (Q, 2), the probability and the share that is right.
     """
-    said, right = np.concatenate(stated).T
+    names = dict.fromkeys(name for one in stated for name in one)
+    return {name: _bins(np.concatenate([one[name] for one in stated if name in one])) for name in names}
+
+
+def _bins(stated: NDArray[np.float64]) -> list[dict[str, Any]]:
+    said, right = stated.T
     which = np.minimum((said * STATED_BINS).astype(int), STATED_BINS - 1)
     return [
         {
