@@ -82,7 +82,7 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     method = results["methods"]["late_fusion"]
     check(8, method)
     said = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
-    assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_accuracy"])
+    assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_auc"])
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from retrieval.commands.main import main
-from retrieval.evaluation.real import PROTOCOLS, run
+from retrieval.evaluation.real import PROTOCOLS, run, vt60
 from retrieval.evaluation.real.measuring import read_measured, write_measured
 from retrieval.methods.base import Method
 from tests import real_data_sets
@@ -51,7 +51,11 @@ def test_every_row_has_its_blurred_control_and_a_verdict_and_chance_has_neither(
         row, nothing = entry["rows"]["cca_pca"], entry["rows"]["chance"]
         assert set(row["measures"]) == set(row["blurred"]) == set(row["differences"])
         difference = row["differences"][entry["main"]]
-        assert row["verdict"]["counts_as_touch"] == (difference["low"] > 0)
+        against_order = row["order_differences"][entry["main"]]
+        assert row["verdict"]["counts_as_touch"] == (difference["low"] > 0 and against_order["low"] > 0)
+        order = entry["controls"]["order"]["measures"][entry["main"]]["value"][0]
+        by_hand = row["measures"][entry["main"]]["value"][0] - order
+        assert against_order["difference"] == pytest.approx(by_hand)
         by_hand = row["measures"][entry["main"]]["value"][0] - row["blurred"][entry["main"]]["value"][0]
         assert difference["difference"] == pytest.approx(by_hand)
         assert (nothing["blurred"], nothing["verdict"]) == (None, None)
@@ -110,6 +114,30 @@ def test_a_catalogue_of_reference_touches_is_asked_blurred_on_both_sides_and_its
         assert entry["controls"]["background"]["why_not"] == "an object is shown by touches"
         assert entry["controls"]["order"]["measures"]["guesses_k9"]["value"][0] > 0.5
     assert "reference touch of each object" in (again / "report.md").read_text()
+
+
+def test_over_choices_each_fold_is_a_value_and_stated_probabilities_and_contact_are_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(vt60, "DRAWN_CHOICES", 1)
+    real_data_sets.write_vt60(tmp_path / "data" / "vt60", instances=3)
+    asked = ["--preset", "tiny", "--seeds", "2", "--methods", "cca_towers,chance", "--protocols", "vt60-choices"]
+    assert benchmark(tmp_path / "data", tmp_path / "out", methods=asked) == 0
+    entry = json.loads((tmp_path / "out" / "results.json").read_text())["protocols"]["vt60-choices"]
+    assert (entry["unit"], len(entry["folds"]), len(entry["folds"][0])) == ("choice", 1, 4)  # once, for any seeds
+    row = entry["rows"]["cca_towers"]
+    summary = row["measures"]["guesses_k9"]
+    by_choice = [one[0] for one in summary["by_choice"]]
+    assert len(by_choice) == 4
+    assert summary["value"][0] == pytest.approx(np.mean(by_choice))
+    assert (summary["least"][0], summary["most"][0]) == (min(by_choice), max(by_choice))
+    assert summary["low"][0] <= summary["value"][0] <= summary["high"][0]
+    quartiles = [row["measures"][f"guesses_k9_contact{number}"] for number in (1, 2, 3, 4)]
+    assert [one["queries"] for one in quartiles] == [4 * 18] * 4  # one touch of four of each object and choice
+    assert np.mean([one["value"][0] for one in quartiles]) == pytest.approx(summary["value"][0])
+    assert sum(one["count"] for one in row["reliability"]["gallery"]) == 4 * 4 * 18 * 4  # drawn four times each
+    assert set(row["chosen"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
+    text = re.sub(r"\\", "", (tmp_path / "out" / "report.md").read_text())
+    for words in ("over choices", "strongest quarter", "mean stated", "the order of capture", "4 choice(s) each"):
+        assert words in text
 
 
 def test_methods_that_are_heads_for_photos_cannot_ask_reference_touches(data, tmp_path, capsys):

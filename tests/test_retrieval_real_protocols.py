@@ -96,6 +96,11 @@ def test_choices_hold_out_all_pairs_of_instance_numbers_and_then_drawn_ones():
     assert [split.test for split in folds("vt60-choices", 1)][:6] == [split.test for split in splits[:6]]
 
 
+def test_two_instances_of_a_class_leave_none_to_train():
+    with pytest.raises(DatasetError, match="a class has 2, give three or more"):
+        load_protocol("vt60-choices").folds(vt60(instances=2), 0)
+
+
 def test_a_choice_has_two_galleries_of_one_object_of_each_class():
     protocol = load_protocol("vt60-choices")
     for split in folds("vt60-choices"):

@@ -56,10 +56,15 @@ def _seen_classes(facts: Facts, seed: int) -> list[Split]:
 
 
 def _choices(facts: Facts, seed: int) -> list[Split]:
-    """Two instances of every class: all pairs of instance numbers, the same in every class, then seeded draws."""
+    """Two instances of every class: all pairs of instance numbers, the same in every class, then seeded draws. Raises
+    DatasetError for fewer than three instances of a class."""
     classes = by_class(facts)
     rng = np.random.default_rng([seed, 31])
     least = min(map(len, classes.values()))
+    if least < 3:
+        raise DatasetError(
+            f"two instances of each class test and others train; a class has {least}, give three or more"
+        )
     tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(least), 2)]
     for _ in range(DRAWN_CHOICES):
         tests.append([name for names in classes.values() for name in rng.choice(names, 2, replace=False).tolist()])
