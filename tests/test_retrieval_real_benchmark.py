@@ -132,7 +132,6 @@ def test_over_choices_each_fold_is_a_value_and_stated_probabilities_and_contact_
     assert summary["low"][0] <= summary["value"][0] <= summary["high"][0]
     quartiles = [row["measures"][f"guesses_k9_contact{number}"] for number in (1, 2, 3, 4)]
     assert [one["queries"] for one in quartiles] == [4 * 18] * 4  # one touch of four of each object and choice
-    assert np.mean([one["value"][0] for one in quartiles]) == pytest.approx(summary["value"][0])
     assert sum(one["count"] for one in row["reliability"]["gallery"]) == 4 * 4 * 18 * 4  # drawn four times each
     assert set(row["chosen"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
     text = re.sub(r"\\", "", (tmp_path / "out" / "report.md").read_text())

@@ -146,9 +146,9 @@ def _fit(
     for directions, some in groupby(sorted(settings, key=lambda one: one.directions), lambda one: one.directions):
         items = [part.items(directions)[rows] for part in (touch, photo)]
         means = [part.mean(0) for part in items]
-        views = [_as_it_is(part - mean) for part, mean in zip(items, means, strict=True)]
-        for ridges, alike in groupby(sorted(some), lambda one: one[:2]):
-            found = canonical(*views, owner[rows], *ridges)
+        felt, seen = (_as_it_is(part - mean) for part, mean in zip(items, means, strict=True))
+        for (ridge, photo_ridge), alike in groupby(sorted(some), lambda one: one[:2]):
+            found = canonical(felt, seen, owner[rows], ridge, photo_ridge)
             for one in alike:
                 weights = found.correlations[:COMPONENTS] ** one.power
                 variates = (each[:, :COMPONENTS] * weights for each in (found.touch_weights, found.photo_weights))
