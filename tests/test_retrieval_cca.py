@@ -90,7 +90,7 @@ def test_of_a_view_the_widest_directions_are_kept_where_so_many_are_asked():
     x = np.random.default_rng(0).standard_normal((50, 12)) * np.arange(1, 13)
     whole, few = decompose(x), decompose(x, 4)
     assert (whole.rank, few.rank) == (12, 4)
-    np.testing.assert_array_equal(few.singular, whole.singular[:4])
+    np.testing.assert_allclose(few.singular, whole.singular[:4], rtol=1e-12)  # by eigenvectors, which round otherwise
     assert decompose(x, 96).rank == 12
 
 
