@@ -167,11 +167,11 @@ def controls(results: Results) -> Table:
     rows = [("the result", "late fusion as it is", *real, "")]
     for name, control in results.data["controls"].items():
         left, at_chance = (control["measures"].get(key) for key in keys), NOTHING
-        if pairs := control["measures"].get(keys[0]):
-            at_chance = "yes" if pairs["low"][0] <= pairs["chance"][0] <= pairs["high"][0] else "no"
+        if found := next((control["measures"][key] for key in keys if key in control["measures"]), None):
+            at_chance = "yes" if found["low"][0] <= found["chance"][0] <= found["high"][0] else "no"
         rows.append((name, control["what"], *map(with_interval, left), at_chance))
     header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
-    return _explained(Table(header, tuple(rows), words=frozenset({1})))
+    return _explained(Table(header, tuple(rows), tuple(_without_threshold(results)), words=frozenset({1})))
 
 
 def ceilings(results: Results) -> Table:
