@@ -190,6 +190,7 @@ def advised(series):
             for present in (True, False):
                 own = [one for one in series if one.present is present and not one.answers[grasps - 1].match]
                 own = [one.answers for one in own if one.answers[grasps - 1].advice == advice]
+                own = [each for each in own if grasps + (each[grasps - 1].more or 0) <= len(each)]  # so many were made
                 later = [each[grasps + (each[grasps - 1].more or len(each) - grasps) - 1] for each in own]
                 then = sum(one.match for one in later)
                 right = sum(each[grasps - 1].right for each in own)
