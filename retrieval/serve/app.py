@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from retrieval.search.opening import OpenShards
 from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
+from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
@@ -59,11 +60,13 @@ def create_app(
     """
     metrics = Metrics()
     generations = Generations(settings, metrics, shards)
+    decoders = Decoders()
     parts = Service(
         settings,
         metrics,
         generations,
-        Queue(generations, settings, metrics),
+        decoders,
+        Queue(generations, settings, metrics, decoders),
         rig or LiveRig(),
         Thumbnails(),
         Keeping(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
@@ -99,7 +102,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     if not parts.generations.ready:
         await asyncio.to_thread(parts.generations.open)
     parts.queue.start()
-    work = [parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
+    work = [parts.decoders.start(), parts.generations.watch(), *([parts.keeping.work()] if parts.keeping else [])]
     running = [asyncio.ensure_future(one) for one in work]
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
