@@ -9,19 +9,19 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
-import anyio.to_process
 import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval.data.images import decode
+from retrieval.data.images import MAX_PIXELS, decode
 from retrieval.data.resize import resized
-from retrieval.errors import ImageError
+from retrieval.errors import ImageError, RetrievalError
 from retrieval.serve import decoders
+from retrieval.serve.decode_process import frame
 from retrieval.serve.decoders import SMALL_PIXELS, Decoders
 from retrieval.serve.errors import Problem
 from tests import decoding
@@ -42,10 +42,20 @@ def saved(samples, kind="PNG", **options):
 SMALL = saved(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8))
 
 
+@asynccontextmanager
+async def opened():
+    both = Decoders()
+    try:
+        yield both
+    finally:
+        await both.close()
+
+
 def read(*named, compares=False, timeout=120):
     async def run():
         async with asyncio.timeout(timeout):
-            return await Decoders().read(named, 32, compares)
+            async with opened() as both:
+                return await both.read(named, 32, compares)
 
     return asyncio.run(run())
 
@@ -71,90 +81,97 @@ def test_the_first_picture_that_cannot_be_used_is_told():
 
 
 def test_a_process_that_ends_is_the_fault_of_its_picture_and_the_next_one_gets_a_new_one(monkeypatch):
-    monkeypatch.setattr(decoders, "read_within_limits", decoding.die_of_large)
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.DIE)
 
     async def run():
-        both = Decoders()
-        for _ in range(2):
-            with pytest.raises(ImageError, match="b: decoding it takes more than 5 s of processor time or 200 MB"):
-                await both.read([("a", SMALL), ("b", LARGE)], 32, False)
-        return await both.read([("a", SMALL)], 32, False)
+        async with opened() as both:
+            for _ in range(2):
+                with pytest.raises(ImageError, match="b: decoding it takes more than 5 s of processor time or 200 MB"):
+                    await both.read([("a", SMALL), ("b", LARGE)], 32, False)
+            return await both.read([("a", SMALL)], 32, False)
 
     assert asyncio.run(run())[0].file_bytes == len(SMALL)
 
 
 def test_a_large_picture_keeps_no_small_one_waiting_and_its_process_ends_when_it_is_abandoned(monkeypatch, tmp_path):
-    monkeypatch.setattr(decoders, "read_within_limits", decoding.hang_on_large)
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
 
     async def run():
-        both, names = Decoders(), [str(tmp_path / "first"), str(tmp_path / "second")]
-        hanging = [asyncio.ensure_future(both.read([(name, LARGE)], 32, False)) for name in names]
-        while not (tmp_path / "first").exists():
-            await asyncio.sleep(0.01)
-        assert len(await both.read([("a", SMALL)] * 10, 32, False)) == 10
-        assert not (tmp_path / "second").exists()  # large ones are decoded one at a time
-        process = int((tmp_path / "first").read_text())
-        assert is_running(process)
-        for one in hanging:
-            one.cancel()
-        await asyncio.wait(hanging)
-        assert all(one.cancelled() for one in hanging)
-        assert not is_running(process)
-        assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+        names = [str(tmp_path / "first"), str(tmp_path / "second")]
+        async with opened() as both:
+            hanging = [asyncio.ensure_future(both.read([(name, LARGE)], 32, False)) for name in names]
+            while not (tmp_path / "first").exists():
+                await asyncio.sleep(0.01)
+            assert len(await both.read([("a", SMALL)] * 10, 32, False)) == 10
+            assert not (tmp_path / "second").exists()  # large ones are decoded one at a time
+            process = int((tmp_path / "first").read_text())
+            assert is_running(process)
+            for one in hanging:
+                one.cancel()
+            await asyncio.wait(hanging)
+            assert all(one.cancelled() for one in hanging)
+            await asyncio.gather(*both._ending)
+            assert not is_running(process)
+            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
 
     asyncio.run(run())
 
 
 def test_who_leaves_while_small_pictures_are_read_ends_no_process_and_leaves_nothing_to_do():
     async def run():
-        both = Decoders()
-        await both.start()
-        before = processes()
-        for _ in range(3):
-            asked = asyncio.ensure_future(both.read([("a", SMALL)] * 50, 32, False))
-            await asyncio.sleep(0.01)
-            asked.cancel()
-            await asyncio.wait([asked])
-        assert len(both._running) <= 2
-        assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
-        return before, processes()
+        async with opened() as both:
+            await both.start()
+            before = {process._process.pid for process in both._idle}
+            for _ in range(3):
+                asked = asyncio.ensure_future(both.read([("a", SMALL)] * 50, 32, False))
+                await asyncio.sleep(0.01)
+                asked.cancel()
+                await asyncio.wait([asked])
+            assert len(both._running) <= 2
+            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+            assert {process._process.pid for process in both._idle} == before
+        for process in before:
+            assert not is_running(process)
 
-    before, after = asyncio.run(run())
-    assert before <= after
+    asyncio.run(run())
+
+
+def test_a_process_that_cannot_start_is_no_fault_of_the_picture(monkeypatch):
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.FAIL)
+    with pytest.raises(RetrievalError, match="ended as it started") as error:
+        read(("a", SMALL))
+    assert not isinstance(error.value, ImageError)
 
 
 LIMITS = """
 import sys
 from retrieval.serve import decode_process
 decode_process.DECODE_CPU_S, decode_process.DECODE_BYTES = int(sys.argv[1]), int(sys.argv[2])
-data = sys.stdin.buffer.read()
-try:
-    while True:
-        print(type(decode_process.read_within_limits(data, "x", 32, False, 20_000_000)).__name__)
-        if sys.argv[1] != "0":
-            break
-except MemoryError:
-    print("MemoryError")
+decode_process.serve_pictures()
 """
 
 
 @pytest.mark.parametrize(
     ("seconds", "size", "said"),
     [
-        (5, 200_000_000, "GelImage"),
+        (5, 200_000_000, b"file_bytes"),
         pytest.param(
             5,
             5_000_000,
-            "MemoryError",
+            b"memory",
             marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux holds a process to its memory"),
         ),
-        (0, 200_000_000, -signal.SIGXCPU),
+        (0, 200_000_000, None),
     ],
 )
 def test_a_process_ends_itself_beyond_its_processor_time_and_refuses_what_takes_more_memory(seconds, size, said):
     line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
-    done = subprocess.run(line, input=LARGE, capture_output=True, check=False, timeout=300)
-    assert said in (done.returncode, done.stdout.decode().strip()), done.stderr.decode()
+    asked = frame({"name": "x", "px": 32, "compares": False, "most": MAX_PIXELS}, LARGE)
+    done = subprocess.run(line, input=asked * (1 if said else 200), capture_output=True, check=False, timeout=300)
+    if said is None:
+        assert done.returncode == -signal.SIGXCPU
+    else:
+        assert said in done.stdout, done.stderr.decode()
 
 
 # The service ----------------------------------------------------------------------------------------------------------
@@ -165,7 +182,7 @@ def body_of(*images):
 
 
 def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(index, touch, monkeypatch, tmp_path):
-    monkeypatch.setattr(decoders, "read_within_limits", decoding.hang_on_large)
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
     monkeypatch.setattr("retrieval.serve.uploads.Pictures.named", _named_in(tmp_path))
     honest = body_of(*(path.read_bytes() for path in touch))
     with listening(index, deadline_s=8) as (url, parts):
@@ -253,11 +270,6 @@ def memory(process):
 def children(process):
     tasks = Path(f"/proc/{process}/task").glob("*/children")
     return [int(child) for task in tasks for child in task.read_text().split()]
-
-
-def processes():
-    """Ids of those that the event loop started."""
-    return {process.pid for process in anyio.to_process._process_pool_workers.get()}
 
 
 def is_running(process):

@@ -67,14 +67,14 @@ def test_the_pictures_of_one_request_have_a_bound_together(client):
     one = base64.b64encode(png_file(4000, 4000)).decode()
     told = problem(client.post("/v1/query", json={"touches": [[one] * 2] * 4}), 413, "too-large")
     assert "may have 100,000,000 pixels together; the large ones have 128,000,000" in told
-    tiny = base64.b64encode(png_file(1, 1)).decode()
+    tiny = base64.b64encode(png_file(1, 1, samples=bytes(4))).decode()
     told = problem(client.post("/v1/query", json={"touches": [[tiny] * 5] * 26}), 422, "bad-input")
     assert told == "a request may hold at most 128 pictures; got 130"
     batch = {"objects": [[[tiny] * 5] * 13] * 2}
     assert problem(client.post("/v1/query/batch", json=batch), 422, "bad-input") == told
     background = {"touches": [[tiny] * 2], "background": [tiny, ""]}
     told = problem(client.post("/v1/query", json=background), 422, "bad-image")
-    assert told.startswith("grasp 1, finger a: damaged or truncated")
+    assert told == "background of finger b: the file is empty"
 
 
 # Bodies of many values ------------------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
 def test_bodies_on_their_way_have_a_bound_together_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
-        small, large = {"touches": [["aGk="]]}, {"touches": [["aGk=" * 300_000]]}
+        small, large = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
         limit.held = HELD_BYTES
         assert "too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
         assert limit.held == HELD_BYTES

@@ -63,7 +63,7 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
         return decode_rgb(bytes(image), name)
     if isinstance(image, Image.Image):
         return pillow_rgb(image, name)
-    if not _is_image(image) and not isinstance(image, np.ndarray):
+    if not isinstance(image, np.ndarray):
         raise ImageError(name, f"an image must be {_WANTED}, got {type(image).__name__}")
     if image.dtype != np.uint8:
         raise ImageError(

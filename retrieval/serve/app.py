@@ -115,6 +115,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
         await asyncio.to_thread(parts.queue.close)
+        await parts.decoders.close()
         if parts.keeping:
             parts.keeping.close()
 

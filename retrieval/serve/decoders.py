@@ -7,18 +7,20 @@ that no small one waits for them and their memory does not add up.
 """
 
 import asyncio
+import json
+import sys
 from collections.abc import Sequence
-
-import anyio.to_process
-from anyio import BrokenWorkerProcess, CapacityLimiter
+from typing import Any
 
 from retrieval.data.images import MAX_PIXELS
-from retrieval.errors import ImageError
+from retrieval.errors import ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage, PictureSize
-from retrieval.serve.decode_process import DECODE_BYTES, DECODE_CPU_S, begin, read_within_limits
+from retrieval.serve.decode_process import DECODE_BYTES, DECODE_CPU_S, LENGTHS, READY, frame, image_of
 from retrieval.serve.errors import Problem
 from retrieval.serve.settings import MAX_BODY_PIXELS
 
+PROGRAM = "from retrieval.serve.decode_process import serve_pictures; serve_pictures()"
+_BUFFER_BYTES = 1 << 20
 PROCESSES = 2  # a touch has as many images
 SMALL_PIXELS = 1 << 21
 """Of a picture that is decoded next to others; a sensor of 1920 x 1080 pixels has fewer."""
@@ -28,13 +30,22 @@ class Decoders:
     """Processes that read the pictures of requests, for the event loop that uses it first."""
 
     def __init__(self) -> None:
-        self._processes = CapacityLimiter(PROCESSES + 1)
+        self._idle: list[_Process] = []
+        self._ending: set[asyncio.Task[None]] = set()
         self._small, self._large = asyncio.Semaphore(PROCESSES), asyncio.Semaphore(1)
         self._running: set[asyncio.Task[GelImage | PictureSize]] = set()
 
     async def start(self) -> None:
-        """Start the processes, so that the first query does not wait for them."""
-        await asyncio.gather(*(anyio.to_process.run_sync(begin, limiter=self._processes) for _ in range(PROCESSES)))
+        """Start the processes, so that the first query does not wait for them. Raises RetrievalError."""
+        self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
+
+    async def close(self) -> None:
+        """End all processes; what is being read fails."""
+        running = [*self._running, *self._ending]
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*running, *(process.end() for process in self._idle), return_exceptions=True)
+        self._idle.clear()
 
     async def read(self, named: Sequence[tuple[str, bytes]], px: int, compares: bool) -> list[GelImage]:
         """Read pictures, each with its name, at the sizes of a model whose `touch_px` is px.
@@ -71,17 +82,77 @@ class Decoders:
         self._small.release()
 
     async def _run(self, name: str, data: bytes, px: int, compares: bool, most: int) -> GelImage | PictureSize:
-        """What a process makes of a picture; it is ended where this is cancelled."""
+        """What a process makes of a picture; it is ended where this is cancelled. Raises ImageError, and RetrievalError
+        where no process can be started."""
+        process = self._idle.pop() if self._idle else await _Process.start()
         try:
-            return await anyio.to_process.run_sync(
-                read_within_limits, data, name, px, compares, most, cancellable=True, limiter=self._processes
-            )
-        except (BrokenWorkerProcess, MemoryError):
+            document, content = await process.ask({"name": name, "px": px, "compares": compares, "most": most}, data)
+            self._idle.append(process)
+            return image_of(document, content)
+        except (EOFError, ConnectionError, MemoryError):
             raise ImageError(
                 name,
                 f"decoding it takes more than {DECODE_CPU_S} s of processor time or {DECODE_BYTES // 10**6} MB: "
                 "send a smaller picture",
             ) from None
+        finally:
+            if process not in self._idle:
+                task = asyncio.ensure_future(process.end())
+                self._ending.add(task)
+                task.add_done_callback(self._ending.discard)
+
+
+class _Process:
+    """A process that reads pictures."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self._process = process
+
+    @classmethod
+    async def start(cls) -> "_Process":
+        """Start one, and wait until it has imported what it needs. Raises RetrievalError."""
+        program = f"import sys; sys.path[:] = {sys.path!r}; {PROGRAM}"
+        pipe = asyncio.subprocess.PIPE
+        try:
+            process = cls(
+                await asyncio.create_subprocess_exec(
+                    sys.executable, "-c", program, stdin=pipe, stdout=pipe, limit=_BUFFER_BYTES
+                )
+            )
+        except OSError as error:
+            raise RetrievalError(f"no process can be started that decodes pictures: {error}") from error
+        try:
+            if (await process._answer())[0] == READY:
+                return process
+        except EOFError:
+            pass
+        except BaseException:
+            process._kill()
+            raise
+        await process.end()
+        raise RetrievalError("the process that decodes pictures ended as it started; the log of the service says more")
+
+    async def ask(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
+        """What it answers. Raises EOFError or ConnectionError where it ended."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(frame(document, content))
+        await self._process.stdin.drain()
+        return await self._answer()
+
+    async def _answer(self) -> tuple[dict[str, Any], bytes]:
+        assert self._process.stdout is not None
+        read = self._process.stdout.readexactly
+        text, content = LENGTHS.unpack(await read(LENGTHS.size))
+        return json.loads(await read(text)), await read(content)
+
+    async def end(self) -> None:
+        """End it, whatever it does."""
+        self._kill()
+        await self._process.wait()
+
+    def _kill(self) -> None:
+        if self._process.returncode is None:
+            self._process.kill()
 
 
 def _check_sizes(large: Sequence[tuple[str, PictureSize]]) -> None:
