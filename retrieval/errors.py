@@ -74,6 +74,9 @@ class ImageError(BadInput):
         self.path = str(path)
         self.reason = reason
 
+    def __reduce__(self) -> tuple[type["ImageError"], tuple[str, str]]:
+        return type(self), (self.path, self.reason)
+
 
 class DatasetError(BadInput):
     """A recording or a catalogue is not usable."""

@@ -41,8 +41,9 @@ from robot.recording.folder import RecordingWriter
 from robot.sim.rig import SimRig
 from tests import synthetic
 from tests.conftest import TINY
+from tests.hostile_pictures import png_file
 from tests.serving import command, listening
-from tests.test_retrieval_serve_uploads import HEAD, png
+from tests.test_retrieval_serve_uploads import HEAD
 
 SEED = 20_000
 QUEUE = 8
@@ -359,7 +360,7 @@ def _attack(url, kind, draw):
     """Status of the answer; None where the attacker left."""
     junk = draw.randbytes(draw.choice((0, 10, 10_000, 1_000_000)))
     as_json = {"content-type": "application/json"}
-    bomb = base64.b64encode(png(draw.randrange(5000, 2**31), draw.randrange(5000, 2**31))).decode()
+    bomb = base64.b64encode(png_file(draw.randrange(5000, 2**31), draw.randrange(5000, 2**31))).decode()
     whole = {
         "junk": lambda: {"content": junk, "headers": as_json},
         "json": lambda: {"json": {"touches": [[base64.b64encode(junk).decode()] * 2]}},

@@ -3,17 +3,14 @@
 import base64
 import io
 import socket
-import struct
 import time
-import zlib
 
 import httpx
 import pytest
 from PIL import Image
 
-from retrieval.errors import ImageError
-from retrieval.serve.errors import Problem
-from retrieval.serve.uploads import HELD_BYTES, check_pictures
+from retrieval.serve.uploads import HELD_BYTES, MAX_LARGE_BODIES, PICTURE_PATHS
+from tests.hostile_pictures import png_file
 from tests.serving import listening, problem, service
 
 
@@ -29,23 +26,13 @@ def url(index):
         yield address
 
 
-def png(width, height, data=b""):
-    """A PNG file that says it has these sides; its samples, if any, are not that many."""
-
-    def chunk(kind, content):
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
-
-
 def post(client, *images):
     return client.post("/v1/query", json={"touches": [[base64.b64encode(image).decode() for image in images]]})
 
 
 @pytest.mark.parametrize(("width", "height"), [(4473, 4473), (50_000, 50_000), (2**31 - 1, 2**31 - 1)])
 def test_a_picture_of_more_than_20_million_pixels_is_refused_by_its_header(client, width, height):
-    told = problem(post(client, png(width, height), png(8, 8)), 422, "bad-image")
+    told = problem(post(client, png_file(width, height), png_file(8, 8)), 422, "bad-image")
     assert told.startswith("grasp 1, finger a: ")
     assert "20" in told
 
@@ -64,27 +51,107 @@ def test_a_large_jpeg_is_refused_although_files_of_that_size_are_read_at_a_part_
         b"",
         b"\x00" * 1000,
         b"GIF89a" + b"\x00" * 100,
-        png(64, 64, b"\x00" * 10),
-        png(64, 64)[:40],
+        png_file(64, 64, samples=b"\x00" * 10),
+        png_file(64, 64)[:40],
         b"<svg/>",
         b"\xff\xd8\xff",
     ],
     ids=["empty", "zeros", "gif", "too few samples", "cut off", "svg", "jpeg's first bytes"],
 )
 def test_what_is_no_whole_picture_is_refused_with_its_place(client, image):
-    good = png(8, 8, b"\x00" * 8 * 25)
+    good = png_file(8, 8, samples=b"\x00" * 8 * 25)
     assert "grasp 1, finger b" in problem(post(client, good, image), 422, "bad-image")
 
 
-def test_the_pictures_of_one_request_have_a_bound_together():
-    one = png(4000, 4000)
-    assert check_pictures([[one, one], [one, one]], [one, one]) == 96_000_000
-    with pytest.raises(Problem, match="may have 100,000,000 pixels together; got 112,000,000"):
-        check_pictures([[one] * 7], None)
-    with pytest.raises(Problem, match="at most 128 pictures; got 130"):
-        check_pictures([[png(1, 1)] * 2] * 65, None)
-    with pytest.raises(ImageError, match="background of finger b: the file is empty"):
-        check_pictures([[png(1, 1)]], [png(1, 1), b""])
+def test_the_pictures_of_one_request_have_a_bound_together(client):
+    one = base64.b64encode(png_file(4000, 4000)).decode()
+    told = problem(client.post("/v1/query", json={"touches": [[one] * 2] * 4}), 413, "too-large")
+    assert "may have 100,000,000 pixels together; the large ones have 128,000,000" in told
+    tiny = base64.b64encode(png_file(1, 1, samples=bytes(4))).decode()
+    told = problem(client.post("/v1/query", json={"touches": [[tiny] * 5] * 26}), 422, "bad-input")
+    assert told == "a request may hold at most 128 pictures; got 130"
+    batch = {"objects": [[[tiny] * 5] * 13] * 2}
+    assert problem(client.post("/v1/query/batch", json=batch), 422, "bad-input") == told
+    background = {"touches": [[tiny] * 2], "background": [tiny, ""]}
+    told = problem(client.post("/v1/query", json=background), 422, "bad-image")
+    assert told == "background of finger b: the file is empty"
+
+
+# Bodies of many values ------------------------------------------------------------------------------------------------
+
+JSON = {"content-type": "application/json"}
+MANY = {
+    "lists": b'{"touches":[' + b"[]," * 6_000_000 + b"[]]}",
+    "keys": b'{"touches":[["aGk="]]' + b',"k":1' * 3_000_000 + b"}",
+    "nested": b'{"touches":' + b"[" * 19_000_000,
+    "numbers": b'{"touches":[[' + b"1," * 9_000_000 + b"1]]}",
+}
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_a_body_of_more_values_than_pictures_need_is_refused_before_they_are_made(client, name):
+    begun = time.process_time()
+    told = problem(client.post("/v1/query", content=MANY[name], headers=JSON), 422, "bad-input")
+    assert told.startswith("a body may hold at most 2,000 JSON values; got up to ")
+    assert time.process_time() - begun < 1
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"touches":[["aGk="]],"top":' + b"1" * 19_000_000 + b"}",
+        b'{"touches":[["aGk="]],"none_prior":0.' + b"1" * 19_000_000 + b"}",
+        b'{"' + b"k" * 19_000_000 + b'":1}',
+        b'{"touches":[["' + b"\\u0041" * 3_000_000 + b'"]],"top":0}',
+    ],
+    ids=["integer", "fraction", "key", "escapes"],
+)
+def test_a_value_of_19_mb_is_refused_soon(client, body):
+    begun = time.process_time()
+    assert client.post("/v1/query", content=body, headers=JSON).status_code in (400, 422)
+    assert time.process_time() - begun < 1
+
+
+def test_only_bodies_with_pictures_may_be_large(client):
+    paths = client.get("/openapi.json").json()["paths"]
+    schemas = ("QueryBody", "BatchBody", "AgreementBody")
+    holding = {
+        path
+        for path, operations in paths.items()
+        if any(name in str(operations.get("post", {}).get("requestBody")) for name in schemas)
+    }
+    assert holding == PICTURE_PATHS
+    posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
+    assert posted == {"/v1/session", "/v1/feedback", "/v1/trials", "/v1/trials/{name}/{number}", "/v1/grasp"}
+    for path in posted - {"/v1/grasp"}:
+        large = client.post(path.format(name="x", number=1), content=b"[" * 16_385, headers=JSON)
+        assert "at most 16,384 bytes" in problem(large, 413, "too-large")
+        nested = client.post(path.format(name="x", number=1), content=b"[" * 16_384, headers=JSON)
+        assert nested.status_code in (400, 422)
+
+
+# Forms ----------------------------------------------------------------------------------------------------------------
+
+FORM = {"content-type": "multipart/form-data; boundary=x"}
+PART = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (PART * 300_000 + b"\r\n--x--", "a form may have at most 136 parts; got 300000"),
+        (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + PART + b"\r\n--x--", "at most 4096 bytes of headers"),
+        (b"--x\r\n" + b"\r\n--" * 4_000_000, "the form is not whole"),
+        (b"--x\r\n\r\n\r\n3\r\n--x--", "must name its field"),
+        (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a short text"),
+        (b"", "the form is not whole"),
+    ],
+    ids=["parts", "headers", "half boundaries", "no name", "long", "empty"],
+)
+def test_a_hostile_form_is_refused_soon(client, body, said):
+    begun = time.process_time()
+    assert said in problem(client.post("/v1/query", content=body, headers=FORM), 422, "bad-input")
+    assert time.process_time() - begun < 1
 
 
 # Bodies on the line ---------------------------------------------------------------------------------------------------
@@ -147,14 +214,19 @@ def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
         assert answer(connection)[0] == 200
 
 
-def test_bodies_on_their_way_have_a_bound_together(index):
-    assert HELD_BYTES == 80_000_000
+def test_bodies_on_their_way_have_a_bound_together_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
+        small, large = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
         limit.held = HELD_BYTES
-        refused = client.post("/v1/query", json={"touches": [["aGk="]]})
-        assert "too many large requests" in problem(refused, 429, "busy")
+        assert "too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
         assert limit.held == HELD_BYTES
+        limit.held, limit.large = 0, MAX_LARGE_BODIES
+        assert "too many large requests" in problem(client.post("/v1/query", json=large), 429, "busy")
+        problem(client.post("/v1/query", json=small), 422, "bad-image")
+        limit.large = MAX_LARGE_BODIES - 1
+        problem(client.post("/v1/query", json=large), 422, "bad-image")
+        assert (limit.held, limit.large) == (0, MAX_LARGE_BODIES - 1)
 
 
 def middlewares(app):

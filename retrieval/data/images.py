@@ -19,6 +19,7 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError, features
 
 from indexes.store.regular import read_regular
+from retrieval.data.picture_structure import check_structure, png_chunks
 from retrieval.data.resize import RgbImage, Samples, to_unit
 from retrieval.errors import BadInput, ImageError
 
@@ -31,12 +32,15 @@ MAX_PIXELS = 20_000_000
 """Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
 MOST_REDUCED = 160_000_000
 """Pixels of such a file."""
+MAX_SIDE, MAX_ASPECT = 65_535, 200
+"""Of a picture: pixels of a side, which is what JPEG can say, and of the longer side for each of the shorter."""
 MAX_BYTES = 512 * 2**20
 
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"})
+_STRIP = 1 << 20  # pixels
 _ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
 
 
@@ -114,6 +118,8 @@ def decode(data: bytes, name: str | Path, least: int | None = None) -> Samples:
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
     """(width, height) of a picture as its file says, and nothing is decoded. Raises ImageError as `decode_rgb` does."""
+    if (size := _webp_size(data)) != (1, 1):
+        return size
     with _opened(data, name) as image:
         width, height = image.size
         return width, height
@@ -126,6 +132,7 @@ def _opened(data: bytes, name: str | Path) -> Iterator[Image.Image]:
         raise ImageError(name, "the file is empty")
     try:
         check_pixels(_webp_size(data), name)
+        check_structure(data, name)
         decoder = _other_decoder(data, name)
         with _quiet:
             try:
@@ -216,6 +223,11 @@ def check_pixels(size: tuple[int, int], name: str | Path) -> None:
         raise ImageError(name, f"has no pixels ({width} x {height})")
     if width * height > MAX_PIXELS:
         raise ImageError(name, _too_large(f"{width} x {height} = {width * height}"))
+    if max(size) > min(MAX_SIDE, MAX_ASPECT * min(size)):
+        raise ImageError(
+            name,
+            f"{width} x {height} pixels; a side may have at most {MAX_SIDE}, and {MAX_ASPECT} for each of the other",
+        )
 
 
 def _too_large(size: str) -> str:
@@ -245,9 +257,20 @@ def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
     if image.mode not in _EIGHT_BIT_MODES:
         raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
     if not image.has_transparency_data:
-        return np.array(image if image.mode == "RGB" else image.convert("RGB"))
+        return _rgb(image)
     samples = to_float(np.asarray(image.convert("RGBA")))
     return _on_white(samples[..., :3], samples[..., 3:])
+
+
+def _rgb(image: Image.Image) -> npt.NDArray[np.uint8]:
+    """The samples of an opaque image of 8 bits, taken strip by strip: Pillow copies what it hands over twice."""
+    width, height = image.size
+    rgb = np.empty((height, width, 3), np.uint8)
+    rows = max(1, _STRIP // width)
+    for top in range(0, height, rows):
+        strip = image.crop((0, top, width, min(top + rows, height)))
+        rgb[top : top + rows] = np.asarray(strip if strip.mode == "RGB" else strip.convert("RGB"))
+    return rgb
 
 
 def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
@@ -275,11 +298,9 @@ def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
 
 
 def _chunks_fit(data: bytes) -> bool:
-    """Whether all chunks of a PNG file end inside it; OpenCV allocates what a chunk claims, up to 4 GB."""
-    start = 8
-    while start + 12 <= len(data) and data[start + 4 : start + 8] != b"IEND":
-        start += 12 + int.from_bytes(data[start : start + 4], "big")
-    return start + 12 <= len(data)
+    """Whether a PNG file ends with IEND and all its chunks end inside it; OpenCV allocates what a chunk claims."""
+    kind, end = list(png_chunks(data))[-1]
+    return kind == b"IEND" and end <= len(data)
 
 
 def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32], premultiplied: bool = False) -> RgbImage:

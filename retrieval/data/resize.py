@@ -43,10 +43,10 @@ def to_unit(image: Samples) -> RgbImage:
 
 def resized(samples: Samples, size: tuple[int, int]) -> RgbImage:
     """As `resize`, for pictures (H, W, C) of any number of channels, and without its checks."""
-    image = to_unit(samples)
+    image = samples
     for axis in axes(image.shape, size):
         image = _resize_axis(image, axis, size[axis])
-    return image
+    return to_unit(image)
 
 
 def axes(old: Sequence[int], new: Sequence[int]) -> list[int]:
@@ -54,9 +54,9 @@ def axes(old: Sequence[int], new: Sequence[int]) -> list[int]:
     return [axis for axis in sorted((0, 1), key=lambda axis: new[axis] / old[axis]) if old[axis] != new[axis]]
 
 
-def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
+def _resize_axis(image: Samples, axis: int, length: int) -> RgbImage:
     """Mix rows, or columns where they lie: to turn the image over, so that columns are rows, takes five times as long
-    as to mix them."""
+    as to mix them. Only the samples of one tap are in float32 at once."""
     table = np.ascontiguousarray(image).reshape(image.shape[0], -1)
     columns, weights = axis_weights(image.shape[axis], length)
     channels = image.shape[2]
@@ -65,11 +65,14 @@ def _resize_axis(image: RgbImage, axis: int, length: int) -> RgbImage:
         weights = np.repeat(weights, channels, axis=1)[:, None, :]
     else:
         weights = weights[:, :, None]
-    mixed = table.take(columns[0], axis=axis)
+    mixed = to_unit(table.take(columns[0], axis=axis))
     mixed *= weights[0]
     part = np.empty_like(mixed)
+    taken = part if table.dtype == np.float32 else np.empty(part.shape, np.uint8)
     for column, weight in zip(columns[1:], weights[1:], strict=True):
-        np.take(table, column, axis=axis, out=part, mode="clip")  # other modes copy once more; all columns are inside
+        np.take(table, column, axis=axis, out=taken, mode="clip")  # other modes copy once more; all columns are inside
+        if taken is not part:
+            np.divide(taken, 255, out=part, dtype=np.float32)
         part *= weight
         mixed += part
     out: RgbImage = mixed.reshape((-1, length, channels) if axis else (length, -1, channels))

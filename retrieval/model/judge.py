@@ -21,7 +21,7 @@ from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, NumericalError
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
-_BLOCKS = 16
+BLOCKS = 16
 _MOST = 1e6
 
 
@@ -81,7 +81,7 @@ def contact_level(touch: RgbImage, untouched: RgbImage) -> float:
 
     Both (H, W, 3) in 0..1; compared in 16 x 16 blocks, whose means leave the noise of single pixels out.
     """
-    size = (_BLOCKS, _BLOCKS)
+    size = (BLOCKS, BLOCKS)
     return 255 * float(np.abs(resize(touch, size) - resize(untouched, size)).max())
 
 

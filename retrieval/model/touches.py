@@ -25,12 +25,14 @@ from PIL import Image
 
 from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb, to_float
 from retrieval.data.resize import RgbImage
-from retrieval.errors import BadInput, ImageError, NumericalError
+from retrieval.errors import BadInput, ImageError, NumericalError, Unanswered
 from retrieval.model.config import Config
+from retrieval.model.gel_images import GelImage
 from retrieval.model.judge import contact_level
 
-AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any]
-"""A path (text is one), the bytes of a file, a Pillow image, or an array (H, W, 3) uint8, red first."""
+AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
+"""A path (text is one), the bytes of a file, a Pillow image, an array (H, W, 3) uint8, red first, or a gel image that
+another process read."""
 AnyTouches: TypeAlias = AnyImage | Sequence[AnyImage] | Sequence[Sequence[AnyImage]]
 """One grasp or several, as the text above says. An array of 4 or 5 axes is a list of those below it."""
 
@@ -61,7 +63,7 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
         return decode_rgb(bytes(image), name)
     if isinstance(image, Image.Image):
         return pillow_rgb(image, name)
-    if not _is_image(image) and not isinstance(image, np.ndarray):
+    if not isinstance(image, np.ndarray):
         raise ImageError(name, f"an image must be {_WANTED}, got {type(image).__name__}")
     if image.dtype != np.uint8:
         raise ImageError(
@@ -117,7 +119,7 @@ def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str
 def _is_image(item: object) -> bool:
     if isinstance(item, np.ndarray):
         return item.ndim <= 3
-    return isinstance(item, str | os.PathLike | bytes | bytearray | memoryview | Image.Image)
+    return isinstance(item, str | os.PathLike | bytes | bytearray | memoryview | Image.Image | GelImage)
 
 
 def _items(given: object, of: str) -> list[Any]:
@@ -134,7 +136,7 @@ def _name(image: AnyImage, place: str, finger: int) -> str:
     elif isinstance(image, Image.Image):
         kind = f"Pillow image {image.width} x {image.height} {image.mode}"
     else:
-        kind = f"{len(bytes(image))} bytes"
+        kind = f"{image.file_bytes if isinstance(image, GelImage) else len(bytes(image))} bytes"
     letter = ascii_lowercase[finger] if finger < len(ascii_lowercase) else str(finger + 1)
     return f"{place} {letter} ({kind})"
 
@@ -262,7 +264,7 @@ class TouchReader:
         self.encoder, self.fingers, self._compares = encoder, config.matcher.fingers, compares
         self._preprocessing = config.preprocessing
 
-    def references(self, background: Sequence[AnyImage] | None) -> Sequence[RgbImage | None]:
+    def references(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
         """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
         that is missing, and for one that would not be looked at."""
         policy = self._preprocessing.background
@@ -278,10 +280,10 @@ class TouchReader:
         frames = read_grasps(background, self.fingers, what="background")
         if len(frames) != 1:
             raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
-        return [frame.read() for frame in frames[0]]
+        return [self._gel_image(frame, True) for frame in frames[0]]
 
     def encode(
-        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None], clock: Stopwatch
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[GelImage | None], clock: Stopwatch
     ) -> TouchCodes:
         """The codes of grasps, made in batches; the clock counts the stages "decode" and "encode". references: the
         no-contact frame of each finger, or None."""
@@ -302,7 +304,7 @@ class TouchReader:
         )
 
     def _views(
-        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[RgbImage | None]
+        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[GelImage | None]
     ) -> list[list[tuple[RgbImage, float]]]:
         """The images of grasps as the tower sees them, and how far each is from its no-contact frame (0 without one);
         made side by side; of several bad ones the first is told.
@@ -316,11 +318,13 @@ class TouchReader:
                 with suppress(Exception):  # told by `read`
                     given.image.load()
 
-        def view(given: GivenImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
+        def view(given: GivenImage, reference: GelImage | None) -> tuple[RgbImage, float]:
             with _forks.computing():
-                image = given.read()
-                level = 0.0 if reference is None else contact_level(image, reference)
-                return self._preprocessing.touch(image, reference if subtracts else None), level
+                image = self._gel_image(given, reference is not None)
+                if reference is None:
+                    return self._preprocessing.touch(image.touch), 0.0
+                level = contact_level(_blocks(image), _blocks(reference))
+                return self._preprocessing.touch(image.touch, reference.touch if subtracts else None), level
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
@@ -328,6 +332,22 @@ class TouchReader:
                 for grasp in grasps
             ]
             return [[job.result() for job in grasp] for grasp in jobs]
+
+    def _gel_image(self, given: GivenImage, compares: bool) -> GelImage:
+        """An image at the sizes of this model. compares: with a no-contact frame. Raises ImageError, and Unanswered for
+        one that was read for another model."""
+        px = self._preprocessing.touch_px
+        if not isinstance(given.image, GelImage):
+            return GelImage.of(given.read(), px, compares)
+        if given.image.touch.shape != (px, px, 3):
+            raise Unanswered("an index of another model was opened meanwhile; ask again")
+        return given.image
+
+
+def _blocks(image: GelImage) -> RgbImage:
+    if image.blocks is None:
+        raise BadInput("a gel image was read without the blocks that are compared with a no-contact frame")
+    return image.blocks
 
 
 def _finite(values: Floats, name: str) -> Floats:

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from retrieval.search.opening import OpenShards
 from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
+from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
@@ -70,15 +71,17 @@ def create_app(
     """
     metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
+    decoders = Decoders()
     alone = replace(settings, workers=1, batch_most=1, batch_ms=0.0)
     parts = Service(
         settings,
         metrics,
         generations,
-        Queue(generations, settings, metrics),
-        Queue(generations, replace(alone, queue=MAX_GRASPS), metrics),
+        decoders,
+        Queue(generations, settings, metrics, decoders),
+        Queue(generations, replace(alone, queue=MAX_GRASPS), metrics, decoders),
         {
-            name: Queue(generations, replace(alone, queue=settings.streams + MAX_FRAMES), metrics)
+            name: Queue(generations, replace(alone, queue=settings.streams + MAX_FRAMES), metrics, decoders)
             for name in rig.sensors
         },
         rig,
@@ -120,7 +123,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         queue.start()
     if parts.keeping:
         parts.keeping.start()
-    watching = asyncio.ensure_future(parts.generations.watch())
+    running = [asyncio.ensure_future(one) for one in (parts.decoders.start(), parts.generations.watch())]
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
             yield
@@ -128,8 +131,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         parts.stopping.set()
         if parts.keeping:
             await parts.keeping.written()
-        watching.cancel()
-        await asyncio.wait([watching], timeout=_CLOSING_S)
+        for task in running:
+            task.cancel()
+        await asyncio.wait([*running, asyncio.ensure_future(parts.decoders.close())], timeout=_CLOSING_S)
         closing: list[Callable[[], None]] = [partial(queue.close, _CLOSING_S) for queue in queues]
         if parts.keeping:
             closing.append(parts.keeping.close)

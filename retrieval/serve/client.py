@@ -15,6 +15,7 @@ from PIL import Image
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
+from retrieval.model.gel_images import GelImage
 from retrieval.model.touches import AnyImage, AnyTouches, GivenImage, read_grasps
 from retrieval.search.answer import Match, QueryResult
 
@@ -188,6 +189,7 @@ def _file(given: GivenImage) -> bytes:
         return _png(image, given.name)
     if isinstance(image, Image.Image | np.ndarray):
         return _png(Image.fromarray(np.rint(255 * given.read()).astype(np.uint8)), given.name)
+    assert not isinstance(image, GelImage), "only the service reads gel images ahead"
     return read_bytes(os.fspath(image))
 
 

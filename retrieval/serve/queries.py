@@ -16,8 +16,8 @@ from retrieval.serve.uploads import (
     BatchBody,
     Grasps,
     Picture,
-    check_pictures,
     json_body,
+    pictures_of,
     read_json,
     read_query,
 )
@@ -52,13 +52,14 @@ async def query_growing(request: Request, parts: Parts, alone: bool = False) -> 
     asked = await read_query(request, parts.generations.current.fingers)
 
     def work(opened: Opened) -> dict[str, list[QueryResult]]:
-        searcher, each = opened.searcher, [[grasp] for grasp in asked.touches if alone]
+        searcher, (touches,) = opened.searcher, asked.pictures.images
+        each = [[grasp] for grasp in touches if alone]
         return {
-            "answers": searcher.query_growing(asked.touches, **asked.keywords),
+            "answers": searcher.query_growing(touches, **asked.keywords),
             "alone": searcher.query_many(each, **asked.keywords),
         }
 
-    found = await parts.queue.do(work, request, asked.options.deadline_ms)
+    found = await parts.queue.do(work, request, asked.options.deadline_ms, asked.pictures)
     return DocumentResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
 
 
@@ -67,11 +68,12 @@ async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     """Several objects in one request: their touches are encoded together, an answer for each in their order."""
     parts.queue.require_room()
     body = await read_json(request, BatchBody)
-    for number, touches in enumerate(body.objects, start=1):
-        check_pictures(touches, body.background, f"object {number}, ")
-    asked = Asked([], body.background, body)
+    asked = Asked(pictures_of(body.objects, body.background, is_batch=True), body)
     answers = await parts.queue.do(
-        lambda opened: opened.searcher.query_many(body.objects, **asked.keywords), request, body.deadline_ms
+        lambda opened: opened.searcher.query_many(asked.pictures.images, **asked.keywords),
+        request,
+        body.deadline_ms,
+        asked.pictures,
     )
     for answer in answers:
         parts.metrics.answered(answer)
@@ -99,15 +101,15 @@ async def agree(request: Request, parts: Parts) -> AgreementDocument:
     """Where a photo agrees with a touch: the match logit's fall as one square after the other is hidden."""
     parts.queue.require_room()
     body = await read_json(request, AgreementBody)
-    check_pictures(body.touches, body.background)
+    pictures = pictures_of([body.touches], body.background)
 
     def work(opened: Opened) -> AgreementDocument:
         photo = photo_of(opened, body.photo)
         found = agreement(
             opened.searcher,
-            body.touches,
+            pictures.images[0],
             opened.searcher.catalogue / photo.path,
-            background=body.background,
+            background=pictures.frames,
             model=opened.checkpoint(),
             squares=body.squares,
         )
@@ -120,4 +122,4 @@ async def agree(request: Request, parts: Parts) -> AgreementDocument:
             falls=found.falls.tolist(),
         )
 
-    return await parts.queue.do(work, request)
+    return await parts.queue.do(work, request, pictures=pictures)

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple, TypeVar
 from starlette.requests import Request
 
 from retrieval.search.answer import QueryResult
+from retrieval.serve.decoders import Decoders
 from retrieval.serve.errors import Problem
 from retrieval.serve.generations import Generations, Opened
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.uploads import Asked
+from retrieval.serve.uploads import Asked, Pictures
 
 Result = TypeVar("Result")
 
@@ -35,7 +36,7 @@ class Answered(NamedTuple):
 
 @dataclass(eq=False)
 class _Job:
-    """Work for the model. asked: the query, where it is one and nothing else."""
+    """Work for the model, its pictures read. asked: the query, where it is one and nothing else."""
 
     work: Callable[[Opened], Any]
     asked: Asked | None
@@ -48,8 +49,11 @@ class Queue:
     """Requests that wait for the model, in the order in which they came. The threads that work on them take one after
     the other themselves: none waits for the event loop in between."""
 
-    def __init__(self, generations: Generations, settings: ServiceSettings, metrics: Metrics) -> None:
+    def __init__(
+        self, generations: Generations, settings: ServiceSettings, metrics: Metrics, decoders: Decoders
+    ) -> None:
         self._generations, self._settings, self._metrics = generations, settings, metrics
+        self._decoders = decoders
         self._jobs: deque[_Job] = deque()
         self._changed, self._closed = Condition(), False
         self._threads: list[Thread] = []
@@ -89,9 +93,10 @@ class Queue:
     async def ask(self, asked: Asked, request: Request) -> Answered:
         """Answer a query. Raises Problem, and the errors of `Searcher.query`."""
         answered: Answered = await self.do(
-            lambda opened: Answered(opened.searcher.query(asked.touches, **asked.keywords), opened.model),
+            lambda opened: Answered(opened.searcher.query(asked.pictures.images[0], **asked.keywords), opened.model),
             request,
             asked.options.deadline_ms,
+            asked.pictures,
             asked,
         )
         self._metrics.answered(answered.result)
@@ -102,20 +107,18 @@ class Queue:
         work: Callable[[Opened], Result],
         request: Request,
         deadline_ms: float | None = None,
+        pictures: Pictures | None = None,
         asked: Asked | None = None,
     ) -> Result:
-        """Have `work` done with the generation that answers when its turn comes. Raises Problem, and what it raises."""
+        """Have `pictures` read, and `work` done with the generation that answers when its turn comes. Raises Problem,
+        ImageError, and what the work raises."""
         self.require_room()
         now = time.monotonic()
         seconds = min(self._settings.deadline_s, (deadline_ms or 1e9) / 1e3)
-        answer: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._held += 1
         self._metrics.held.inc()
+        answer = asyncio.ensure_future(self._answer(work, pictures, asked, now, now + seconds))
         answer.add_done_callback(self._let_go)
-        job = _Job(work, asked, answer, now, now + seconds)
-        with self._changed:
-            self._jobs.append(job)
-            self._changed.notify_all()
         gone: asyncio.Future[None] = asyncio.ensure_future(_gone(request))
         either: set[asyncio.Future[Any]] = {answer, gone}
         try:
@@ -128,6 +131,29 @@ class Queue:
         finally:
             gone.cancel()
             answer.cancel()
+
+    async def _answer(
+        self,
+        work: Callable[[Opened], Result],
+        pictures: Pictures | None,
+        asked: Asked | None,
+        began: float,
+        deadline: float,
+    ) -> Result:
+        """Have pictures read, then wait for the model. Cancelling stops both."""
+        if pictures is not None:
+            px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
+            images = await self._decoders.read(pictures.named(), px, pictures.background is not None)
+            pictures.take(iter(images))
+            self._metrics.stages.labels("pictures").observe(time.monotonic() - began)
+        answer: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
+        job = _Job(work, asked, answer, began, deadline)
+        with self._changed:
+            self._jobs.append(job)
+            self._changed.notify_all()
+        try:
+            return await answer
+        finally:
             with self._changed:
                 if job in self._jobs:
                     self._jobs.remove(job)
@@ -158,7 +184,7 @@ class Queue:
             while first.asked and len(jobs) < self._settings.batch_most:
                 if not self._changed.wait_for(lambda: self._jobs, until - time.monotonic()):
                     break
-                if not (asked := self._jobs[0].asked) or asked.keywords != first.asked.keywords:
+                if not (asked := self._jobs[0].asked) or not asked.goes_with(first.asked):
                     break
                 jobs.append(self._jobs.popleft())
             return jobs
@@ -190,7 +216,7 @@ def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
 def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
     try:
-        found = opened.searcher.query_many([one.touches for one in asked], **asked[0].keywords)
+        found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
     except BaseException:  # each alone says which of them it was
         return None
     return [Answered(result, opened.model) for result in found]

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from retrieval.data.images import decode_rgb
+from retrieval.data.images import decode
 from retrieval.model.judge import CONTACT
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.store import BACKGROUND, Store
@@ -84,5 +84,6 @@ def recordable(data: bytes) -> bytes:
     """A picture's file as a recording may hold it: PNG or JPEG as it is, another as PNG. Raises ImageError."""
     if data.startswith(_RECORDABLE):
         return data
-    pixels = np.rint(255 * decode_rgb(data, "a picture")).astype(np.uint8)
+    samples = decode(data, "a picture")
+    pixels = samples if samples.dtype == np.uint8 else np.rint(255 * samples).astype(np.uint8)
     return bytes(cv2.imencode(".png", pixels[..., ::-1])[1].tobytes())

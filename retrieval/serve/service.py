@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.keeping import Keeping as Keeping
 from retrieval.serve.metrics import Metrics
@@ -47,6 +48,7 @@ class Service:
     settings: ServiceSettings
     metrics: Metrics
     generations: Generations
+    decoders: Decoders
     queue: Queue
     grasps: Queue
     frames: Mapping[str, Queue]

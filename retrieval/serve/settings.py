@@ -9,9 +9,12 @@ from retrieval.data.images import MAX_PIXELS
 from retrieval.errors import ConfigError
 
 MAX_BODY_BYTES = 20_000_000
+"""Of a request with pictures; of any other, MAX_SMALL_BODY_BYTES."""
+MAX_SMALL_BODY_BYTES = 16_384
 MAX_BODY_PIXELS = 5 * MAX_PIXELS
 """Of all pictures of one request together; of each, MAX_PIXELS."""
 MAX_PICTURES = 128
+"""Of one request."""
 LEAST_TOKEN = 16
 
 

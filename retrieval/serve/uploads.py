@@ -7,51 +7,65 @@ multipart/form-data   gelsight, once for each image, fingers in their order, gra
 import asyncio
 import base64
 import binascii
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from string import ascii_lowercase
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, WithJsonSchema
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, UploadFile
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from retrieval.data.images import MAX_PIXELS, picture_size
-from retrieval.errors import ImageError
+from retrieval.model.gel_images import GelImage
 from retrieval.model.posterior import NONE_PRIOR
 from retrieval.serve.errors import Problem, invalid
-from retrieval.serve.settings import MAX_BODY_BYTES, MAX_BODY_PIXELS, MAX_PICTURES
+from retrieval.serve.forms import form_parts
+from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 
-HELD_BYTES = 4 * MAX_BODY_BYTES
-"""Of all bodies that are on their way at once."""
+PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/query/growing", "/v1/agreement"})
+"""Whose bodies hold pictures, and may have MAX_BODY_BYTES; all others have MAX_SMALL_BODY_BYTES."""
+LARGE_BYTES = 1_000_000
+"""A body with more is a large one."""
+MAX_LARGE_BODIES = 2
+"""At once."""
+HELD_BYTES = 20_000_000
+"""Of all other bodies together."""
 PARSED_AT_ONCE_BYTES = 1 << 18
 """Sooner than a thread begins."""
+MAX_JSON_VALUES = 2_000
+"""In one body: MAX_PICTURES in lists of their own, of objects of their own, and the options make fewer than 800."""
+MAX_FIELD_BYTES = 1000
+"""Of an option in a form."""
 Body = TypeVar("Body", bound=BaseModel)
 MOST_GRASPS, MOST_OBJECTS = 32, 32
 _CLOSE = {"connection": "close"}  # what is left of the body is not read
+_AGAIN = _CLOSE | {"retry-after": "1"}
 
 
 class BodyLimit:
-    """Bodies of at most MAX_BODY_BYTES, within `seconds`, and of HELD_BYTES together."""
+    """Bodies as large as their path takes, within `seconds`, MAX_LARGE_BODIES at once, the others of HELD_BYTES
+    together."""
 
     def __init__(self, app: ASGIApp, seconds: float) -> None:
-        self.app, self.seconds, self.held = app, seconds, 0
+        self.app, self.seconds, self.held, self.large = app, seconds, 0, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, whose body is refused where it is too large or too slow (ASGI)."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        most = MAX_BODY_BYTES if scope["path"] in PICTURE_PATHS else MAX_SMALL_BODY_BYTES
         announced = Headers(scope=scope).get("content-length", "0")
-        if announced.isdecimal() and int(announced[:20]) > MAX_BODY_BYTES:
-            await too_large().response()(scope, receive, send)
+        if announced.isdecimal() and int(announced[:20]) > most:
+            await too_large(most).response()(scope, receive, send)
             return
-        deadline, received, whole = asyncio.get_running_loop().time() + self.seconds, 0, False
+        deadline, received, held = asyncio.get_running_loop().time() + self.seconds, 0, 0
+        whole = is_large = False
 
         async def limited() -> Message:
-            nonlocal received, whole
+            nonlocal received, held, whole, is_large
             if whole:  # what comes now is the end of the connection
                 return await receive()
             try:
@@ -60,25 +74,32 @@ class BodyLimit:
             except TimeoutError:
                 raise Problem("too-slow", f"the body must come within {self.seconds:g} s", _CLOSE) from None
             size = len(message.get("body", b""))
-            received, self.held = received + size, self.held + size
-            if received > MAX_BODY_BYTES:
-                raise too_large()
-            if self.held > HELD_BYTES:
-                raise Problem(
-                    "busy", "too many large requests are on their way; try again", _CLOSE | {"retry-after": "1"}
-                )
+            received += size
+            if received > most:
+                raise too_large(most)
+            if received <= LARGE_BYTES:
+                held, self.held = received, self.held + size
+                if self.held > HELD_BYTES:
+                    raise Problem("busy", "too many requests are on their way; try again", _AGAIN)
+            elif not is_large:
+                if self.large >= MAX_LARGE_BODIES:
+                    raise Problem("busy", "too many large requests are on their way; try again", _AGAIN)
+                is_large, self.large = True, self.large + 1
+                held, self.held = 0, self.held - held
             whole = not message.get("more_body", False)
             return message
 
         try:
             await self.app(scope, limited, send)
         finally:
-            self.held -= received
+            self.large -= is_large
+            self.held -= held
 
 
-def too_large() -> Problem:
-    """What is answered to a body that is too large."""
-    return Problem("too-large", f"a request may hold at most {MAX_BODY_BYTES:,} bytes; send smaller pictures", _CLOSE)
+def too_large(most: int) -> Problem:
+    """What is answered to a body of more than `most` bytes."""
+    advice = "; send smaller pictures" if most == MAX_BODY_BYTES else ""
+    return Problem("too-large", f"a request to this path may hold at most {most:,} bytes{advice}", _CLOSE)
 
 
 def _decoded(text: Any) -> bytes:
@@ -169,70 +190,139 @@ def json_body(model: str) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
+@dataclass(eq=False)
+class Pictures:
+    """The files of a request's pictures, and what the matcher looks at of them, once `Queue.do` had them read.
+
+    files: for each object its grasps, for each grasp a file for each finger. background: the fingers' no-contact
+    frames. is_batch: whether messages name the object. images, frames: the same, read.
+    """
+
+    files: Sequence[Sequence[Sequence[bytes]]]
+    background: Sequence[bytes] | None
+    is_batch: bool = False
+    images: list[list[list[GelImage]]] = field(default_factory=list)
+    frames: list[GelImage] | None = None
+
+    def named(self) -> list[tuple[str, bytes]]:
+        """Each file, and how messages and answers call it."""
+        found = [
+            (f"{f'object {at}, ' if self.is_batch else ''}grasp {number}, finger {_letter(place)}", data)
+            for at, grasps in enumerate(self.files, start=1)
+            for number, grasp in enumerate(grasps, start=1)
+            for place, data in enumerate(grasp)
+        ]
+        found += [(f"background of finger {_letter(place)}", data) for place, data in enumerate(self.background or ())]
+        return found
+
+    def take(self, images: Iterator[GelImage]) -> None:
+        """Take the read images, in the order of `named`."""
+        self.images = [[[next(images) for _ in grasp] for grasp in grasps] for grasps in self.files]
+        self.frames = None if self.background is None else list(images)
+
+
 @dataclass(frozen=True)
 class Asked:
-    """A query that may be asked: its pictures are of known kinds and sizes; nothing is decoded yet."""
+    """A query that may be asked; its pictures are still to be read."""
 
-    touches: list[list[bytes]]
-    background: list[bytes] | None
+    pictures: Pictures
     options: Options
 
     @property
+    def touches(self) -> Sequence[Sequence[bytes]]:
+        """The files of the touches of a single object."""
+        return self.pictures.files[0]
+
+    @property
+    def background(self) -> Sequence[bytes] | None:
+        """The files of the no-contact frames."""
+        return self.pictures.background
+
+    @property
     def keywords(self) -> dict[str, Any]:
-        """The keywords of `Searcher.query`, all but the touches."""
+        """The keywords of `Searcher.query`, all but the touches; the pictures must have been read."""
         said = self.options
         return {
-            "background": self.background,
+            "background": self.pictures.frames,
             "top": said.top,
             "candidates": said.candidates,
             "none_prior": said.none_prior,
         }
 
+    def goes_with(self, other: "Asked") -> bool:
+        """Whether both can be answered together."""
+        return {**self.keywords, "background": self.background} == {**other.keywords, "background": other.background}
+
+
+def pictures_of(
+    objects: Sequence[Sequence[Sequence[bytes]]], background: Sequence[bytes] | None, is_batch: bool = False
+) -> Pictures:
+    """The pictures of a request. Raises Problem where there are too many."""
+    count = sum(len(grasp) for grasps in objects for grasp in grasps) + len(background or ())
+    if count > MAX_PICTURES:
+        raise Problem("bad-input", f"a request may hold at most {MAX_PICTURES} pictures; got {count}")
+    return Pictures(objects, background, is_batch)
+
 
 async def read_query(request: Request, fingers: int) -> Asked:
-    """The query in a request's body, for a model with so many fingers. Raises Problem, ImageError."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind == "multipart/form-data":
-        return await _from_form(request, fingers)
+    """The query in a request's body, for a model with so many fingers. Raises Problem."""
+    if _content_type(request) == "multipart/form-data":
+        data = await _body_of(request)
+        return await run_in_threadpool(_from_form, data, request.headers["content-type"], fingers)
     body = await read_json(request, QueryBody)
-    check_pictures(body.touches, body.background)
-    return Asked(body.touches, body.background, body)
+    return Asked(pictures_of([body.touches], body.background), body)
 
 
 async def read_json(request: Request, model: type[Body]) -> Body:
     """The JSON body of a request, read within its limits; a large one is parsed off the event loop. Raises Problem."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = _content_type(request)
     if kind != "application/json":
         raise Problem("unsupported-type", f"the body must be application/json; got {kind[:100] or 'no content-type'}")
-    data = await request.body()
+    data = await _body_of(request)
     try:
         if len(data) <= PARSED_AT_ONCE_BYTES:
-            return model.model_validate_json(data)
-        return await run_in_threadpool(model.model_validate_json, data)
+            return _parsed(data, model)
+        return await run_in_threadpool(_parsed, data, model)
     except ValidationError as error:
         wrong = error.errors(include_input=False, include_url=False, include_context=False)
         broken = any(one["type"] == "json_invalid" for one in wrong)
         raise Problem("malformed" if broken else "bad-input", invalid(wrong)) from None
 
 
-async def _from_form(request: Request, fingers: int) -> Asked:
-    await request.body()  # whole before it is parsed: older parsers leave files open where it ends early
-    async with request.form(max_files=MAX_PICTURES, max_fields=8, max_part_size=1000) as form:
-        pictures: dict[str, list[bytes]] = {"gelsight": [], "background": []}
-        said: dict[str, str] = {}
-        for name, value in form.multi_items():
-            if isinstance(value, UploadFile) != (name in pictures):
-                what = "a file" if name in pictures else "a short text"
-                raise Problem("bad-input", f"{name[:100]!r} must be {what}, and one of gelsight, background, top, ...")
-            if isinstance(value, UploadFile):
-                pictures[name].append(await value.read())
-            else:
-                said[name] = value
+def _content_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def _body_of(request: Request) -> bytes:
+    """The whole body, which the request does not keep."""
+    return b"".join([chunk async for chunk in request.stream()])
+
+
+def _parsed(data: bytes, model: type[Body]) -> Body:
+    """The body, made when it cannot hold more values than MAX_JSON_VALUES: each but the first follows one of `,:[{`,
+    which base64 has not. Raises Problem and ValidationError."""
+    values = 1 + sum(map(data.count, (b",", b":", b"[", b"{")))
+    if values > MAX_JSON_VALUES:
+        raise Problem("bad-input", f"a body may hold at most {MAX_JSON_VALUES:,} JSON values; got up to {values:,}")
+    return model.model_validate_json(data)
+
+
+def _from_form(data: bytes, content_type: str, fingers: int) -> Asked:
+    files: dict[str, list[bytes]] = {"gelsight": [], "background": []}
+    said: dict[str, str] = {}
+    for name, is_file, content in form_parts(data, content_type):
+        if is_file != (name in files) or (not is_file and len(content) > MAX_FIELD_BYTES):
+            what = "a file" if name in files else "a short text"
+            raise Problem("bad-input", f"{name[:100]!r} must be {what}, and one of gelsight, background, top, ...")
+        if is_file:
+            files[name].append(content)
+        else:
+            said[name] = content.decode("utf-8", "replace")
     try:
         options = Options.model_validate(said)
     except ValidationError as error:
         raise Problem("bad-input", invalid(error.errors(include_input=False, include_url=False))) from None
-    images = pictures["gelsight"]
+    images = files["gelsight"]
     if not images or len(images) % fingers:
         raise Problem(
             "bad-input",
@@ -240,37 +330,9 @@ async def _from_form(request: Request, fingers: int) -> Asked:
             f"each grasp; got {len(images)}",
         )
     touches = [images[start : start + fingers] for start in range(0, len(images), fingers)]
-    background = pictures["background"] or None
     if len(touches) > MOST_GRASPS:
         raise Problem("bad-input", f"a query may hold at most {MOST_GRASPS} grasps; got {len(touches)}")
-    check_pictures(touches, background)
-    return Asked(touches, background, options)
-
-
-def check_pictures(touches: Sequence[Sequence[bytes]], background: Sequence[bytes] | None, of: str = "") -> int:
-    """The pixels of all pictures, by their headers. Raises ImageError for what is no picture, and Problem for pictures
-    that are too large or too many."""
-    named = [
-        (f"{of}grasp {number}, finger {_letter(place)}", data)
-        for number, grasp in enumerate(touches, start=1)
-        for place, data in enumerate(grasp)
-    ]
-    named += [(f"{of}background of finger {_letter(place)}", data) for place, data in enumerate(background or ())]
-    if len(named) > MAX_PICTURES:
-        raise Problem("bad-input", f"a request may hold at most {MAX_PICTURES} pictures; got {len(named)}")
-    total = 0
-    for name, data in named:
-        width, height = picture_size(data, name)
-        if width * height > MAX_PIXELS:
-            raise ImageError(
-                name, f"{width} x {height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
-            )
-        total += width * height
-    if total > MAX_BODY_PIXELS:
-        raise Problem(
-            "too-large", f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; got {total:,}"
-        )
-    return total
+    return Asked(pictures_of([touches], files["background"] or None), options)
 
 
 def _letter(place: int) -> str:

@@ -1,0 +1,55 @@
+"""Bodies of the kind multipart/form-data (RFC 7578), taken apart by searches in C and with a bound on their parts.
+
+A general parser calls Python for each header and for each byte that begins like a boundary, however many there are.
+"""
+
+from email.message import Message
+from email.parser import HeaderParser
+from email.utils import collapse_rfc2231_value
+from typing import NamedTuple
+
+from retrieval.serve.errors import Problem
+from retrieval.serve.settings import MAX_PICTURES
+
+MAX_PARTS = MAX_PICTURES + 8
+"""Pictures, and options of the query."""
+MAX_PART_HEADER_BYTES = 4096
+
+
+class FormPart(NamedTuple):
+    """A field of a form, or a file where it was sent with a file's name."""
+
+    name: str
+    is_file: bool
+    content: bytes
+
+
+def form_parts(body: bytes, content_type: str) -> list[FormPart]:
+    """The parts of a form, in their order. Raises Problem."""
+    header = Message()
+    header["content-type"] = content_type
+    boundary = header.get_boundary("")
+    if not boundary or not boundary.isascii() or len(boundary) > 70:
+        raise Problem("malformed", "multipart/form-data needs a boundary of 1 to 70 ASCII characters")
+    delimiter = b"\r\n--" + boundary.encode("ascii")
+    body = b"\r\n" + body
+    found = body.count(delimiter) - 1  # the last one ends the form
+    if found > MAX_PARTS:
+        raise Problem("bad-input", f"a form may have at most {MAX_PARTS} parts; got {found}")
+    _, *parts = body.split(delimiter)
+    if not parts or not parts[-1].startswith(b"--"):
+        raise Problem("bad-input", "the form is not whole: it must end with its boundary and two dashes")
+    return [_part(part) for part in parts[:-1]]
+
+
+def _part(part: bytes) -> FormPart:
+    end = part.find(b"\r\n\r\n", 0, MAX_PART_HEADER_BYTES)
+    if end < 0:
+        raise Problem(
+            "bad-input", f"each part of a form must begin with at most {MAX_PART_HEADER_BYTES} bytes of headers"
+        )
+    headers = HeaderParser().parsestr(part[:end].decode("utf-8", "replace").lstrip())
+    name = headers.get_param("name", header="content-disposition")
+    if name is None:
+        raise Problem("bad-input", "each part of a form must name its field in content-disposition")
+    return FormPart(collapse_rfc2231_value(name), headers.get_filename() is not None, part[end + 4 :])

@@ -1,0 +1,280 @@
+"""Pictures in processes of their own: what costs too much ends with its process, and others are served meanwhile."""
+
+import asyncio
+import base64
+import io
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from retrieval.data.images import MAX_PIXELS, decode
+from retrieval.data.resize import resized
+from retrieval.errors import ImageError, RetrievalError
+from retrieval.serve import decoders
+from retrieval.serve.decode_process import frame
+from retrieval.serve.decoders import SMALL_PIXELS, Decoders
+from retrieval.serve.errors import Problem
+from tests import decoding
+from tests.hostile_pictures import jpeg_of_scans, jpeg_of_segments, png_of_zeros
+from tests.serving import command, listening, problem
+from tests.waiting import until
+
+LARGE = png_of_zeros(2000, 1500)
+assert SMALL_PIXELS < 2000 * 1500
+
+
+def saved(samples, kind="PNG", **options):
+    file = io.BytesIO()
+    Image.fromarray(samples).save(file, kind, **options)
+    return file.getvalue()
+
+
+SMALL = saved(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8))
+
+
+@asynccontextmanager
+async def opened():
+    both = Decoders()
+    try:
+        yield both
+    finally:
+        await both.close()
+
+
+def read(*named, compares=False, timeout=120):
+    async def run():
+        async with asyncio.timeout(timeout):
+            async with opened() as both:
+                return await both.read(named, 32, compares)
+
+    return asyncio.run(run())
+
+
+def test_images_come_in_their_order_with_the_numbers_that_this_process_makes_of_them():
+    grey = saved(np.full((20, 40), 7, np.uint8))
+    found = read(("a", LARGE), ("b", SMALL), ("c", grey), compares=True)
+    for image, data in zip(found, (LARGE, SMALL, grey), strict=True):
+        assert np.array_equal(image.touch, resized(decode(data, "x"), (32, 32)))
+        assert np.array_equal(image.blocks, resized(decode(data, "x"), (16, 16)))
+        assert image.file_bytes == len(data)
+    assert read(("b", SMALL))[0].blocks is None
+
+
+def test_the_first_picture_that_cannot_be_used_is_told():
+    with pytest.raises(ImageError, match="b: not a PNG") as error:
+        read(("a", SMALL), ("b", b"junk"), ("c", b"junk"), ("d", LARGE))
+    assert (error.value.path, error.value.reason[:9]) == ("b", "not a PNG")
+    with pytest.raises(ImageError, match="a: more than 50 JPEG scans"):
+        read(("a", jpeg_of_scans(4472, 40_000)))
+    with pytest.raises(Problem, match="the large ones have 120,000,000"):
+        read(*[("a", png_of_zeros(4000, 5000))] * 6)
+
+
+def test_a_process_that_ends_is_the_fault_of_its_picture_and_the_next_one_gets_a_new_one(monkeypatch):
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.DIE)
+
+    async def run():
+        async with opened() as both:
+            for _ in range(2):
+                with pytest.raises(ImageError, match="b: decoding it takes more than 5 s of processor time or 200 MB"):
+                    await both.read([("a", SMALL), ("b", LARGE)], 32, False)
+            return await both.read([("a", SMALL)], 32, False)
+
+    assert asyncio.run(run())[0].file_bytes == len(SMALL)
+
+
+def test_a_large_picture_keeps_no_small_one_waiting_and_its_process_ends_when_it_is_abandoned(monkeypatch, tmp_path):
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
+
+    async def run():
+        names = [str(tmp_path / "first"), str(tmp_path / "second")]
+        async with opened() as both:
+            hanging = [asyncio.ensure_future(both.read([(name, LARGE)], 32, False)) for name in names]
+            while not (tmp_path / "first").exists():
+                await asyncio.sleep(0.01)
+            assert len(await both.read([("a", SMALL)] * 10, 32, False)) == 10
+            assert not (tmp_path / "second").exists()  # large ones are decoded one at a time
+            process = int((tmp_path / "first").read_text())
+            assert is_running(process)
+            for one in hanging:
+                one.cancel()
+            await asyncio.wait(hanging)
+            assert all(one.cancelled() for one in hanging)
+            await asyncio.gather(*both._ending)
+            assert not is_running(process)
+            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+
+    asyncio.run(run())
+
+
+def test_who_leaves_while_small_pictures_are_read_ends_no_process_and_leaves_nothing_to_do():
+    async def run():
+        async with opened() as both:
+            await both.start()
+            before = {process._process.pid for process in both._idle}
+            for _ in range(3):
+                asked = asyncio.ensure_future(both.read([("a", SMALL)] * 50, 32, False))
+                await asyncio.sleep(0.01)
+                asked.cancel()
+                await asyncio.wait([asked])
+            assert len(both._running) <= 2
+            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+            assert {process._process.pid for process in both._idle} == before
+        for process in before:
+            assert not is_running(process)
+
+    asyncio.run(run())
+
+
+def test_a_process_that_cannot_start_is_no_fault_of_the_picture(monkeypatch):
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.FAIL)
+    with pytest.raises(RetrievalError, match="ended as it started") as error:
+        read(("a", SMALL))
+    assert not isinstance(error.value, ImageError)
+
+
+LIMITS = """
+import sys
+from retrieval.serve import decode_process
+decode_process.DECODE_CPU_S, decode_process.DECODE_BYTES = int(sys.argv[1]), int(sys.argv[2])
+decode_process.serve_pictures()
+"""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "size", "said"),
+    [
+        (5, 200_000_000, b"file_bytes"),
+        pytest.param(
+            5,
+            5_000_000,
+            b"memory",
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux holds a process to its memory"),
+        ),
+        (0, 200_000_000, None),
+    ],
+)
+def test_a_process_ends_itself_beyond_its_processor_time_and_refuses_what_takes_more_memory(seconds, size, said):
+    line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
+    asked = frame({"name": "x", "px": 32, "compares": False, "most": MAX_PIXELS}, LARGE)
+    done = subprocess.run(line, input=asked * (1 if said else 200), capture_output=True, check=False, timeout=300)
+    if said is None:
+        assert done.returncode == -signal.SIGXCPU
+    else:
+        assert said in done.stdout, done.stderr.decode()
+
+
+# The service ----------------------------------------------------------------------------------------------------------
+
+
+def body_of(*images):
+    return {"touches": [[base64.b64encode(image).decode() for image in images]]}
+
+
+def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(index, touch, monkeypatch, tmp_path):
+    monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
+    monkeypatch.setattr("retrieval.serve.uploads.Pictures.named", _named_in(tmp_path))
+    honest = body_of(*(path.read_bytes() for path in touch))
+    with listening(index, deadline_s=8) as (url, parts):
+        assert httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code == 200
+        answers = []
+        attack = threading.Thread(
+            target=lambda: answers.append(httpx.post(f"{url}/v1/query", json=body_of(LARGE, LARGE), timeout=60))
+        )
+        attack.start()
+        while not list(tmp_path.iterdir()):
+            time.sleep(0.01)
+        assert [httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code for _ in range(3)] == [200] * 3
+        attack.join(60)
+        problem(answers[0], 504, "late")
+        until(lambda: parts.queue.held == 0)
+        process = int(next(tmp_path.iterdir()).read_text())
+        until(lambda: not is_running(process))
+
+
+def _named_in(folder):
+    """Pictures are called by a file of that folder."""
+    return lambda pictures: [(str(folder / str(number)), data) for number, data in enumerate(pictures.files[0][0])]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: jpeg_of_scans(4472, 40_000),
+        lambda: jpeg_of_scans(4472, 50),
+        lambda: png_of_zeros(1, 20_000_000),
+        lambda: png_of_zeros(4472, 4472),
+        lambda: jpeg_of_segments(2_500_000),
+    ],
+    ids=["scans", "fifty scans", "thin", "large", "markers"],
+)
+def test_hostile_pictures_leave_the_service_alive_small_and_quick_to_end(index, touch, make):
+    honest, hostile = body_of(*(path.read_bytes() for path in touch)), body_of(make(), make())
+    with command("--index", index, "--port", "0", "--no-history") as (process, url, _):
+        for _ in range(3):
+            assert httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code == 200
+        idle, peak, slowest, ended = memory(process.pid), 0, 0.0, threading.Event()
+        asking = [threading.Thread(target=ask, args=(url, hostile, ended)) for _ in range(3)]
+        for one in asking:
+            one.start()
+        honest_answers, end = [], time.monotonic() + 10
+        while time.monotonic() < end:
+            begun = time.monotonic()
+            assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+            slowest = max(slowest, time.monotonic() - begun)
+            peak = max(peak, memory(process.pid))
+            honest_answers.append(httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code)
+        ended.set()
+        begun = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+        print(f"slowest healthz {slowest:.3f} s, {(peak - idle) / 1e6:.0f} MB more, {time.monotonic() - begun:.1f} s")
+        assert time.monotonic() - begun < 30
+        assert set(honest_answers) == {200}
+        assert peak - idle < 320_000_000
+        assert slowest < 5  # on a machine that others keep busy
+        for one in asking:
+            one.join(60)
+
+
+def ask(url, body, ended):
+    while not ended.is_set():
+        try:
+            httpx.post(f"{url}/v1/query", json=body, timeout=60)
+        except httpx.HTTPError:
+            return
+
+
+def memory(process):
+    """Bytes of a process and its children that no other process shares."""
+    total = 0
+    for one in (process, *children(process)):
+        with suppress(OSError):
+            lines = Path(f"/proc/{one}/smaps_rollup").read_text().splitlines()
+            total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
+    return total
+
+
+def children(process):
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    return [int(child) for task in tasks for child in task.read_text().split()]
+
+
+def is_running(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
