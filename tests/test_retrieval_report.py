@@ -15,7 +15,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.answer import Match, QueryResult, in_words
+from retrieval.search.answer import Match, NearestReference, QueryResult, in_words
 from retrieval.search.build import build_index
 from retrieval.search.searcher import Searcher
 from tests.pages import Page
@@ -170,14 +170,13 @@ def test_the_verdict_is_said(tmp_path):
     rejected = Page(query_html(made_up(one, verdict="none of these", none=0.9), tmp_path))
     assert "None of these, most likely: the catalogue lacks the object with probability 90.0 %." in rejected.text
     assert "If it has the object, this is mug with probability 80.0 %." in rejected.text
-    assert "Reference touches or more photos of mug would help." in rejected.text
+    assert "Reference touches of mug would help." in rejected.text
     assert "80.0 % if present" in rejected.text
     assert "Most likely" not in rejected.text
     assert "1. mug" in rejected.text
     assert not firsts(rejected)
 
 
-OTHERS = "Reference touches or more photos"
 UNCLEAR = ("mug", 1.5, 0.04, "mug/1.jpg", {})
 CLEAR = ("mug", 1.5, 0.08, "mug/1.jpg", {})
 
@@ -185,12 +184,12 @@ CLEAR = ("mug", 1.5, 0.08, "mug/1.jpg", {})
 @pytest.mark.parametrize(
     ("match", "grasps", "more", "advice"),
     [
-        (UNCLEAR, 1, None, f"The ranking is not clear. {OTHERS} of its first objects would help."),
+        (UNCLEAR, 1, None, "The ranking is not clear. Reference touches of its first objects would help."),
         (
             CLEAR,
             1,
             None,
-            f"The ranking is clear, but more grasps would hardly change the verdict. {OTHERS} of mug would",
+            "The ranking is clear, but more grasps would hardly change the verdict. Reference touches of mug",
         ),
         (CLEAR, 1, 1, 'Another grasp would help: 1 more like this one would make the verdict "match".'),
         (CLEAR, 2, 3, 'Another grasp would help: 3 more like these would make the verdict "match".'),
@@ -205,6 +204,12 @@ def test_the_advice_names_what_would_help(match, grasps, more, advice, tmp_path)
     assert advice in Page(query_html(result, tmp_path)).text
     assert in_words(result).endswith(result.advice)
     assert made_up(ONE).advice is None
+
+
+def test_the_advice_for_an_object_with_reference_touches_asks_for_more():
+    result = made_up(CLEAR, verdict="none of these", none=0.9)
+    match = dataclasses.replace(result.top, reference=NearestReference(("mug/touch_0_a.png",), 0.9, 0.1))
+    assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 
 def test_a_document_of_before_there_was_advice_is_still_read():

@@ -128,12 +128,13 @@ class QueryResult:
         best = self.top
         if self.verdict != NONE_OF_THESE or best is None or best.probability_if_present is None:
             return None
+        references = "Reference touches" if best.reference is None else "More reference touches"
         if not is_clear(best.probability_if_present):
-            return "The ranking is not clear. Reference touches or more photos of its first objects would help."
+            return f"The ranking is not clear. {references} of its first objects would help."
         if self.more_grasps is None:
             return (
                 "The ranking is clear, but more grasps would hardly change the verdict. "
-                f"Reference touches or more photos of {best.object_id} would help."
+                f"{references} of {best.object_id} would help."
             )
         like = "this one" if self.grasps.count(CONTACT) == 1 else "these"
         return f'Another grasp would help: {self.more_grasps} more like {like} would make the verdict "match".'
