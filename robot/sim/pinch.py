@@ -1,7 +1,8 @@
 """Two fingers close on the object: what each meets, how deep it is pressed, how wide the jaws stand, whether it holds.
 
-Gripper frame: x along the closing direction, z up, origin between the fingertips. Finger a comes from -x and looks
-along +x, finger b the other way. A gel's grid has its rows downward (-z) and its columns to the finger's right.
+Gripper frame: x along the closing direction, z from the fingertips to the hand (up, unless the hand is tilted), origin
+between the fingertips. Finger a comes from -x and looks along +x, finger b the other way. A gel's grid has its rows
+towards the fingertip (-z) and its columns to the finger's right.
 Each part is worked out when it is asked for, and once.
 """
 
@@ -130,7 +131,7 @@ class Pinch:
         yy, zz = np.meshgrid(y, z)
         local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
         pose, rotations = self.grip.pose, np.stack([placement.rotation() for placement in placements])
-        closing = Placement(yaw_rad=pose.yaw_rad).rotation()
+        closing = pose.rotation()
         pad = local @ closing.T + [pose.x_mm - self.placement.x_mm, pose.y_mm - self.placement.y_mm, pose.z_mm]
         starts = pad @ rotations
         directions = (side * closing[:, 0]) @ rotations
