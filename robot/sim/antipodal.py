@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from robot.grasping.settings import GraspSettings
 from robot.sim.objects.mesh import MeshBody
@@ -35,6 +35,9 @@ _LEAST_CONTACT = 0.2
 
 _HAND_MM, _ABOVE_TABLE_MM = 50.0, 5.0
 """Width of the hand behind the fingers, across the closing direction; how far it stays above the table."""
+
+_STRAYS_MM = 9.0
+"""A grasp is the better for holding when the hand arrives so far beside it, as the camera's calibration has it."""
 
 _AROUND_MM = 180.0
 """Contacts farther from the object's middle are outside the workspace."""
@@ -69,7 +72,7 @@ def find_grasps(body: MeshBody, settings: GraspSettings, stroke_mm: float) -> Gr
             pads = outline.pads(tilt)
             narrowest = min(narrowest, float(pads.width_mm[pads.opposite].min(initial=math.inf)))
             clear, back_mm = outline.approach(tilt, pads, settings, stroke_mm)
-            at = np.nonzero(pads.opposite & clear)
+            at = np.nonzero(_inner(pads.opposite & clear))
             angles = (np.full(len(at[0]), angle) for angle in (yaw, tilt))
             parts.append((outline.points(at, pads.middle_mm), *angles, pads.width_mm[at], back_mm[at]))
     return Grasps(*map(np.concatenate, zip(*parts, strict=True)), narrowest_mm=narrowest)
@@ -173,6 +176,12 @@ class _Outline:
         u, v = middle_mm[at], self.across_mm[at[0]]
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.stack([c * u - s * v, s * u + c * v, self.up_mm[at[1]]], axis=1)
+
+
+def _inner(mask: Mask) -> Mask:
+    """The places of a mask (H, Z) whose neighbours across are in it, too; all of them where there is no such place."""
+    inner = np.asarray(minimum_filter1d(mask, 2 * round(_STRAYS_MM / _PITCH_MM) + 1, axis=0, mode="constant", cval=0))
+    return inner if inner.any() else mask
 
 
 def _windows(array: Array, cells: tuple[int, int], beyond: float) -> Array:

@@ -26,9 +26,11 @@ class MeshFolder:
         if not Path(folder).is_dir():
             raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
         self._folder, self._seed, self._settings = folder, seed, settings
-        kinds = tuple(f".{kind}" for kind in FORMATS)
-        files = sorted(Path(folder).iterdir())
-        self._paths = [each for each in files if each.suffix.lower() in kinds and each.name[0] != "."]
+
+    @property
+    def _paths(self) -> list[Path]:
+        files = sorted(Path(self._folder).iterdir())
+        return [each for each in files if each.suffix.lower().lstrip(".") in FORMATS and each.name[0] != "."]
 
     @property
     def digest(self) -> str:
@@ -40,11 +42,10 @@ class MeshFolder:
 
     def object_ids(self, count: int) -> list[str]:
         """Names of the first `count`. Raises RobotConfigError for more than there are, SceneError for a bad file."""
-        if count > len(self._paths):
-            raise RobotConfigError(
-                f"{self._folder} must hold as many STL, OBJ or PLY as objects; it has {len(self._paths)}"
-            )
-        names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in self._paths[:count]]
+        paths = self._paths
+        if count > len(paths):
+            raise RobotConfigError(f"{self._folder} must hold as many STL, OBJ or PLY as objects; it has {len(paths)}")
+        names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in paths[:count]]
         if twice := sorted(name for name, times in Counter(names).items() if times > 1):
             raise RobotConfigError(f"{self._folder} must not hold two meshes of one name, got {twice[0]!r}; rename one")
         return names
