@@ -87,7 +87,8 @@ class SimSettings(TypedSettings):
     (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
     markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
     instead (needs the extra `mesh`). contact_grid
-    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one.
+    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one. focal_px: of the
+    camera, whose pictures have 256 px a side; at 860 they show some 190 mm, and larger objects in part.
     localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
     tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts are made
     (robot.grasping.settings), and what the gels are made of (robot.gel_settings); what is not known of one is drawn.
@@ -102,6 +103,7 @@ class SimSettings(TypedSettings):
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: float = limited(1e-12, 0.999, 1e-2)
     shadow: bool = True
+    focal_px: float = limited(300, 10_000, 860.0, unit="px")
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
@@ -136,7 +138,9 @@ class SimRig(Rig):
         attempt = attempt_of(asked.attempt, asked.grasp)
         self._meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
         self._shadow = asked.shadow
-        self._hand = Hand(grid=asked.contact_grid, tolerance=asked.contact_tolerance)
+        self._hand = Hand(
+            grid=asked.contact_grid, tolerance=asked.contact_tolerance, turns_about_grip=self._meshes is not None
+        )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
         dots = Markers() if asked.markers else None
         fingers, known = asked.fingers, gels_of(asked.gel, asked.fingers)
@@ -147,7 +151,7 @@ class SimRig(Rig):
             }
             for pair in drawn
         ]
-        self._camera = PinholeCamera()
+        self._camera = PinholeCamera(focal_px=asked.focal_px)
         clock, error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
         self.world = World(clock)
         super().__init__(
