@@ -165,9 +165,10 @@ def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_says_by_how_much(t
             rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
 
 
-def test_a_plate_too_flat_for_the_fingers_has_no_two_sides(tmp_path):
-    _, grasps = grasps_of(tmp_path, *box(250, 250, 4))
-    assert not len(grasps)
+def test_slopes_that_the_fingers_would_slip_off_are_no_opposite_sides(tmp_path):
+    """A cone whose wall goes 15 mm inwards for 10 mm up: the friction cone ends at 3 for 10."""
+    _, grasps = grasps_of(tmp_path, *revolved([(46, 0), (1, 30)]))
+    assert (len(grasps), grasps.narrowest_mm) == (0, math.inf)
 
 
 def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
@@ -186,10 +187,11 @@ def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
 # Attempts ---------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def attempts(tmp_path):
-    stl(tmp_path / "box.stl", *box(60, 90, 180))
-    with load_rig("sim", seed=2, meshes=str(tmp_path)) as rig:
+@pytest.fixture(scope="module")
+def attempts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    stl(folder / "box.stl", *box(60, 90, 180))
+    with load_rig("sim", seed=2, meshes=str(folder)) as rig:
         attempter, name, moves = Attempter(rig, 2, rig.attempt), rig.object_ids(1)[0], []
         move = rig.arm._move_to
         rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)

@@ -75,7 +75,8 @@ def find_grasps(body: MeshBody, settings: GraspSettings, stroke_mm: float) -> Gr
             at = np.nonzero(_inner(pads.opposite & clear))
             angles = (np.full(len(at[0]), angle) for angle in (yaw, tilt))
             parts.append((outline.points(at, pads.middle_mm), *angles, pads.width_mm[at], back_mm[at]))
-    return Grasps(*map(np.concatenate, zip(*parts, strict=True)), narrowest_mm=narrowest)
+    points, yaws, tilts, widths, backs = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Grasps(points, yaws, tilts, widths, backs, narrowest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +112,10 @@ class _Outline:
         vertices = body.mesh.vertices
         places = vertices @ sideways
         low, high = float(places.min()), float(places.max())
-        across = _PITCH_MM * np.arange(
-            math.ceil(max(low, -_AROUND_MM) / _PITCH_MM), math.floor(min(high, _AROUND_MM) / _PITCH_MM) + 1
-        )
-        up = np.arange(floor_mm % _PITCH_MM or _PITCH_MM, max(float(vertices[:, 2].max()), floor_mm) + 1e-9, _PITCH_MM)
+        first, last = math.ceil(max(low, -_AROUND_MM) / _PITCH_MM), math.floor(min(high, _AROUND_MM) / _PITCH_MM)
+        across = _PITCH_MM * np.arange(first, last + 1, dtype=np.float64)
+        top = max(float(vertices[:, 2].max()), floor_mm)
+        up = np.arange(floor_mm % _PITCH_MM or _PITCH_MM, top + 1e-9, _PITCH_MM, dtype=np.float64)
         far = float(np.linalg.norm(vertices[:, :2], axis=1).max()) + 10.0
         grid = (across[:, None, None] * sideways + up[None, :, None] * np.array([0.0, 0.0, 1.0])).reshape(-1, 3)
         reach, slopes = np.full((2, len(grid)), -np.inf), np.zeros((2, 2, len(grid)))

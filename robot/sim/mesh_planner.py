@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -55,7 +55,9 @@ def _check_graspable(scene: Scene, grasps: Grasps, settings: GraspSettings, stro
     """Raise UngraspableError where no attempt can succeed."""
     if not len(grasps):
         if math.isinf(grasps.narrowest_mm):
-            raise UngraspableError("no two opposite sides for the fingers")
+            raise UngraspableError(
+                f"no two opposite sides that the fingers could hold, {settings.floor_mm:g} mm above the table or higher"
+            )
         if grasps.narrowest_mm + 2 * settings.clearance_mm > stroke_mm:
             raise UngraspableError(
                 f"wider than the gripper opens: {grasps.narrowest_mm:.0f} mm at least between opposite sides, "
@@ -90,7 +92,7 @@ class _Poses:
         rises = self._lift - self._points[:, 2] >= np.where(grasps.tilt_rad == 0, grasps.back_mm, 0.0)
         self.possible = inside[0] & inside[1] & rises
 
-    def plan(self, number: int, stroke_mm: float, force_n: float, fit: dict[str, str | float]) -> GraspPlan:
+    def plan(self, number: int, stroke_mm: float, force_n: float, fit: dict[str, Any]) -> GraspPlan:
         """The plan of one of them."""
         yaw, tilt = math.floor(self._yaw[number] * 1e6) / 1e6, float(self._tilt[number])
         (x, y, z), (start_x, start_y, start_z) = self._points[number].round(3), self._start[number].round(3)
