@@ -3,7 +3,8 @@
 Object by object and attempt by attempt: photo, cylinder, random grasp, gel images before, during and after, lift, what
 the gripper felt, and the gate, which decides what training keeps. What it rejects is recorded too, and attempts that
 came to no grasp are logged (robot.recording.attempt_log). `grasps` accepted ones are wanted of each object, in a
-bounded number of attempts: an object that cannot be grasped is reported, not tried for ever.
+bounded number of attempts: an object that is not grasped is reported, not tried for ever. One that cannot be grasped
+at all is skipped, and recording.json says why; the others are collected.
 
 A recording is written by one writer in one order, so that it is the same whatever the number of jobs, and a
 collection that was stopped or killed goes on where it was when it is started again.
@@ -29,7 +30,7 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.grasping.attempt import Attempter, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, judge
 from robot.grasping.settings import AttemptSettings
-from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
+from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.recording.grasp import check_name
 from robot.rig import Rig
@@ -218,12 +219,14 @@ class _Collection:
 
     def run(self, workers: Jobs[GraspAttempt]) -> None:
         """Attempts are recorded object by object; workers may be ahead, but never make one that is not wanted."""
+        self._say_skipped()  # a crash may have come between a line of the log and this
         self._report()
         for name in self.names:
             while self._wants(name):
                 self._submit_ahead(workers, name)
                 self._record(self._pending[name].popleft()())
                 self._report()
+            self._pending.pop(name, None)  # of an object that turned out to be ungraspable
 
     def _submit_ahead(self, workers: Jobs[GraspAttempt], name: str) -> None:
         """Give out the attempts that are wanted next, this object's first."""
@@ -238,6 +241,8 @@ class _Collection:
     def _wants(self, name: str, ahead: bool = False) -> bool:
         """Whether another attempt is needed, if all that are under way are going to be accepted."""
         under_way, so_far = len(self._pending[name]) if ahead else 0, self.tallies[name]
+        if so_far.skipped is not None:
+            return False
         return so_far.accepted + under_way < self.settings.grasps and so_far.attempts + under_way < self.settings.limit
 
     def _record(self, attempt: GraspAttempt) -> None:
@@ -257,12 +262,19 @@ class _Collection:
                 time_s=round(began + attempt.at_s, 3),
             )
         self.tallies[attempt.object_id].add(logged)
+        if attempt.outcome == UNGRASPABLE:
+            self._say_skipped()
+
+    def _say_skipped(self) -> None:
+        """Have recording.json name the objects that cannot be grasped, where there are any."""
+        if skipped := {name: why for name in self.names if (why := self.tallies[name].skipped) is not None}:
+            self.writer.tell(skipped_objects=skipped)
 
     def _judged(self, attempt: GraspAttempt) -> LoggedAttempt:
         logged = functools.partial(
             LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
         )
-        if attempt.outcome == "no_plan":
+        if attempt.outcome in ("no_plan", UNGRASPABLE):
             return logged(accepted=False, reason=attempt.reason)
         accepted, score = judge(self.gate, RecordedTouches(attempt.images))
         grasp_id = name_of(attempt.object_id, attempt.number)

@@ -182,12 +182,14 @@ class Actuator(Device):
 
 
 class Arm(Actuator):
-    """Moves the gripper, held upright, inside `workspace` (limits of the point between the fingertips).
+    """Moves the gripper inside `workspace` (limits of the point between the fingertips).
 
-    by_hand: a person moves it when asked to; no speed is kept then.
+    by_hand: a person moves it when asked to; no speed is kept then. can_tilt: whether the fingers may point elsewhere
+    than straight down.
     """
 
     by_hand: ClassVar[bool] = False
+    can_tilt: bool = False
 
     def __init__(
         self, name: str, workspace: Region, *, max_speed_mm_s: float = 1000.0, clock: Clock = time.monotonic
@@ -200,6 +202,8 @@ class Arm(Actuator):
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
+        if pose.tilt_rad and not self.can_tilt:
+            raise DeviceError(f"{self.name} keeps the fingers pointing straight down: tilt must be 0, got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot move"):
             return self._reached(self._move_to(pose, speed_mm_s))

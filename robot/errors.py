@@ -6,13 +6,14 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
     RobotError                 the job ran and failed (exit code 1)
     +-- DeviceError            a device is missing, went away, answers late, stale or out of range
     +-- PlanError              nothing to grasp is seen, or no grasp of it is possible
+    |   +-- UngraspableError   no attempt at this object can succeed; the collection goes on with the next one
     +-- StorageError           a recording could not be written: disk full, no permission, folder in use
     +-- BadRobotInput          wrong use or bad input (exit code 2)
         +-- RecordingError     a recording is not usable. For example: a line that is not JSON
         +-- ImporterError      a data set to import is not what its importer reads
         +-- UnknownName        no driver or importer has this name
         +-- RobotConfigError   a setting is unknown or out of range
-        +-- SceneError         a scene is impossible. For example: an object wider than the gripper's stroke
+        +-- SceneError         a scene is impossible. For example: a mesh that is not closed
 """
 
 
@@ -35,6 +36,10 @@ class DeviceError(RobotError):
 
 class PlanError(RobotError):
     """Nothing to grasp is seen, or no grasp of it is possible with this gripper; another attempt may do better."""
+
+
+class UngraspableError(PlanError):
+    """The gripper cannot grasp this object at all, however often it is tried."""
 
 
 class StorageError(RobotError):

@@ -19,7 +19,8 @@ STATUSES: tuple[Status, ...] = ("idle", "moving", "holding", "no_part", "part_lo
 class Pose:
     """The point between the fingertips, and the direction (cos yaw, sin yaw) in which the jaws close.
 
-    Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers.
+    Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers. The fingers point
+    straight down; tilt turns them about the closing direction, pi / 2 until they point along (-sin yaw, cos yaw).
 
     >>> robot.Pose(120.0, 0.0, 40.0, yaw_rad=0.0).as_tuple()
     (120.0, 0.0, 40.0, 0.0)
@@ -29,10 +30,17 @@ class Pose:
     y_mm: float
     z_mm: float
     yaw_rad: float
+    tilt_rad: float = 0.0
 
-    def as_tuple(self) -> tuple[float, float, float, float]:
-        """x, y, z in mm and yaw in rad, as a recording holds them."""
-        return self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
+    def as_tuple(self) -> tuple[float, ...]:
+        """x, y, z in mm and yaw in rad, then the tilt in rad unless it is 0, as a recording holds them."""
+        upright = self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
+        return (*upright, self.tilt_rad) if self.tilt_rad else upright
+
+    def rotation(self) -> npt.NDArray[np.float64]:
+        """(3, 3): gripper frame to rig frame. Jaws close along the gripper's x, and its fingers point along -z."""
+        (c, s), (up, aside) = ((math.cos(angle), math.sin(angle)) for angle in (self.yaw_rad, self.tilt_rad))
+        return np.array([[c, -s * up, s * aside], [s, c * up, -c * aside], [0.0, aside, up]])
 
 
 @dataclass(frozen=True)

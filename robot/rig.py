@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
+from robot.grasping.planner import CylinderPlanner, GraspPlanner
 from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.settings import build
@@ -32,7 +33,7 @@ class Rig:
     `info` goes into recording.json: source and sensor at least. `clock` and `sleep` keep the rig's time, in which
     frames are stamped; a simulated rig gives its own. `ask` shows a person a sentence and returns when it is done.
     `attempt`: how attempts are made with this rig unless said otherwise. `given`: where every object stands and how
-    large it is, for a rig whose camera cannot tell.
+    large it is, for a rig whose camera cannot tell. `planner`: where its jaws close.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     sorted(rig.sensors), rig.arm.is_connected
@@ -57,8 +58,10 @@ class Rig:
         ask: Callable[[str], object] = ask_on_terminal,
         attempt: AttemptSettings | None = None,
         given: CylinderFit | None = None,
+        planner: GraspPlanner | None = None,
     ) -> None:
-        if given is None and not camera.has_depth:
+        self.planner = planner or CylinderPlanner()
+        if given is None and self.planner.needs_depth and not camera.has_depth:
             raise RobotConfigError(f"{camera.name} has no depth: where the object stands and its size must be given")
         self.arm, self.gripper, self.camera = arm, gripper, camera
         self.sensors = dict(sorted(sensors.items()))

@@ -24,7 +24,7 @@ What tests lean on:
     synthetic, labelled                         drawn pictures
     made_up_evaluation, referenced              results and models of them
     miniatures, real_data_sets, data            public data sets in small, and where real ones lie
-    fake_rig, replay_rig, views                 rigs and depth pictures made of arithmetic and of files
+    fake_rig, replay_rig, views, meshes         rigs, depth pictures and solids made of arithmetic and of files
     fake_video, wsg50_bench, wsg50_packets      cameras and a gripper that are not there
     oracle, documents, pages                    what must come out; texts and pages taken apart
     serving, browser, s3, on_ray, waiting       other processes, and waits that end

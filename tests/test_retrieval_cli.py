@@ -16,6 +16,7 @@ from retrieval.commands.options import Command
 from retrieval.lab.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.search import defaults
+from tests.meshes import box, sphere, stl
 
 
 @pytest.fixture
@@ -394,6 +395,25 @@ def test_collecting_nothing_is_a_failure_that_says_where_to_look(workplace, fake
     monkeypatch.setattr("tests.fake_rig.FakeRig.object_ids", lambda self, count: ["wide-0"])
     assert main(COLLECT) == 1
     assert "no grasp was accepted; rec/attempts.jsonl says why" in capsys.readouterr().err
+
+
+def test_meshes_that_cannot_be_grasped_are_named_and_the_others_are_collected(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
+    pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
+    monkeypatch.chdir(tmp_path)
+    Path("meshes").mkdir()
+    Path("rig.toml").write_text('rig = "sim"\nmeshes = "meshes"\n')
+    (globe, faces), collect = sphere(20), ["collect", "--rig", "rig.toml", "--grasps", "1", "--seed", "1"]
+    stl(Path("meshes/a_globe.stl"), 80 * globe, faces)
+    stl(Path("meshes/b_box.stl"), *box(60, 90, 120))
+    stl(Path("meshes/c_box.stl"), *box(50, 70, 100))
+    assert main([*collect, "--objects", "3", "--out", "rec"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    named = [line for line in lines if "skipped: wider than the gripper opens: 15" in line]
+    assert [line.split("-")[0] for line in named] == ["mesh.a_globe"]
+    assert lines[-1] == "rec: 2 accepted grasps of 2 objects, 1 skipped"
+    assert main([*collect, "--objects", "1", "--out", "none"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].endswith("no grasp was accepted; none/attempts.jsonl says why")
 
 
 def test_a_gate_is_trained_and_decides_what_is_kept(workplace, fake_rig, capsys):

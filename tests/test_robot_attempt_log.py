@@ -37,6 +37,20 @@ def test_what_is_appended_is_read(tmp_path):
     }
 
 
+def test_an_ungraspable_object_is_in_the_log_and_named_in_the_table_but_was_not_attempted(tmp_path):
+    ball = LoggedAttempt("ball", 0, "ungraspable", False, 31.0, reason="wider than the gripper opens")
+    write(tmp_path, (*ALL, ball))
+    tallies = list(tally(read_attempts(tmp_path, GRASPS)).values())
+    assert (tallies[2].attempts, tallies[2].skipped) == (0, "wider than the gripper opens")
+    assert [each.skipped for each in tallies[:2]] == [None, None]
+    assert acceptance_table(tallies, wanted=2).splitlines()[1:] == [
+        "mug               1   3     1       1        0        1  gave up",
+        "cup, blue         1   1     0       0        1        0  gave up",
+        "ball              0   0     0       0        0        0  skipped: wider than the gripper opens",
+        "all               2   4     1       1        1        1",
+    ]
+
+
 def test_a_log_is_continued(tmp_path):
     whole = write(tmp_path / "", ALL).read_bytes()
     other = tmp_path / "other"

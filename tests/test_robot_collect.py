@@ -1,5 +1,6 @@
 """Collection over the contract: what is recorded, what is asked of the devices, when it ends, and what is refused."""
 
+import dataclasses
 import functools
 import json
 import zlib
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 
 from robot.collect import CollectSettings, Progress, RecordedTouches, collect, name_of
-from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError
+from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import Attempter, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
+from robot.grasping.plan import GraspPlan
+from robot.grasping.planner import CylinderPlanner
 from robot.grasping.settings import AttemptSettings, GraspSettings
-from robot.readings import RGBD
+from robot.readings import RGBD, Pose
 from robot.recording.attempt_log import read_attempts
 from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import Rig
@@ -290,6 +293,57 @@ def test_where_the_place_is_given_no_depth_is_asked_for_and_the_object_is_put_ba
         attempt.fields["pose"][0],
         *(attempt.fields["pose"][i] for i in (1, 3)),
     )
+
+
+class Picky(CylinderPlanner):
+    """Takes thin things for ungraspable."""
+
+    def plan(self, rig, image, settings, rng):
+        if rig.world.solid.radius < 10:
+            raise UngraspableError("too thin")
+        return super().plan(rig, image, settings, rng)
+
+
+def picky_rig():
+    rig = FakeRig(3)
+    rig.planner = Picky()
+    return rig
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_a_planner_says_is_ungraspable_is_skipped_at_once_and_the_others_are_collected(tmp_path, jobs):
+    settings = CollectSettings(2, None, AttemptSettings())
+    tallies = collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings, jobs=jobs)
+    assert [(each.accepted, each.skipped) for each in tallies] == [(2, None), (0, "too thin"), (2, None)]
+    logged = read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
+    assert [each.reason for each in logged if each.object_id == "thin-1"] == ["too thin"]
+    assert read_recording(tmp_path / "r").info["skipped_objects"] == {"thin-1": "too thin"}
+    before = files(tmp_path / "r")
+    (tmp_path / "r" / "recording.json").write_text(
+        json.dumps(json.loads(before["recording.json"]) | {"skipped_objects": {}})
+    )
+    collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings)  # as after a crash between the two
+    assert files(tmp_path / "r") == before
+
+
+def test_a_planner_without_need_of_depth_has_none_taken():
+    class Blind(Picky):
+        needs_depth = False
+
+        def plan(self, rig, image, settings, rng):
+            assert image.depth_m is None
+            solid = rig.world.solid
+            pose = Pose(solid.x, solid.y, 40.0, 0.5)
+            return GraspPlan(
+                pose, dataclasses.replace(pose, z_mm=250.0), rig.gripper.stroke_mm, 12.0, fit={"seen": "not"}
+            )
+
+    rig = FakeRig(3)
+    rig.planner = Blind()
+    with rig:
+        attempt = Attempter(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
+    assert "depth" not in rig.world.calls
+    assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"seen": "not"})
 
 
 def test_a_person_is_asked_to_put_the_object_back_before_each_attempt_at_a_given_place():

@@ -146,3 +146,39 @@ def test_a_finger_lands_on_an_object_that_stands_beside_the_middle():
 def test_an_opening_beyond_the_stroke_is_refused(opening_mm):
     with pytest.raises(SceneError, match="opening_mm"):
         pinch(thing(Slanted()), opening_mm=opening_mm)
+
+
+def test_a_thing_that_is_grasped_far_from_its_middle_is_turned_where_it_is_grasped():
+    """Jaws that close 30 mm from the middle of a block, 10 degrees off square, meet the same place of it when it has
+    turned; turned about its own middle it would have moved aside by 30 sin(10 deg) = 5 mm."""
+    block, angle = thing(Slanted()), math.radians(10)
+    moved = {}
+    for about_grip in (True, False):
+        made = dataclasses.replace(pinch(block, y_mm=30.0, yaw=angle), hand=Hand(turns_about_grip=about_grip))
+        assert made.turned.yaw_rad == pytest.approx(angle, abs=math.radians(0.6))
+        moved[about_grip] = made.turned.to_object(np.array([[0.0, 30.0, 0.0]]))[0]
+    np.testing.assert_allclose(moved[True], [0, 30, 0], atol=1e-9)
+    assert moved[False][0] == pytest.approx(30 * math.sin(angle), abs=0.4)
+
+
+# A tilted hand ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt", [math.pi / 2, -math.pi / 2])
+def test_from_the_side_the_gel_meets_an_upright_cylinder_turned_by_a_quarter(tilt):
+    """From above its wall runs along the rows' direction, so that every row is the same; from a side every column."""
+    post = dataclasses.replace(draw_object(0, 0, family="cylinder", relief="smooth"))
+    upright = pinch(post, yaw=0.3, z_mm=40.0).gap("a")
+    grip = Grip(Pose(0.0, 0.0, 40.0, 0.3, tilt), 12.0)
+    tilted = dataclasses.replace(pinch(post, yaw=0.3), grip=grip).gap("a")
+    assert np.ptp(upright, axis=0).max() < 1e-3 < np.ptp(upright, axis=1).max()
+    assert np.ptp(tilted, axis=1).max() < 1e-3 < np.ptp(tilted, axis=0).max()
+
+
+def test_a_tilted_pose_points_its_fingers_across_the_closing_direction():
+    """By hand: closing along x, tilted by a quarter turn the fingers point along y, by half of that down as well."""
+    down = [-Pose(0, 0, 0, 0, tilt).rotation()[:, 2] for tilt in (0.0, math.pi / 2, -math.pi / 2, math.pi / 4)]
+    half = math.sqrt(0.5)
+    np.testing.assert_allclose(down, [[0, 0, -1], [0, 1, 0], [0, -1, 0], [0, half, -half]], atol=1e-12)
+    turned = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
+    np.testing.assert_allclose(turned, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)

@@ -84,7 +84,11 @@ def collect(
     accepted = sum(each.accepted for each in tallies)
     if accepted == 0:
         raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl says why")
-    say(f"{out}: {accepted} accepted grasps of {len(tallies)} objects")
+    skipped = sum(each.skipped is not None for each in tallies)
+    say(
+        f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects"
+        + f", {skipped} skipped" * bool(skipped)
+    )
     if preview:
         from robot.sim.preview import write_preview
 

@@ -16,25 +16,23 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import MAX_AGE_S, read_together
-from robot.errors import DeviceError, PlanError
-from robot.grasping.plan import GraspPlan, plan_grasp
+from robot.errors import DeviceError, PlanError, UngraspableError
+from robot.grasping.plan import GraspPlan
 from robot.grasping.settings import AttemptSettings
-from robot.readings import RGBD, Pose, Region
+from robot.readings import RGBD, Pose
 from robot.rig import Rig, check_seed
-from robot.sight.cylinder import fit_cylinder
 from robot.storage import file_content
 
 _OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
-_SIGHT_MM = 150.0
-"""An object may stand so far outside the workspace and still be looked for."""
 
 
 @dataclass(frozen=True)
 class GraspAttempt:
     """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
 
-    outcome: "held", "missed", "slipped" by the gripper after the lift, or "no_plan" for the `reason` given, and then
-    there are no images. at_s, lasted_s: from the photo to the picture of the closed jaws, and to the end.
+    outcome: "held", "missed", "slipped" by the gripper after the lift, or for the `reason` given "no_plan", or
+    "ungraspable" where further attempts are useless; then there are no images. at_s, lasted_s: from the photo to the
+    picture of the closed jaws, and to the end.
     """
 
     object_id: str
@@ -55,10 +53,6 @@ class Attempter:
         check_seed(seed)
         settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
-        lower, upper = rig.arm.workspace.lower, rig.arm.workspace.upper
-        self._sight = Region(
-            (lower[0] - _SIGHT_MM, lower[1] - _SIGHT_MM, -1.0), (upper[0] + _SIGHT_MM, upper[1] + _SIGHT_MM, upper[2])
-        )
 
     def run(self, object_id: str, number: int) -> GraspAttempt:
         """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
@@ -105,13 +99,13 @@ class Attempter:
         rig.prepare(object_id, number)
         start = rig.clock()
         records_depth = rig.camera.has_depth and "depth" in self.settings.outputs
-        image = rig.camera.read(depth=rig.given is None or records_depth)
+        image = rig.camera.read(depth=records_depth or (rig.given is None and rig.planner.needs_depth))
         try:
-            fit = rig.given or fit_cylinder(image, rig.camera.extrinsics, self._sight)
-            plan = plan_grasp(fit, self.settings.grasp, rig.arm.workspace, rig.gripper.stroke_mm, rng)
+            plan = rig.planner.plan(rig, image, self.settings.grasp, rng)
         except PlanError as error:
+            outcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
             lasted = round(rig.clock() - start, 3)
-            return GraspAttempt(object_id, number, "no_plan", reason=str(error), lasted_s=lasted)
+            return GraspAttempt(object_id, number, outcome, reason=str(error), lasted_s=lasted)
         images = self._pictures(image)
         touches, fields, at = self._grasp(plan)
         outcome = self._outcome()
@@ -124,7 +118,7 @@ class Attempter:
             outcome,
             {**images, **touches},
             fields,
-            fit.to_dict(),
+            plan.fit,
             at_s=round(at - start, 3),
             lasted_s=round(rig.clock() - start, 3),
         )
@@ -141,7 +135,8 @@ class Attempter:
     def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
         """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
         rig, settings = self.rig, self.settings
-        rig.arm.move_to(plan.above, settings.travel_mm_s)
+        for pose in plan.approach or (plan.above,):
+            rig.arm.move_to(pose, settings.travel_mm_s)
         rig.gripper.open(plan.opening_mm)
         reached = rig.arm.move_to(plan.pose, settings.approach_mm_s)
         touches = self._feel("_before", MAX_AGE_S)[0] if "before" in settings.outputs else {}
@@ -174,20 +169,22 @@ class Attempter:
         return _OUTCOME_OF[status]
 
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
-        """Let go: of a held object on the table, at a random place and turned at random, or where it was given."""
+        """Let go: of a held object on the table, at a random place and turned at random; where it was given, or where a
+        tilted hand took it and has room to withdraw."""
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
         x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
         yaw = float(rng.uniform(0.0, math.pi))
-        if rig.given is not None:
+        if rig.given is not None or plan.pose.tilt_rad:
             x, y, yaw = plan.pose.x_mm, plan.pose.y_mm, plan.pose.yaw_rad
         if held:
             z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))
-            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.travel_mm_s)
-            rig.arm.move_to(Pose(float(x), float(y), z, yaw), settings.approach_mm_s)
+            over = Pose(float(x), float(y), plan.above.z_mm, yaw, plan.pose.tilt_rad)
+            rig.arm.move_to(over, settings.travel_mm_s)
+            rig.arm.move_to(replace(over, z_mm=z), settings.approach_mm_s)
         rig.gripper.open(rig.gripper.stroke_mm)
         if held:
-            rig.arm.move_to(Pose(float(x), float(y), plan.above.z_mm, yaw), settings.approach_mm_s)
+            rig.arm.move_to(plan.approach[-1] if plan.approach else over, settings.approach_mm_s)
 
     def _pictures(self, image: RGBD) -> dict[str, bytes]:
         pictures = {"photo": self._jpeg(image.colour)}

@@ -24,14 +24,16 @@ class DryArm(VirtualDevice, Arm):
 
     def __init__(self, arm: Arm, say: Say) -> None:
         super().__init__(f"{arm.name} (dry run)", arm.workspace, max_speed_mm_s=arm.max_speed_mm_s, clock=arm.clock)
+        self.can_tilt = arm.can_tilt
         self._say = say
         lower, upper = arm.workspace.lower, arm.workspace.upper
         self._at = Pose((lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, upper[2], 0.0)
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
+        tilt = f"tilt {pose.tilt_rad:.3f} rad, " if pose.tilt_rad else ""
         self._say(
             f"arm: to x {pose.x_mm:.1f}, y {pose.y_mm:.1f}, z {pose.z_mm:.1f} mm, yaw {pose.yaw_rad:.3f} rad, "
-            f"at {speed_mm_s:g} mm/s"
+            f"{tilt}at {speed_mm_s:g} mm/s"
         )
         self._at = pose
         return pose

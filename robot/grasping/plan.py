@@ -7,7 +7,9 @@ on how another one fared.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -19,12 +21,18 @@ from robot.sight.cylinder import CylinderFit
 
 @dataclass(frozen=True)
 class GraspPlan:
-    """Where to close, from where to come, how far to open before, and how hard to close."""
+    """Where to close, where to lift to, how far to open before, and how hard to close.
+
+    approach: poses to pass on the way there, the last one clear of the object; `above` where none are given. fit: what
+    the attempt's log says of the object as it was seen.
+    """
 
     pose: Pose
     above: Pose
     opening_mm: float
     force_n: float
+    approach: tuple[Pose, ...] = ()
+    fit: Mapping[str, Any] = field(default_factory=dict)
 
 
 def plan_grasp(

@@ -2,8 +2,9 @@
 
 It lies beside the recording, a line for each attempt: object_id, number, outcome, accepted, ended_s (second since the
 recording began, while the rig worked), and where there was a grasp its grasp_id, the gate's score and fit (method and
-error of the cylinder), else the reason. A line is written before its grasp is appended to the recording: after a crash
-at most the last line is half or has no grasp, and then it does not count.
+error of the cylinder), else the reason. The outcome "ungraspable" ends the attempts at its object. A line is written
+before its grasp is appended to the recording: after a crash at most the last line is half or has no grasp, and then it
+does not count.
 """
 
 import json
@@ -21,6 +22,8 @@ from robot.settings import build
 from robot.storage import append_line, content_of, object_of, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
+UNGRASPABLE = "ungraspable"
+"""Outcome of an attempt after which no other one at the same object is made."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,8 @@ class LoggedAttempt:
             attempt = build(cls, row)
         except RobotConfigError as error:
             raise RecordingError(f"is no attempt: {error}") from error
-        if attempt.outcome not in OUTCOMES:
-            raise RecordingError(
-                f"is no attempt: outcome must be one of {', '.join(OUTCOMES)}, got {attempt.outcome!r}"
-            )
+        if attempt.outcome not in (known := (*OUTCOMES, UNGRASPABLE)):
+            raise RecordingError(f"is no attempt: outcome must be one of {', '.join(known)}, got {attempt.outcome!r}")
         return attempt
 
 
@@ -127,16 +128,20 @@ class AttemptLog:
 
 @dataclass
 class Tally:
-    """What came of the attempts at one object."""
+    """What came of the attempts at one object. skipped: why it cannot be grasped at all."""
 
     object_id: str
     attempts: int = 0
     accepted: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     reasons: Counter[str] = field(default_factory=Counter)
+    skipped: str | None = None
 
     def add(self, attempt: LoggedAttempt) -> None:
-        """Count one more."""
+        """Count one more; what is ungraspable was not attempted."""
+        if attempt.outcome == UNGRASPABLE:
+            self.skipped = attempt.reason
+            return
         self.attempts += 1
         self.accepted += attempt.accepted
         self.outcomes[attempt.outcome] += 1
@@ -153,12 +158,14 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
 
 
 def acceptance_table(tallies: Sequence[Tally], wanted: int | None = None) -> str:
-    """Plain text, a line an object and one for all; objects that have fewer than `wanted` are marked."""
+    """Plain text, a line an object and one for all; marked are objects that have fewer than `wanted`, and why those
+    were skipped that cannot be grasped."""
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
     total = Tally("all")
     for each in tallies:
-        lines.append(_line(each, width) + ("  gave up" if wanted is not None and each.accepted < wanted else ""))
+        gave_up = "  gave up" if wanted is not None and each.accepted < wanted else ""
+        lines.append(_line(each, width) + (f"  skipped: {each.skipped}" if each.skipped else gave_up))
         total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
         total.outcomes += each.outcomes
     return "\n".join([*lines, _line(total, width)])

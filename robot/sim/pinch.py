@@ -1,7 +1,8 @@
 """Two fingers close on the object: what each meets, how deep it is pressed, how wide the jaws stand, whether it holds.
 
-Gripper frame: x along the closing direction, z up, origin between the fingertips. Finger a comes from -x and looks
-along +x, finger b the other way. A gel's grid has its rows downward (-z) and its columns to the finger's right.
+Gripper frame: x along the closing direction, z from the fingertips to the hand (up, unless the hand is tilted), origin
+between the fingertips. Finger a comes from -x and looks along +x, finger b the other way. A gel's grid has its rows
+towards the fingertip (-z) and its columns to the finger's right.
 Each part is worked out when it is asked for, and once.
 """
 
@@ -49,12 +50,15 @@ class Hand:
     """What of the gripper matters here. `safety`: friction must carry this many times the weight, for the lift.
 
     `grid` and `tolerance` are those of the contact solver: what they cost in error is measured by `frontier`.
+    `turns_about_grip`: closing jaws turn the object about the point between them, as one that is grasped far from its
+    middle; else about its own axis, near which procedural objects are grasped.
     """
 
     stroke_mm: float = STROKE_MM
     safety: float = 1.5
     grid: tuple[int, int] = (120, 160)
     tolerance: float = 1e-2
+    turns_about_grip: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,11 @@ class Pinch:
         return self._turn(_nearest_widest(fine, self._reached(fine)) + rest)
 
     def _turn(self, angle: float) -> Placement:
-        return Placement(self.placement.x_mm, self.placement.y_mm, self.placement.yaw_rad + angle)
+        x, y, pose = self.placement.x_mm, self.placement.y_mm, self.grip.pose
+        if self.hand.turns_about_grip:
+            c, s, along, across = math.cos(angle), math.sin(angle), x - pose.x_mm, y - pose.y_mm
+            x, y = pose.x_mm + c * along - s * across, pose.y_mm + s * along + c * across
+        return Placement(x, y, self.placement.yaw_rad + angle)
 
     @cached_property
     def _reaches(self) -> Array:
@@ -130,9 +138,9 @@ class Pinch:
         yy, zz = np.meshgrid(y, z)
         local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
         pose, rotations = self.grip.pose, np.stack([placement.rotation() for placement in placements])
-        closing = Placement(yaw_rad=pose.yaw_rad).rotation()
-        pad = local @ closing.T + [pose.x_mm - self.placement.x_mm, pose.y_mm - self.placement.y_mm, pose.z_mm]
-        starts = pad @ rotations
+        closing = pose.rotation()
+        middles = np.array([[pose.x_mm - each.x_mm, pose.y_mm - each.y_mm, pose.z_mm] for each in placements])
+        starts = (local @ closing.T + middles[:, None]) @ rotations
         directions = (side * closing[:, 0]) @ rotations
         return starts, np.broadcast_to(directions[:, None], starts.shape)
 

@@ -1,14 +1,11 @@
 """The simulated rig: devices like any other over one Scene; seed, object and number decide all of an attempt."""
 
-import hashlib
 import math
 import zlib
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +13,10 @@ import numpy.typing as npt
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
-from robot.grasping.settings import attempt_of
+from robot.grasping.planner import GraspPlanner
+from robot.grasping.settings import GraspSettings, attempt_of
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
+from robot.recording.folder import UNITS
 from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.settings import TypedSettings, limited
@@ -29,10 +28,14 @@ from robot.sim.objects.shapes import SHAPES
 from robot.sim.pinch import PAD_MM, SIDES, Grip, Hand
 from robot.sim.scene import Scene
 
+if TYPE_CHECKING:
+    from robot.sim.meshes import MeshFolder
+
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
 """Clamping force of the Weiss WSG-50 that is simulated."""
 
+_MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
 _MOST_OBJECTS = 100_000
 _WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
@@ -84,7 +87,8 @@ class SimSettings(TypedSettings):
     (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
     markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
     instead (needs the extra `mesh`). contact_grid
-    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one.
+    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one. focal_px: of the
+    camera, whose pictures have 256 px a side; at 860 they show some 190 mm, and larger objects in part.
     localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
     tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts are made
     (robot.grasping.settings), and what the gels are made of (robot.gel_settings); what is not known of one is drawn.
@@ -99,6 +103,7 @@ class SimSettings(TypedSettings):
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: float = limited(1e-12, 0.999, 1e-2)
     shadow: bool = True
+    focal_px: float = limited(300, 10_000, 860.0, unit="px")
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
@@ -129,9 +134,13 @@ class SimRig(Rig):
         """Raises RobotConfigError, UnknownName, SceneError."""
         check_seed(seed)
         asked = SimSettings(**settings)
-        self._seed, self._families, self._meshes = seed, tuple(sorted(asked.families)), asked.meshes
+        self._seed, self._families = seed, tuple(sorted(asked.families))
+        attempt = attempt_of(asked.attempt, asked.grasp)
+        self._meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
         self._shadow = asked.shadow
-        self._hand = Hand(grid=asked.contact_grid, tolerance=asked.contact_tolerance)
+        self._hand = Hand(
+            grid=asked.contact_grid, tolerance=asked.contact_tolerance, turns_about_grip=self._meshes is not None
+        )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
         dots = Markers() if asked.markers else None
         fingers, known = asked.fingers, gels_of(asked.gel, asked.fingers)
@@ -142,25 +151,26 @@ class SimRig(Rig):
             }
             for pair in drawn
         ]
-        self._camera = PinholeCamera()
-        clock = SimClock()
+        self._camera = PinholeCamera(focal_px=asked.focal_px)
+        clock, error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
         self.world = World(clock)
         super().__init__(
             SimArm(self.world),
             SimGripper(self.world),
             {finger: SimTactileSensor(self.world, finger) for finger in fingers},
-            SimCamera(self.world, self._camera, _calibration_error(seed, asked.localisation_mm)),
+            SimCamera(self.world, self._camera, error_mm),
             info={
                 "source": "simulated rig",
                 "sensor": f"simulated GelSight ({asked.optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
                 "gels": [{finger: pair[finger].gel.as_recorded() for finger in sorted(pair)} for pair in self._gels],
-                **({"meshes_sha256": _mesh_digest(asked.meshes)} if asked.meshes else {}),
+                **({"meshes_sha256": self._meshes.digest, "units": _MESH_UNITS} if self._meshes else {}),
             },
             clock=clock,
             sleep=clock.sleep,
-            attempt=attempt_of(asked.attempt, asked.grasp),
+            attempt=attempt,
+            planner=_mesh_planner(self.world, error_mm) if self._meshes else None,
         )
         self.attempt.grasp.check(self.arm, self.gripper)
 
@@ -168,10 +178,9 @@ class SimRig(Rig):
         """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
         if count > _MOST_OBJECTS:
             raise RobotConfigError(f"the simulated rig has at most {_MOST_OBJECTS} objects a seed, got {count}")
-        names = [self._object(index).object_id for index in range(count)]
-        if self._meshes and (twice := sorted(name for name, times in Counter(names).items() if times > 1)):
-            raise RobotConfigError(f"{self._meshes} must not hold two meshes of one name, got {twice[0]!r}; rename one")
-        return names
+        if self._meshes is not None:
+            return self._meshes.object_ids(count)
+        return [_procedural(self._seed, index, self._families).object_id for index in range(count)]
 
     def prepare(self, object_id: str, number: int) -> None:
         """Stand the object on the table, turned and placed at random, under new light."""
@@ -225,61 +234,36 @@ class SimRig(Rig):
 
     def _find(self, object_id: str) -> SimObject:
         """The object of this name: procedural ones end in their index, meshes begin with their file's name."""
-        if self._meshes:
-            candidates = [_mesh(path, self._seed) for path in _mesh_files(self._meshes) if _may_be(object_id, path)]
+        if self._meshes is not None:
+            candidates = self._meshes.candidates(object_id)
         else:
             index = object_id.rsplit("-", 1)[-1]
-            candidates = [self._object(int(index))] if index.isdecimal() else []
+            candidates = [_procedural(self._seed, int(index), self._families)] if index.isdecimal() else []
         for candidate in candidates:
             if candidate.object_id == object_id:
                 return candidate
         raise RobotConfigError(f"the simulated rig with seed {self._seed} and these settings has no {object_id!r}")
 
-    def _object(self, index: int) -> SimObject:
-        if not self._meshes:
-            return _procedural(self._seed, index, self._families)
-        paths = _mesh_files(self._meshes)
-        if index >= len(paths):
-            raise RobotConfigError(f"{self._meshes} must hold as many STL, OBJ or PLY as objects; it has {len(paths)}")
-        return _mesh(paths[index], self._seed)
-
-
-# An object keeps its baked relief, and a mesh its search tree, from attempt to attempt.
-
 
 @lru_cache(maxsize=4)
 def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
+    """It keeps its baked relief from attempt to attempt."""
     return draw_object(seed, index, family=families[index % len(families)] if families else None)
 
 
-@lru_cache(maxsize=4)
-def _mesh(path: Path, seed: int) -> SimObject:
-    from robot.sim.objects.mesh import load_mesh_object
-
-    return load_mesh_object(path, seed)
+# Meshes need packages that others need not wait for.
 
 
-def _mesh_files(folder: str) -> list[Path]:
-    """Raises RobotConfigError for a folder that is none."""
-    if not Path(folder).is_dir():
-        raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
-    kinds = (".stl", ".obj", ".ply")
-    return sorted(each for each in Path(folder).iterdir() if each.suffix.lower() in kinds and each.name[0] != ".")
+def _mesh_folder(folder: str, seed: int, settings: GraspSettings) -> "MeshFolder":
+    from robot.sim.meshes import MeshFolder
+
+    return MeshFolder(folder, seed, settings)
 
 
-def _mesh_digest(folder: str) -> str:
-    """Of all mesh files and their names: a recording goes on with the same ones only."""
-    digest = hashlib.sha256()
-    for path in _mesh_files(folder):
-        digest.update(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
-    return digest.hexdigest()
+def _mesh_planner(world: World, error_mm: Array) -> GraspPlanner:
+    from robot.sim.mesh_planner import MeshPlanner
 
-
-def _may_be(object_id: str, path: Path) -> bool:
-    """Whether the file's name fits, so that not every mesh must be read."""
-    from robot.sim.objects.mesh import object_prefix
-
-    return object_id.startswith(object_prefix(path))
+    return MeshPlanner(world.now, error_mm)
 
 
 def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
@@ -297,6 +281,7 @@ class SimArm(VirtualDevice, Arm):
 
     def __init__(self, world: World) -> None:
         super().__init__("simulated arm", _WORKSPACE, clock=world.clock)
+        self.can_tilt = True
         self._world = world
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:

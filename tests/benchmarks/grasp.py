@@ -51,7 +51,7 @@ def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator
 def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
     """Grips about the middle of the rig's objects, each round over all of them."""
     rig = SimRig(40_000)
-    held = {name: rig._object(index) for index, name in enumerate(rig.object_ids(objects))}
+    held = {name: rig._find(name) for name in rig.object_ids(objects)}
     rng = np.random.default_rng(0)
     for number in range(grasps):
         for name, obj in held.items():

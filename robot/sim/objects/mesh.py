@@ -19,15 +19,15 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from robot.errors import SceneError
 from robot.sim.objects.body import Body, ClippedRays, Vectors
-from robot.sim.objects.draw import STROKE_MM, SimObject
+from robot.sim.objects.draw import SimObject
 from robot.sim.objects.looks import draw_looks
 from robot.sim.objects.materials import draw_material
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
+from robot.sim.objects.resting import UP, turn_up
 from robot.sim.objects.shapes.base import Cylindrical, Floats, relief_limit
 from robot.sim.objects.wall import Wall, bake_plain, ends_weight, smoothstep
 
 FORMATS = ("stl", "obj", "ply")
-TALLEST_MM = 300.0
 THINNEST_MM = 2.0
 _METRES_BELOW = 2.0
 _CREASE_COSINE = 0.77
@@ -83,8 +83,26 @@ class Mesh:
     @cached_property
     def volume_mm3(self) -> float:
         """Signed volume, by the divergence theorem: positive if the faces look outwards."""
+        return float(np.einsum("ij,ij->", *self._tetrahedra) / 6)
+
+    @property
+    def centre_of_mass(self) -> Vectors:
+        """(3,) of the homogeneous solid."""
+        weight = np.einsum("ij,ij->i", *self._tetrahedra) / (6 * self.volume_mm3)
+        middle = self.vertices.mean(axis=0)
+        return np.asarray(middle + weight @ (self.corners - middle).sum(axis=1) / 4)
+
+    @property
+    def _tetrahedra(self) -> tuple[Vectors, Vectors]:
+        """Of each face with the vertices' middle, an edge and the cross product of the two others, (F, 3) each."""
         a, b, c = (self.corners - self.vertices.mean(axis=0)).transpose(1, 0, 2)
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+        return a, np.cross(b, c)
+
+    def resting(self, up: Vectors) -> "Mesh":
+        """Turned until the unit direction `up` points up, its foot on z = 0, centred."""
+        vertices = self.vertices if up is UP else self.vertices @ turn_up(up).T
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        return Mesh(vertices - [*(low + high)[:2] / 2, low[2]], self.faces)
 
     def normals_at(self, face: Faces, points: Vectors) -> Vectors:
         """Normals mixed from the corners', at points (N, 3) on the faces."""
@@ -143,7 +161,7 @@ class MeshBody(Body):
         origins, directions, near = rays.origins[ahead], rays.directions[ahead], rays.near_mm[ahead]
         # A face that lies in the bounding box would be missed by rays that start on it.
         start = near - np.minimum(near, _BACK_MM)
-        face, distance = self._first(origins + start[:, None] * directions, directions)
+        face, distance = self.first_faces(origins + start[:, None] * directions, directions)
         hit = np.flatnonzero(face >= 0)
         result = np.full(len(ahead), np.inf)
         result[hit] = start[hit] + distance
@@ -156,8 +174,8 @@ class MeshBody(Body):
         distances[ahead] = np.maximum(result, near)
         return distances
 
-    def _first(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
-        """First face along each ray (-1: none), and for those with one the distance to its plane, in float64."""
+    def first_faces(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
+        """First face of the bare mesh along each ray (-1: none), and for those with one the distance to its plane."""
         face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
         hit = face >= 0
         normal, corner = self.mesh.face_normals[face[hit]], self.mesh.corners[face[hit], 0]
@@ -205,7 +223,7 @@ class MeshBody(Body):
         """Smoothed normals of the faces under the points, found from just outside."""
         guess = self._guess(points)
         reach = self.relief.amplitude_mm + 2 * _BACK_MM
-        face, distance = self._first(points + reach * guess, -guess)
+        face, distance = self.first_faces(points + reach * guess, -guess)
         found = np.flatnonzero(face >= 0)
         depth = reach - distance
         near = np.abs(depth) < reach
@@ -234,14 +252,27 @@ def load_mesh_object(
     relief: str | None = None,
     material: str | None = None,
 ) -> SimObject:
-    """Read a mesh, stand it on the table and give it relief, material and looks drawn from `seed` and its name.
+    """Read a mesh as `read_mesh` and make an object of it as `mesh_object`, that stands as it does in the file."""
+    return mesh_object(Path(path), read_mesh(path), seed, relief=relief, material=material)
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a closed solid and stand it on the table.
 
     The file's z axis points up, and its unit is the metre if its largest extent is below 2, else the mm. Raises
-    SceneError for a file that is no closed solid of a size that the gripper (110 mm) can close on, UnknownName, and
-    SceneError naming the extra where its packages are missing.
+    SceneError for a file that is no closed solid, and SceneError naming the extra where its packages are missing.
     """
     file = Path(path)
-    mesh = _stand(_read(file), file)
+    return _stand(_read(file), file)
+
+
+def mesh_object(
+    file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None, material: str | None = None
+) -> SimObject:
+    """Give a mesh relief, material and looks drawn from `seed` and the file's name, and rest it with `up` (3,) up.
+
+    Raises UnknownName.
+    """
     stream = [seed, zlib.crc32(file.stem.encode())]
     worn = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
     limit = relief_limit(min(_narrowest(mesh.vertices), 94.0), 3.0)
@@ -252,7 +283,7 @@ def load_mesh_object(
         relief=pattern,
         material=draw_material(np.random.default_rng([*stream, 2]), material),
         looks=draw_looks(np.random.default_rng([*stream, 3])),
-        body=MeshBody(mesh, pattern),
+        body=MeshBody(mesh.resting(up), pattern),
     )
 
 
@@ -316,13 +347,13 @@ def _stand(mesh: Mesh, file: Path) -> Mesh:
     """The mesh in mm, foot on z = 0, centred, faces outwards, after all checks. Raises SceneError."""
     _check_closed(mesh, file)
     scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _METRES_BELOW else 1.0
-    vertices = mesh.vertices * scale
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    vertices = vertices - [*(low + high)[:2] / 2, low[2]]
-    _check_size(vertices, file, scale)
-    standing = Mesh(vertices, mesh.faces)
+    standing = Mesh(mesh.vertices * scale, mesh.faces).resting(UP)
+    thin = np.ptp(standing.vertices, axis=0).min()
+    if thin < THINNEST_MM:
+        hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
+        raise SceneError(f"{file} must be at least {THINNEST_MM:g} mm thick, got {thin:.3g} mm {hint}")
     if standing.volume_mm3 < 0:
-        standing = Mesh(vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
+        standing = Mesh(standing.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
     if standing.volume_mm3 < 1.0:
         raise SceneError(f"{file} must enclose a volume, got {standing.volume_mm3:g} mm3; is it a flat surface?")
     return standing
@@ -342,20 +373,6 @@ def _check_closed(mesh: Mesh, file: Path) -> None:
     balance = np.bincount(number.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
     if balance.any():
         raise SceneError(f"{file} must have all faces turned outwards; set them right with trimesh.repair.fix_normals")
-
-
-def _check_size(vertices: Vectors, file: Path, scale: float) -> None:
-    hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
-    extents = np.ptp(vertices, axis=0)
-    if extents.min() < THINNEST_MM:
-        raise SceneError(f"{file} must be at least {THINNEST_MM:g} mm thick, got {extents.min():.3g} mm {hint}")
-    if extents[2] > TALLEST_MM:
-        raise SceneError(f"{file} must be at most {TALLEST_MM:g} mm high, got {extents[2]:.4g} mm {hint}")
-    if (narrow := _narrowest(vertices)) > STROKE_MM:
-        raise SceneError(
-            f"{file} must fit between fingers {STROKE_MM:g} mm apart in some direction, "
-            f"and its narrowest width is {narrow:.4g} mm {hint}"
-        )
 
 
 def _narrowest(vertices: Vectors) -> float:

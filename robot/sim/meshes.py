@@ -1,0 +1,80 @@
+"""A folder of meshes as the objects of a simulated rig, each in a resting pose in which the gripper can grasp it."""
+
+import hashlib
+from collections import Counter
+from functools import lru_cache
+from pathlib import Path
+
+from robot.errors import RobotConfigError
+from robot.grasping.settings import GraspSettings
+from robot.sim.antipodal import Grasps, find_grasps
+from robot.sim.objects.draw import STROKE_MM, SimObject
+from robot.sim.objects.mesh import FORMATS, MeshBody, mesh_object, object_prefix, read_mesh
+from robot.sim.objects.resting import resting_ups
+
+_ENOUGH = 100
+"""A resting pose with so many grasps is taken; few may be a chance of the grid, out of the arm's reach."""
+
+
+class MeshFolder:
+    """The STL, OBJ and PLY files of a folder as objects of one seed, for a rig with these grasp settings.
+
+    Raises RobotConfigError for a folder that is none.
+    """
+
+    def __init__(self, folder: str, seed: int, settings: GraspSettings) -> None:
+        if not Path(folder).is_dir():
+            raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
+        self._folder, self._seed, self._settings = folder, seed, settings
+
+    @property
+    def _paths(self) -> list[Path]:
+        files = sorted(Path(self._folder).iterdir())
+        return [each for each in files if each.suffix.lower().lstrip(".") in FORMATS and each.name[0] != "."]
+
+    @property
+    def digest(self) -> str:
+        """Of all mesh files and their names: a recording goes on with the same ones only."""
+        digest = hashlib.sha256()
+        for path in self._paths:
+            digest.update(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+        return digest.hexdigest()
+
+    def object_ids(self, count: int) -> list[str]:
+        """Names of the first `count`. Raises RobotConfigError for more than there are, SceneError for a bad file."""
+        paths = self._paths
+        if count > len(paths):
+            raise RobotConfigError(f"{self._folder} must hold as many STL, OBJ or PLY as objects; it has {len(paths)}")
+        names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in paths[:count]]
+        if twice := sorted(name for name, times in Counter(names).items() if times > 1):
+            raise RobotConfigError(f"{self._folder} must not hold two meshes of one name, got {twice[0]!r}; rename one")
+        return names
+
+    def candidates(self, object_id: str) -> list[SimObject]:
+        """Objects that may have this name, for their files' names fit. Raises SceneError."""
+        paths = [path for path in self._paths if object_id.startswith(object_prefix(path))]
+        return [_rested(path, self._seed, self._settings) for path in paths]
+
+
+# An object keeps its search tree and its grasps from attempt to attempt.
+
+
+@lru_cache(maxsize=4)
+def _rested(path: Path, seed: int, settings: GraspSettings) -> SimObject:
+    """The mesh in the first resting pose with enough grasps, else in that with the most; where there are none, in that
+    whose opposite sides are nearest to each other."""
+    mesh = read_mesh(path)
+    rated: list[tuple[int, float, SimObject]] = []
+    for up in resting_ups(mesh.vertices, mesh.centre_of_mass):
+        obj = mesh_object(path, mesh, seed, up=up)
+        found = grasps_of(obj.body, settings)
+        rated.append((len(found), -found.narrowest_mm, obj))
+        if len(found) >= _ENOUGH:
+            return obj
+    return max(rated, key=lambda each: each[:2])[2]
+
+
+@lru_cache(maxsize=16)
+def grasps_of(body: MeshBody, settings: GraspSettings) -> Grasps:
+    """`find_grasps` for the stroke of the simulated gripper, once."""
+    return find_grasps(body, settings, STROKE_MM)

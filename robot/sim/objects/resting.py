@@ -1,0 +1,70 @@
+"""How a solid may rest on the table: the sides on which it stands without falling over.
+
+A solid rests on a side of its convex hull if its centre of mass lies above the polygon of the points that touch the
+table there (Goldberg 1999). Scans are not flat to a micrometre, so that points within a millimetre of the table touch.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+Array = NDArray[np.float64]
+UP = np.array([0.0, 0.0, 1.0])
+
+_TOUCHES_MM = 1.0
+_STEADY = math.radians(4.0)
+"""A solid that falls over when it is tilted by less does not rest."""
+
+_SAME_COSINE = math.cos(math.radians(20.0))
+"""Sides whose normals are nearer to each other than this are one side, of which the steadiest resting pose counts."""
+
+_MAX_POSES = 6
+
+
+def resting_ups(vertices: Array, centre_of_mass: Array) -> list[Array]:
+    """Directions (3,) of the solid that point up when it rests: its own z first or one near it, then the steadiest.
+
+    vertices (V, 3). A solid that rests nowhere stands as it is.
+    """
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError:
+        return [UP]
+    corners = vertices[hull.vertices] - centre_of_mass
+    # Scans have thousands of sides: of those that point the same way to about a degree, one is tried.
+    _, first = np.unique(np.rint(hull.equations[:, :3] / 0.02), axis=0, return_index=True)
+    tried = [UP, *-hull.equations[np.sort(first), :3]]
+    angles = [tipping_angle(corners, -up) for up in tried]
+    steady = sorted((number == 0, angle, number) for number, angle in enumerate(angles) if angle > _STEADY)
+    poses: list[Array] = []
+    for up in (tried[number] for *_, number in reversed(steady)):
+        if all(up @ other < _SAME_COSINE for other in poses):
+            poses.append(up)
+    upright_first = sorted(poses, key=lambda up: bool(up @ UP < _SAME_COSINE))
+    return upright_first[:_MAX_POSES] or [UP]
+
+
+def tipping_angle(corners: Array, down: Array) -> float:
+    """How far (rad) a solid can be tilted before it falls over; below 0 where it does not rest.
+
+    corners (N, 3): of its convex hull, from the centre of mass. down (3,): unit direction of the table.
+    """
+    depth = corners @ down
+    height = float(depth.max())
+    touching = corners[depth >= height - _TOUCHES_MM] @ turn_up(-down).T
+    try:
+        edges = ConvexHull(touching[:, :2]).equations if len(touching) > 2 else None
+    except QhullError:  # they lie in a line
+        edges = None
+    return -1.0 if edges is None else math.atan2(-float(edges[:, 2].max()), height)
+
+
+def turn_up(up: Array) -> Array:
+    """(3, 3): the shortest rotation that brings the unit direction `up` (3,) to z."""
+    x, y, z = up
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1 + z))

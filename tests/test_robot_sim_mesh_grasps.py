@@ -1,0 +1,309 @@
+"""Resting poses, and grasps of meshes from above and from the sides: what must hold for solids known by hand."""
+
+import dataclasses
+import functools
+import json
+import math
+
+import numpy as np
+import pytest
+
+from robot.collect import CollectSettings, collect
+from robot.errors import UngraspableError
+from robot.grasping.attempt import Attempter
+from robot.grasping.settings import GraspSettings
+from robot.readings import Pose
+from robot.recording.folder import read_recording
+from robot.rig import load_rig
+from robot.sim.antipodal import find_grasps
+from robot.sim.objects.mesh import Mesh, load_mesh_object, mesh_object, read_mesh
+from robot.sim.objects.resting import UP, resting_ups, tipping_angle, turn_up
+from tests.meshes import BOTTLE, box, revolved, sphere, stl
+
+pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
+pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
+
+SETTINGS, STROKE_MM = GraspSettings(), 110.0
+FINGER_MM, HAND_MM = 15.0, 50.0
+
+
+def grasps_of(tmp_path, vertices, faces, up=UP):
+    path = stl(tmp_path / "thing.stl", vertices, faces)
+    obj = mesh_object(path, read_mesh(path), 0, up=up, relief="smooth")
+    return obj.body.mesh, find_grasps(obj.body, SETTINGS, STROKE_MM)
+
+
+def surface(mesh, per_mm2=0.3):
+    """Points all over a mesh."""
+    rng = np.random.default_rng(0)
+    count = int(per_mm2 * mesh.areas.sum())
+    face = rng.choice(len(mesh.areas), count, p=mesh.areas / mesh.areas.sum())
+    return np.einsum("ij,ijk->ik", rng.dirichlet(np.ones(3), count), mesh.corners[face])
+
+
+# Resting poses ----------------------------------------------------------------------------------------------
+
+
+def test_a_box_rests_on_its_six_sides_as_it_stands_first_and_then_the_steadiest():
+    vertices, _ = box(60, 90, 180)
+    ups = resting_ups(vertices, np.zeros(3))
+    assert ups[0] is UP
+    np.testing.assert_allclose(np.sort(np.abs(ups[1:5]), axis=1), np.tile([0, 0, 1], (4, 1)), atol=1e-9)
+    np.testing.assert_allclose([abs(up[0]) for up in ups[1:5]], [1, 1, 0, 0], atol=1e-9)  # the largest sides
+    np.testing.assert_allclose(ups[5], [0, 0, -1], atol=1e-9)
+
+
+def test_a_box_falls_over_when_its_centre_passes_the_edge():
+    vertices, _ = box(60, 90, 180)
+    assert tipping_angle(vertices, -UP) == pytest.approx(math.atan2(30, 90))
+    assert tipping_angle(vertices, np.array([1.0, 0, 0])) == pytest.approx(math.atan2(45, 30))
+    assert tipping_angle(vertices, np.array([0.6, 0, 0.8])) < 0  # on an edge
+
+
+def test_what_leans_in_its_file_is_set_on_the_side_that_it_nearly_stands_on(tmp_path):
+    vertices, faces = box(60, 90, 180)
+    lean = turn_up(np.array([math.sin(0.1), 0.0, math.cos(0.1)]))
+    mesh = Mesh(vertices @ lean, faces)
+    up = resting_ups(mesh.vertices, np.zeros(3))[0]
+    np.testing.assert_allclose(np.ptp(mesh.resting(up).vertices, axis=0), [60, 90, 180], atol=1e-6)
+
+
+def test_a_pencil_on_end_lies_down():
+    vertices, faces = box(6, 6, 150)
+    mesh = Mesh(vertices, faces)
+    assert np.ptp(mesh.resting(resting_ups(vertices, np.zeros(3))[0]).vertices[:, 2]) == pytest.approx(6)
+
+
+def test_the_centre_of_mass_is_that_of_the_solid_wherever_it_is():
+    (vertices, faces), away = box(60, 90, 180), [500, -7, 90]
+    np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).centre_of_mass, away, atol=1e-9)
+    cone = Mesh(*revolved([(30, 0), (0.001, 80)]))
+    np.testing.assert_allclose(cone.centre_of_mass, [0, 0, 20], atol=0.01)  # a quarter of its height
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, -0.64, 0.48]])
+def test_the_direction_that_is_to_point_up_does(up):
+    turn = turn_up(np.array(up))
+    np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+# Grasps -----------------------------------------------------------------------------------------------------
+
+
+def test_a_box_is_grasped_across_its_flat_sides_from_above_and_from_the_sides(tmp_path):
+    _, grasps = grasps_of(tmp_path, *box(60, 90, 180))
+    degrees = np.degrees(grasps.yaw_rad).round().astype(int)
+    assert set(degrees) == {0, 10, 80, 90, 100, 170}  # within the friction cone of a side's normal: 17 degrees
+    for yaw, width in ((0, 60), (90, 90)):
+        np.testing.assert_allclose(grasps.width_mm[degrees == yaw], width, atol=1e-3)
+    for tilt in (0.0, math.pi / 2, -math.pi / 2):
+        assert (grasps.tilt_rad == tilt).sum() > 100
+    heights = grasps.points[grasps.tilt_rad == 0, 2]
+    assert 180 - SETTINGS.reach_mm <= heights.min() < heights.max() <= 180 - SETTINGS.top_margin_mm
+    heights = grasps.points[grasps.tilt_rad != 0, 2]
+    assert heights.min() >= HAND_MM / 2
+    assert np.ptp(heights) > 120
+    np.testing.assert_allclose(grasps.points[degrees == 0, 0], 0, atol=1e-3)  # in the middle between the two sides
+
+
+@pytest.mark.parametrize("solid", [box(60, 90, 180), revolved(BOTTLE), box(40, 200, 30)], ids=["box", "bottle", "bar"])
+def test_neither_fingers_nor_hand_sweep_over_the_object_or_the_table(tmp_path, solid):
+    """Held to points all over the surface, in the frame of the open gripper, on its whole way."""
+    mesh, grasps = grasps_of(tmp_path, *solid)
+    assert len(grasps) > 100
+    points, inside, coarse = surface(mesh), STROKE_MM / 2, 3.0  # of the grid: what lies between its rays may be met
+    for number in np.random.default_rng(1).choice(len(grasps), 100, replace=False):
+        pose = Pose(*grasps.points[number], grasps.yaw_rad[number], grasps.tilt_rad[number])
+        x, y, z = ((points - pose.as_tuple()[:3]) @ pose.rotation()).T
+        fingers = (
+            (np.abs(x) > inside) & (np.abs(y) < SETTINGS.finger_mm / 2 - coarse) & (z > coarse - SETTINGS.floor_mm)
+        )
+        hand = (np.abs(y) < HAND_MM / 2 - coarse) & (z > SETTINGS.reach_mm + coarse)
+        assert not (fingers & (np.abs(x) < inside + FINGER_MM)).any()
+        assert not (hand & (np.abs(x) < inside + FINGER_MM)).any()
+        tips = np.array([[0, side * SETTINGS.finger_mm / 2, -SETTINGS.floor_mm] for side in (-1, 1)])
+        back = np.array([[0, side * HAND_MM / 2, SETTINGS.reach_mm] for side in (-1, 1)])
+        corners = np.concatenate([tips, back]) @ pose.rotation().T + pose.as_tuple()[:3]
+        assert corners[:, 2].min() >= 0
+        withdrawn = z - grasps.back_mm[number]  # from there, everything lies ahead of the fingertips
+        assert withdrawn.max() < -SETTINGS.floor_mm + coarse
+
+
+def test_a_bottle_is_grasped_at_its_body_and_its_neck_from_all_around(tmp_path):
+    _, grasps = grasps_of(tmp_path, *revolved(BOTTLE))
+    assert len(set(grasps.yaw_rad)) == 18
+    neck, body = grasps.points[:, 2] > 152, grasps.points[:, 2] < 100
+    np.testing.assert_allclose(grasps.width_mm[body & (grasps.points[:, 2] > 15)], 68, atol=2.5)
+    np.testing.assert_allclose(grasps.width_mm[neck], 26, atol=4)  # a pad there may touch the shoulder
+    assert neck.sum() > 50
+    slanted = (grasps.points[:, 2] > 130) & (grasps.points[:, 2] < 138)  # 20 mm up for 16 mm in: too steep to hold
+    assert not slanted.any()
+
+
+def test_a_box_that_is_too_wide_on_two_axes_is_grasped_when_it_rests_on_edge(tmp_path):
+    assert not len(grasps_of(tmp_path, *box(150, 160, 60))[1])
+    rig = load_rig("sim", seed=0, meshes=str(tmp_path))
+    with rig:
+        name = rig.object_ids(1)[0]
+        rig.prepare(name, 0)
+        height = rig.world.scene.obj.body.mesh.vertices[:, 2].max()
+        assert height > 149
+        attempts = [Attempter(rig, 0, rig.attempt).run(name, number) for number in range(6)]
+    held = [attempt for attempt in attempts if attempt.outcome == "held"]
+    assert len(held) >= 3
+    assert all(attempt.fit["width_mm"] < 80 for attempt in attempts)
+
+
+def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_says_by_how_much(tmp_path):
+    vertices, faces = sphere()
+    stl(tmp_path / "globe.stl", 70 * vertices, faces)
+    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        with pytest.raises(UngraspableError, match=r"wider than the gripper opens: 13\d mm .* 110 mm less 5 mm"):
+            rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
+
+
+def test_slopes_that_the_fingers_would_slip_off_are_no_opposite_sides(tmp_path):
+    """A cone whose wall goes 15 mm inwards for 10 mm up: the friction cone ends at 3 for 10."""
+    _, grasps = grasps_of(tmp_path, *revolved([(46, 0), (1, 30)]))
+    assert (len(grasps), grasps.narrowest_mm) == (0, math.inf)
+
+
+def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
+    stl(tmp_path / "brick.stl", *box(60, 90, 180))
+    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        scene = rig.world.scene
+        lead = dataclasses.replace(scene.obj.material, name="lead", density_kg_m3=11340.0, friction=0.3)
+        rig.world.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=lead))
+        mass = (60 * 90 + 60 * 180 + 90 * 180) * 2 * 3 * 11340e-9  # a shell of 3 mm
+        said = rf"too heavy to lift: {mass:.2f} kg of lead need {1.5 * mass * 9.81 / 0.6:.0f} N .* ends at 25 N"
+        with pytest.raises(UngraspableError, match=said):
+            rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
+
+
+# Attempts ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def attempts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    stl(folder / "box.stl", *box(60, 90, 180))
+    with load_rig("sim", seed=2, meshes=str(folder)) as rig:
+        attempter, name, moves = Attempter(rig, 2, rig.attempt), rig.object_ids(1)[0], []
+        move = rig.arm._move_to
+        rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)
+        made = []
+        for number in range(12):
+            moves.clear()
+            made.append((attempter.run(name, number), list(moves)))
+        return made
+
+
+def test_attempts_come_from_above_and_from_the_sides_and_most_hold(attempts):
+    tilts = [len(attempt.fields["pose"]) == 5 for attempt, _ in attempts]
+    assert 2 <= sum(tilts) <= 10
+    assert sum(attempt.outcome == "held" for attempt, _ in attempts) >= 8
+
+
+def test_a_tilted_hand_goes_down_beside_the_object_comes_and_withdraws_level_and_lifts_straight_up(attempts):
+    held = [each for each in attempts if each[0].outcome == "held" and len(each[0].fields["pose"]) == 5]
+    assert held
+    for attempt, moves in held:
+        pose = Pose(*attempt.fields["pose"])
+        at = moves.index(pose)
+        high, start, above = moves[at - 2], moves[at - 1], moves[at + 1]
+        assert (high.x_mm, high.y_mm) == (start.x_mm, start.y_mm)
+        assert high.z_mm > 400
+        assert start.z_mm == pose.z_mm
+        assert above == dataclasses.replace(pose, z_mm=above.z_mm)
+        assert above.z_mm > pose.z_mm + 100
+        ahead = -pose.rotation()[:, 2]
+        way = np.subtract(pose.as_tuple()[:3], start.as_tuple()[:3])
+        np.testing.assert_allclose(way / np.linalg.norm(way), ahead, atol=1e-3)
+        assert moves[-1] == start
+
+
+def test_touch_sees_what_the_photo_shows(tmp_path):
+    """A box 60 mm by 90 mm: as the jaws close across one or the other, so wide they stand."""
+    stl(tmp_path / "box.stl", *box(60, 90, 120))
+    with load_rig("sim", seed=0, meshes=str(tmp_path), localisation_mm=[0.0, 0.0]) as rig:
+        name = rig.object_ids(1)[0]
+        for number in range(8):
+            attempt = Attempter(rig, 0, rig.attempt).run(name, number)
+            if attempt.outcome == "held":
+                width = 60 if attempt.fit["width_mm"] < 75 else 90
+                assert (
+                    width - 25 < attempt.fields["opening_mm"] < width + 2 * 3 + 0.1
+                )  # gels give way, relief stands out
+
+
+def test_a_mallet_is_taken_from_the_end_of_its_handle_and_not_through_its_head(tmp_path):
+    """Turned as it may be, the hand comes from where there is room: half a turn of the jaws swaps the fingers only."""
+    (handle, faces), (head, _) = box(20, 160, 80), box(120, 40, 80)
+    vertices = np.concatenate([handle, head + np.array([0, 100, 0])])
+    stl(tmp_path / "mallet.stl", vertices, np.concatenate([faces, faces + 8]))
+    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+        name, ways = rig.object_ids(1)[0], []
+        for number in range(40):
+            rig.prepare(name, number)
+            plan = rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(number))
+            across_handle = plan.fit["width_mm"] < 30
+            if plan.pose.tilt_rad and across_handle:
+                ways.append(-plan.pose.rotation()[:, 2] @ rig.world.scene.placement.rotation())
+    assert len(ways) > 5
+    np.testing.assert_allclose(np.array(ways)[:, 1] > 0.95, True)
+
+
+def three(folder):
+    folder.mkdir()
+    vertices, faces = sphere(20)
+    stl(folder / "a_box.stl", *box(60, 90, 120))
+    stl(folder / "b_globe.stl", 80 * vertices, faces)
+    stl(folder / "c_bottle.stl", *revolved(BOTTLE))
+    return functools.partial(load_rig, "sim", seed=1, meshes=str(folder))
+
+
+def files(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_collection_skips_and_names_what_cannot_be_grasped_and_goes_on(tmp_path):
+    make_rig, settings = three(tmp_path / "meshes"), CollectSettings(grasps=2)
+    tallies = collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
+    assert [each.accepted for each in tallies] == [2, 0, 2]
+    assert [each.attempts > 0 for each in tallies] == [True, False, True]
+    globe = tallies[1].object_id
+    recording = read_recording(tmp_path / "r")
+    assert list(recording.info["skipped_objects"]) == [globe]
+    assert recording.info["skipped_objects"][globe].startswith("wider than the gripper opens: 15")
+    assert globe not in {grasp.object_id for grasp in recording.grasps}
+    before = files(tmp_path / "r")
+    again = collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
+    assert (again, files(tmp_path / "r")) == (tallies, before)
+
+
+@pytest.mark.slow
+def test_several_jobs_skip_the_same_objects_and_write_the_same_bytes(tmp_path):
+    make_rig, settings = three(tmp_path / "meshes"), CollectSettings(grasps=2)
+    collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
+    collect(make_rig, tmp_path / "s", objects=3, seed=1, settings=settings, jobs=2)
+    assert files(tmp_path / "r") == files(tmp_path / "s")
+
+
+def test_a_mesh_that_stands_in_its_file_is_not_turned(tmp_path):
+    vertices, faces = box(60, 90, 180)
+    path = stl(tmp_path / "box.stl", vertices, faces)
+    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+        rig.prepare(rig.object_ids(1)[0], 0)
+        body = rig.world.scene.obj.body
+    np.testing.assert_array_equal(body.mesh.vertices, load_mesh_object(path, 0).body.mesh.vertices)
+
+
+def test_a_recording_of_meshes_says_that_poses_may_be_tilted(tmp_path):
+    rig = three(tmp_path / "meshes")()
+    assert "tilt in radian" in rig.info["units"]["pose"]
+    assert "units" not in load_rig("sim", seed=0).info
+    json.dumps(rig.info)
