@@ -152,11 +152,10 @@ def test_an_id_out_of_range_in_a_structure_is_an_error_of_the_search(tmp_path, k
     """FAISS reads it, and the digest fits: the file was written so."""
     folder = filled(tmp_path, 650, kind).folder
     structure = faiss.read_index(str(folder / "vectors.faiss"))
+    lists = structure.invlists
     for number in range(structure.nlist):
-        size = structure.invlists.list_size(number)
-        if size:
-            ids = np.full(size, wrong, np.int64)
-            structure.invlists.update_entries(number, 0, size, faiss.swig_ptr(ids), structure.invlists.get_codes(number))
+        ids = np.full(lists.list_size(number), wrong, np.int64)
+        lists.update_entries(number, 0, len(ids), faiss.swig_ptr(ids), lists.get_codes(number))
     faiss.write_index(structure, str(folder / "vectors.faiss"))
     files = json.loads((folder / "manifest.json").read_text())["files"]
     files["vectors.faiss"]["sha256"] = file_digest(folder / "vectors.faiss")

@@ -117,8 +117,8 @@ class Rows(Sequence[dict[str, Any]]):
 
     def _parsed(self, number: int) -> dict[str, Any]:
         record = self.table[number]
-        if (size := int(record["stop"]) - int(record["start"])) > MAX_LINE_BYTES:
-            raise CorruptIndex(f"row {number} of the index has {size} bytes, must have {MAX_LINE_BYTES} or less; {AGAIN}")
+        if record["stop"] - record["start"] > MAX_LINE_BYTES:
+            raise CorruptIndex(f"row {number} of the index must have {MAX_LINE_BYTES} bytes or less; {AGAIN}")
         try:
             row = parse_json(self.line(number))
         except ValueError as error:

@@ -215,7 +215,7 @@ class TableWriter:
             before = b"" if self.parent is None or number < 0 else self.parent.rows.line(number)
             line = json_of(dict(row), f"row {name!r}", name, checked=before)
             if len(line) >= MAX_LINE_BYTES:
-                raise RowError(f"row {name!r} must have less than {MAX_LINE_BYTES} bytes of JSON, has {len(line)}", name)
+                raise RowError(f"row {name!r} must have less than {MAX_LINE_BYTES} bytes, has {len(line)}", name)
             lines.append(line + b"\n")
             same[place] = line == before
         for name in KEYS:
