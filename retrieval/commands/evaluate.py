@@ -8,6 +8,8 @@ import typer
 from retrieval.commands.options import (
     DEFAULT_PRESET,
     INIT,
+    MAX_COUNT,
+    MAX_SEED,
     SPLIT,
     InitPhoto,
     InitTouch,
@@ -43,10 +45,13 @@ def evaluate(
     init_touch: InitTouch = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
-    iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
-    seeds: Annotated[int, typer.Option(help="trainings of each method")] = 1,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, max=MAX_COUNT, help="optimiser steps, instead of the preset's")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=MAX_COUNT, help="trainings of each method")] = 1,
     seed: Annotated[
-        int | None, typer.Option(help="seed of split, queries and first training, instead of the preset's")
+        int | None,
+        typer.Option(min=0, max=MAX_SEED, help="seed of split, queries and first training, instead of the preset's"),
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     cache: Annotated[

@@ -1,6 +1,7 @@
 """What several commands share: options, options of several values, and what is read where an option names it."""
 
 import dataclasses
+import math
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -39,6 +40,13 @@ LabelledTouches = Annotated[
     typer.Option("--touches", help="labelled touches (`collect --touches-only`) to pair with them by labels"),
 ]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
+
+MAX_COUNT, MAX_SEED = 10**9, 2**32 - 1
+"""Largest number of anything that is counted, and of a seed."""
+MAX_WORKERS = 1024
+"""Processes, threads or replicas at most."""
+MAX_SECONDS = 86_400
+"""The longest wait, a day."""
 
 _BETWEEN = "\0"  # which no word of a command line holds
 
@@ -81,7 +89,12 @@ class Command(TyperCommand):
             else:
                 joined += args[:1]
                 args = args[1:]
-        return super().parse_args(ctx, joined + args)
+        rest = super().parse_args(ctx, joined + args)
+        for each in self.params:
+            value = ctx.params.get(each.name)
+            if isinstance(value, float) and math.isnan(value):  # it lies in every range, as comparisons go
+                ctx.fail(f"Invalid value for '{each.opts[0]}': nan is not a number")
+        return rest
 
 
 def refuse(why: str, **given: object) -> None:

@@ -123,6 +123,12 @@ def require_ours(path: Path, kind: Kind) -> None:
     )
 
 
+def require_folder(path: Path) -> None:
+    """Raise BadInput unless the folder of a file to write exists: a wrong path is more likely than a wish for it."""
+    if not path.parent.is_dir():
+        raise BadInput(f"{path} cannot be written, as there is no folder {path.parent}; make it, or name another file")
+
+
 def _why(error: OSError) -> str:
     reason = error.strerror or str(error)
     return reason if reason.startswith(("is ", "has ")) else f"cannot be opened ({reason})"

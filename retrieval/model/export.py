@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from indexes.store.files import write_atomically
-from retrieval.console.files import EXPORT, make_cache_folder, require_ours, require_private
+from retrieval.console.files import EXPORT, make_cache_folder, require_folder, require_ours, require_private
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
@@ -63,6 +63,7 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     if path.suffix != ENDING:
         raise BadInput(f"an export must be named *{ENDING}; got {path}")
     require_ours(path, EXPORT)
+    require_folder(path)
     unsettled = path.with_name(f".{path.name}.unsettled")
     try:
         write_atomically(unsettled, sealed(graph_of(checkpoint)))

@@ -25,6 +25,7 @@ LEAST_LIMIT, MAX_DISTANCE = 0.02, 0.1
 PART = 0.25
 _SAMPLE = 500
 """Pictures at most, evenly chosen, of which the median is taken."""
+_HALVES = ((1, 2), (2, 1), (2, 2))
 _ONES = np.full((SIDE, SIDE), 1 / SIDE, np.float32)
 
 Doubles = NDArray[np.float64]
@@ -52,11 +53,12 @@ class AlignedSet:
         return self._to(self._pictures[row].astype(np.float32), others)
 
     def moved_by_half(self, row: int) -> float:
-        """Return the distance of a picture to itself moved by half a pixel each way, where most of its detail is lost.
+        """Return the distance of a picture to itself moved by half a pixel along either side or both, the farthest.
 
         A moved copy lies no farther, unless it was changed otherwise too.
         """
-        return float(self._to(cv2.blur(self._pictures[row].astype(np.float32), (2, 2)), [row])[0])
+        picture = self._pictures[row].astype(np.float32)
+        return max(float(self._to(cv2.blur(picture, size), [row])[0]) for size in _HALVES)
 
     def _to(self, picture: NDArray[np.float32], others: Sequence[int]) -> Doubles:
         """At each shift, the correlation of what remains of a part of `picture` with what remains of the inner part of
