@@ -37,7 +37,7 @@ LONGEST, LAST = 500, 150
 hostile file may be of any length."""
 _WRONG_PATHS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP),
+    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
 
 app = typer.Typer(
