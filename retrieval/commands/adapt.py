@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import MAX_SEED, SPLIT, Recording, read_split
+from retrieval.commands.options import SEED, SPLIT, Recording, read_split
 from retrieval.console.files import TEXT, require_ours
 from retrieval.console.output import say
 
@@ -28,7 +28,7 @@ def adapt(
     cache: Annotated[
         Path | None, typer.Option(help="folder where features of images are kept, to go on where it was stopped")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED, help="seed of the folds")] = 0,
+    seed: Annotated[int, typer.Option(parser=SEED, help="seed of the folds")] = 0,
 ) -> None:
     """Fit a model to a new sensor and own objects; minutes on two cores."""
     from retrieval.adaptation.curve import learning_curve, write_curve

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.import_ import run_importer
-from retrieval.commands.options import INIT, MAX_COUNT, Command, Json, Values, training_config
+from retrieval.commands.options import COUNT, INIT, Command, Json, Values, training_config
 from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
@@ -52,13 +52,13 @@ def real(
     preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
     iterations: Annotated[
-        int | None, typer.Option(min=1, max=MAX_COUNT, help="optimiser steps, instead of the preset's")
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
     ] = None,
     model: Annotated[
         Values | None,
         typer.Option(parser=Values.read, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=MAX_COUNT, help="how often folds are drawn and methods fitted")] = 3,
+    seeds: Annotated[int, typer.Option(parser=COUNT, help="how often folds are drawn and methods fitted")] = 3,
     cache: Annotated[
         Path | None, typer.Option(help="folder of recordings, features and measures (default: OUT/cache)")
     ] = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from indexes import KINDS
-from retrieval.commands.options import MAX_COUNT, MAX_SECONDS, Json, Model
+from retrieval.commands.options import COUNT, SHARE, Json, Model, Number
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.data.storage import is_url
@@ -44,11 +44,13 @@ def build_index(
     ] = None,
     min_recall: Annotated[
         float | None,
-        typer.Option(min=0, max=1, help="least share of touches whose best photo must be found (default: 0.99)"),
+        typer.Option(parser=SHARE, help="least share of touches whose best photo must be found (default: 0.99)"),
     ] = None,
     max_ms: Annotated[
         float | None,
-        typer.Option(min=0, max=1000 * MAX_SECONDS, help="longest search in milliseconds: candidates and judging them"),
+        typer.Option(
+            parser=Number(float, 0, 86_400_000), help="longest search in milliseconds: candidates and judging them"
+        ),
     ] = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="write OUT-views.png: what the model sees of some of the photos")
@@ -56,15 +58,14 @@ def build_index(
     shards: Annotated[
         int | None,
         typer.Option(
-            min=1,
-            max=MAX_COUNT,
+            parser=COUNT,
             help="index folders to divide the catalogue over (default: as OUT has it, else one, undivided)",
         ),
     ] = None,
     bad_share: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", min=0, max=1, help="of shards: photos that may be unreadable (default: 0.05 of all)"
+            metavar="SHARE", parser=SHARE, help="of shards: photos that may be unreadable (default: 0.05 of all)"
         ),
     ] = None,
     cluster: Annotated[

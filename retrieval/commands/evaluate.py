@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import (
+    COUNT,
     DEFAULT_PRESET,
     INIT,
-    MAX_COUNT,
-    MAX_SEED,
+    SEED,
     SPLIT,
     InitPhoto,
     InitTouch,
@@ -46,12 +46,11 @@ def evaluate(
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
     iterations: Annotated[
-        int | None, typer.Option(min=1, max=MAX_COUNT, help="optimiser steps, instead of the preset's")
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=MAX_COUNT, help="trainings of each method")] = 1,
+    seeds: Annotated[int, typer.Option(parser=COUNT, help="trainings of each method")] = 1,
     seed: Annotated[
-        int | None,
-        typer.Option(min=0, max=MAX_SEED, help="seed of split, queries and first training, instead of the preset's"),
+        int | None, typer.Option(parser=SEED, help="seed of split, queries and first training, instead of the preset's")
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     cache: Annotated[

@@ -1,7 +1,6 @@
 """What several commands share: options, options of several values, and what is read where an option names it."""
 
 import dataclasses
-import math
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -41,13 +40,6 @@ LabelledTouches = Annotated[
 ]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
 
-MAX_COUNT, MAX_SEED = 10**9, 2**32 - 1
-"""Largest number of anything that is counted, and of a seed."""
-MAX_WORKERS = 1024
-"""Processes, threads or replicas at most."""
-MAX_SECONDS = 86_400
-"""The longest wait, a day."""
-
 _BETWEEN = "\0"  # which no word of a command line holds
 
 
@@ -58,6 +50,37 @@ class Values(tuple[str, ...]):
     def read(cls, joined: str) -> Self:
         """As `Command` hands them over."""
         return cls(joined.split(_BETWEEN))
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """Read the number of an option, from `low` to `high`, so that no command begins with another one.
+
+    kind: int or float. (A range of the library admits nan, and shows its limits in the help.)
+    """
+
+    kind: type[int] | type[float]
+    low: float
+    high: float
+
+    @property
+    def __name__(self) -> str:
+        """As the help names it."""
+        return self.kind.__name__
+
+    def __call__(self, text: str) -> float:
+        """Return the number. Raises BadParameter."""
+        try:
+            value = self.kind(text)
+        except ValueError as error:
+            raise typer.BadParameter(f"{text!r} is not a valid {self.__name__}") from error
+        if not self.low <= value <= self.high:
+            raise typer.BadParameter(f"{text} is not from {self.low} to {self.high}")
+        return value
+
+
+COUNT, SEED, WORKERS = Number(int, 1, 10**9), Number(int, 0, 2**32 - 1), Number(int, 1, 1024)
+SHARE, SECONDS = Number(float, 0, 1), Number(float, 0, 86_400)
 
 
 class Command(TyperCommand):
@@ -89,12 +112,7 @@ class Command(TyperCommand):
             else:
                 joined += args[:1]
                 args = args[1:]
-        rest = super().parse_args(ctx, joined + args)
-        for each in self.params:
-            value = ctx.params.get(each.name)
-            if isinstance(value, float) and math.isnan(value):  # it lies in every range, as comparisons go
-                ctx.fail(f"Invalid value for '{each.opts[0]}': nan is not a number")
-        return rest
+        return super().parse_args(ctx, joined + args)
 
 
 def refuse(why: str, **given: object) -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import MAX_COUNT, Json, Values
+from retrieval.commands.options import COUNT, SHARE, Json, Values
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
@@ -36,17 +36,15 @@ def query(
         ),
     ] = None,
     model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
-    top: Annotated[int, typer.Option(min=1, max=MAX_COUNT, help="objects to return")] = 10,
+    top: Annotated[int, typer.Option(parser=COUNT, help="objects to return")] = 10,
     candidates: Annotated[
         int | None,
-        typer.Option(
-            min=1, max=MAX_COUNT, help="photos that the full classifier judges (default: what the index needs)"
-        ),
+        typer.Option(parser=COUNT, help="photos that the full classifier judges (default: what the index needs)"),
     ] = None,
     none_prior: Annotated[
         float,
         typer.Option(
-            metavar="P", min=0, max=1, help="probability, before anything is felt, that the catalogue lacks the object"
+            metavar="P", parser=SHARE, help="probability, before anything is felt, that the catalogue lacks the object"
         ),
     ] = 0.5,
     json: Json = False,

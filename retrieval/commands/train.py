@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 import typer
 
 from retrieval.commands.options import (
+    COUNT,
     INIT,
-    MAX_COUNT,
-    MAX_SEED,
-    MAX_WORKERS,
+    SEED,
     SPLIT,
+    WORKERS,
     InitPhoto,
     InitTouch,
     LabelledPhotos,
@@ -46,11 +46,10 @@ def train(
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
     iterations: Annotated[
-        int | None, typer.Option(min=1, max=MAX_COUNT, help="optimiser steps, instead of the configuration's")
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the configuration's")
     ] = None,
     seed: Annotated[
-        int | None,
-        typer.Option(min=0, max=MAX_SEED, help="seed of split, pairs and weights, instead of the configuration's"),
+        int | None, typer.Option(parser=SEED, help="seed of split, pairs and weights, instead of the configuration's")
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
@@ -63,9 +62,7 @@ def train(
     cluster: Annotated[
         bool, typer.Option("--cluster", help="Ray Train starts the ranks: that of RAY_ADDRESS, else one here")
     ] = False,
-    workers: Annotated[
-        int | None, typer.Option(min=1, max=MAX_WORKERS, help="of --cluster: ranks (default: 2)")
-    ] = None,
+    workers: Annotated[int | None, typer.Option(parser=WORKERS, help="of --cluster: ranks (default: 2)")] = None,
 ) -> None:
     """Train a matcher, a tower that sees relief, or a gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
