@@ -7,7 +7,9 @@ import faiss
 import numpy as np
 import pytest
 
+from indexes import KINDS, load_kind
 from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import own_digest
 from tests.test_indexes_store import FINGERPRINT, filled, unit
@@ -123,6 +125,61 @@ def test_one_flipped_bit_anywhere_is_found_and_named(folder, name):
             reopened(folder)
         path.write_bytes(whole)
     assert reopened(folder).count == 20
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_is_flipped_or_cut_in_an_index_of_any_kind_is_found_by_its_digest(tmp_path, kind):
+    count = 650  # what the codes of the largest kinds need
+    arrays, documents = {"halves": np.ones((count, 3), np.float16)}, {"calibration": {"a": 1}}
+    folder = filled(tmp_path, count, kind, arrays=arrays, documents=documents).folder
+    rng = np.random.default_rng(0)
+    for path in sorted(folder.iterdir()):
+        whole = path.read_bytes()
+        for place in rng.integers(len(whole) - 1, size=6).tolist():  # the last byte is a line break in some
+            flip(path, place, int(rng.integers(8)))
+            with pytest.raises((CorruptIndex, UnsupportedFormat), match=path.name):
+                reopened(folder)
+            path.write_bytes(whole[:place])
+            with pytest.raises(CorruptIndex, match=path.name):
+                reopened(folder, verify=False)
+            path.write_bytes(whole)
+    assert reopened(folder).count == count
+
+
+@pytest.mark.parametrize("kind", ["ivf_flat", "ivf_sq8", "ivf_pq"])
+@pytest.mark.parametrize("wrong", [3530822107858468864, -7, 650])
+def test_an_id_out_of_range_in_a_structure_is_an_error_of_the_search(tmp_path, kind, wrong):
+    """FAISS reads it, and the digest fits: the file was written so."""
+    folder = filled(tmp_path, 650, kind).folder
+    structure = faiss.read_index(str(folder / "vectors.faiss"))
+    lists = structure.invlists
+    for number in range(structure.nlist):
+        ids = np.full(lists.list_size(number), wrong, np.int64)
+        lists.update_entries(number, 0, len(ids), faiss.swig_ptr(ids), lists.get_codes(number))
+    faiss.write_index(structure, str(folder / "vectors.faiss"))
+    files = json.loads((folder / "manifest.json").read_text())["files"]
+    files["vectors.faiss"]["sha256"] = file_digest(folder / "vectors.faiss")
+    rewrite_manifest(folder, files=files)
+    generation = reopened(folder)
+    for search in (generation.search, generation.candidates):
+        with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, the index has 650.*build-index"):
+            search(unit(3), 4)
+
+
+def test_a_slot_that_a_structure_names_twice_is_an_error_of_the_search(tmp_path):
+    index = load_kind("ivf_flat").build(unit(650))
+    index._candidates = lambda queries, fetch, effort: (np.ones((len(queries), 3), np.float32), np.int64([[1, 2, 1]]))
+    with pytest.raises(CorruptIndex, match="found one slot twice"):
+        index.search(unit(1), 2)
+
+
+def test_a_kind_of_ones_own_is_held_to_the_same_slots():
+    class Wrong(load_kind("exact")):
+        def _search(self, queries, k, live):
+            return np.ones((len(queries), k), np.float32), np.full((len(queries), k), 99)
+
+    with pytest.raises(CorruptIndex, match="found slot 99, the index has 20"):
+        Wrong.build(unit(20)).search(unit(1), 1)
 
 
 def test_naive_faiss_loads_a_flipped_bit_in_silence_and_answers_wrongly(tmp_path):

@@ -3,8 +3,10 @@ the folder is read, waited for or written over."""
 
 import json
 import os
+import resource
 import shutil
 import socket
+import time
 
 import numpy as np
 import pytest
@@ -88,6 +90,9 @@ def test_any_field_of_the_manifest_may_be_forged(kept, field, value):
         lambda content: content["files"].__setitem__("a\0b", {"bytes": 1, "sha256": ""}),
         lambda content: content["files"]["calibration.json"].pop("bytes"),
         lambda content: content["files"].pop("rows.jsonl"),
+        lambda content: content["documents"].append("calibration"),
+        lambda content: content["documents"].append("halves"),
+        lambda content: content["arrays"].append("halves"),
         lambda content: content["documents"].append("../../secret"),
         lambda content: content["arrays"].append("../../secret"),
         lambda content: content.__setitem__("segments", {"records": [1], "vectors": [1]}),
@@ -111,12 +116,24 @@ def out_of(field, value):
     return change
 
 
+def same(field):
+    def change(table):
+        table[field][4] = table[field][3] if field != "object_id" else b"other"
+        return table
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
         ("table.npy", out_of("start", -1)),
         ("table.npy", out_of("start", 2**40)),
         ("table.npy", out_of("stop", 2**40)),
+        ("table.npy", lambda table: table[[0, *range(20 - 1)]]),  # two rows of one id
+        ("table.npy", same("id")),
+        ("table.npy", same("start")),  # two lines overlap
+        ("table.npy", same("object_id")),  # of one row, to rank its object twice
         ("table.npy", out_of("slot", -1)),
         ("table.npy", out_of("slot", 10**6)),
         ("table.npy", lambda table: table[:0]),
@@ -178,6 +195,44 @@ def test_a_file_larger_than_what_is_read_whole_is_refused_unread(tmp_path):
     os.truncate(tmp_path / "large", 2**40)
     with pytest.raises(OSError, match="has 1099511627776 bytes; at most 536870912 are read"):
         read_regular(tmp_path / "large")
+
+
+@pytest.mark.parametrize("verify", [True, False])
+@pytest.mark.parametrize("name", ["manifest.json", "calibration.json"])
+def test_a_json_file_larger_than_its_index_needs_is_refused_at_once_and_unread(folder, name, verify):
+    with (folder / name).open("ab") as file:
+        file.truncate(300 * 10**6)
+    if name != "manifest.json":
+        files = {"calibration.json": {"bytes": 300 * 10**6, "sha256": ""}}
+        path = folder / "manifest.json"
+        content = json.loads(path.read_text())
+        del content["sha256"]
+        content["files"] |= files
+        path.write_text(json.dumps(content | {"sha256": own_digest(content)}))
+        verify = False  # the digest of 300 MB would be taken first
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    with pytest.raises(CorruptIndex, match=r"has 300000000 bytes; at most \d+ are read"):
+        opened(folder, verify=verify)
+    assert time.perf_counter() - start < 1
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_a_manifest_that_has_a_key_twice_is_refused(folder):
+    path = folder / "manifest.json"
+    path.write_text(path.read_text().replace('"documents": [', '"documents": [], "documents": [', 1))
+    with pytest.raises(CorruptIndex, match="it has the key 'documents' twice"):
+        opened(folder)
+
+
+@pytest.mark.parametrize("field", ["about", "documents", "rows"])
+def test_json_larger_than_a_reader_takes_is_refused_as_it_is_written(tmp_path, field):
+    long = {"note": "x" * 5 * 10**6}
+    more = {"rows": {}, "about": {"about": long}, "documents": {"documents": {"calibration": long}}}[field]
+    rows = [row | (long if field == "rows" else {}) for row in rows_of(names(2))]
+    with pytest.raises(RowError, match=r"must have (at most|less than) \d+ bytes"):
+        IndexStore(tmp_path).write(rows, unit(2), fingerprint=FINGERPRINT, **more)
+    assert not (tmp_path / "CURRENT").exists()
 
 
 def test_files_of_the_user_in_the_folder_of_an_index_stay(tmp_path):

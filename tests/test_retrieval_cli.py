@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -9,10 +10,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 from indexes import KINDS
-from retrieval.commands.main import main
+from retrieval.commands.main import app, main
 from retrieval.commands.options import Command
+from retrieval.errors import BadInput
 from retrieval.lab.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.search import defaults
@@ -73,14 +76,13 @@ def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys
     assert said.err.splitlines()[-1] == last
 
 
-@pytest.mark.parametrize("prior", ["1", "-0.1", "nan"])
-def test_a_prior_that_is_no_probability_below_1_is_wrong_use(prior, workplace, model, capsys):
+def test_a_prior_of_1_is_wrong_use(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model)])
     capsys.readouterr()
-    assert main(["query", "--gelsight", "a.png", "b.png", f"--none-prior={prior}"]) == 2
+    assert main(["query", "--gelsight", "a.png", "b.png", "--none-prior=1"]) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert f'the prior of "none of these" must be at least 0 and less than 1; got {float(prior)}' in said.err
+    assert 'the prior of "none of these" must be at least 0 and less than 1; got 1.0' in said.err
 
 
 def test_an_index_built_elsewhere_is_found_again_from_where_it_was_built_only(workplace, model, capsys, monkeypatch):
@@ -169,13 +171,7 @@ WRONG_USE = {
     "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: real, sim"),
     "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
-    "too many objects": (["collect", "--objects", str(10**20), "--out", "rec"], "at most 100000 objects"),
-    "no seed of collections": (["collect", "--seed", "-1", "--out", "rec"], "seed must be a whole number from 0"),
-    "no seed of gates": (
-        ["train", "catalog/", "--task", "grasp-success", "--seed", "-1", "--out", "g.safetensors"],
-        "seed must be in [0, 2^32); got -1",
-    ),
-    "no objects": (["collect", "--objects", "0", "--out", "rec"], "at least one object"),
+    "too many objects": (["collect", "--objects", "100001", "--out", "rec"], "at most 100000 objects"),
     "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
     "not an empty folder": (["collect", "--out", "catalog"], "catalog holds other files"),
     "nothing to check": (["check", "nowhere"], "nowhere"),
@@ -206,6 +202,138 @@ def test_an_unexpected_error_is_no_traceback_unless_debug_is_asked_for(workplace
     assert "unexpected ZeroDivisionError" in capsys.readouterr().err
     with pytest.raises(ZeroDivisionError):
         main(["--debug", "query", "--gelsight", "a.png"])
+
+
+def numeric_options():
+    """Of every command: its words, what else it must be given, and each option that takes a number."""
+
+    def walk(command, words):
+        for name, inner in getattr(command, "commands", {}).items():
+            yield from walk(inner, [*words, name])
+        for each in getattr(command, "params", ()):
+            if each.type.name.split()[0] in ("int", "float"):
+                yield pytest.param(words, command, each, id=f"{' '.join(words)} {each.opts[0]}")
+
+    return list(walk(typer.main.get_command(app), []))
+
+
+def needed(command):
+    """Words for what a command must be given: nothing is there, so that whatever is read first is refused too."""
+    for each in command.params:
+        if each.required:
+            yield from [each.opts[0], "nowhere"] if each.opts[0].startswith("-") else ["nowhere"]
+
+
+@pytest.mark.parametrize(("words", "command", "option"), numeric_options())
+def test_no_number_outside_its_range_passes_the_command_line(words, command, option, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    low, high = option.type.func.low, option.type.func.high
+    wrong = [low - 1, high + 1, "1" * 31, f"-{'1' * 31}", "inf", "-inf", "nan", "1e400"]
+    for value in wrong:
+        assert main([*words, *needed(command), f"{option.opts[0]}={value}"]) == 2
+        said = capsys.readouterr()
+        (line,) = said.err.splitlines()
+        assert f"Invalid value for '{option.opts[0]}'" in line
+        assert line.endswith(
+            (f"{value} is not from {low} to {high}; see --help", f"{value!r} is not a valid int; see --help")
+        )
+        assert said.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_test_above_finds_the_options_that_take_numbers():
+    assert {"serve --deadline", "query --top", "benchmark real --seeds"} <= {one.id for one in numeric_options()}
+    assert len(numeric_options()) > 30
+
+
+def test_the_naive_range_of_a_library_admits_nan():
+    assert not float("nan") < 0
+    assert not float("nan") > 1
+
+
+@pytest.mark.parametrize("length", [501, 5000])
+def test_a_long_message_is_cut_in_its_middle_and_keeps_what_to_do(length, monkeypatch, capsys):
+    def fail(given):
+        raise BadInput("x" * length + "; do this")
+
+    monkeypatch.setattr(defaults, "find_index", fail)
+    assert main(["query", "--gelsight", "a.png"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert len(line) < 540
+    assert line.startswith("retrieve query: xxx")
+    assert line.endswith("x; do this")
+
+
+@pytest.mark.parametrize(
+    "words", [["import", "imagenet", "src", "--out", "o"], ["benchmark", "real", "empty", "--out", "report"]]
+)
+def test_an_error_is_one_line_where_much_could_be_listed(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    assert main(words) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["query", "--gelsight", "a.png", "b.png", "--html", "none/there/x.html"],
+        ["export", "--out", "none/m.onnx"],
+        ["rig", "calibrate", "points.csv", "--out", "none/hand_eye.json"],
+    ],
+)
+def test_no_folder_is_made_for_a_file_that_is_to_be_written(words, workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    capsys.readouterr()
+    assert main(words) == 2
+    assert f"there is no folder {Path(words[-1]).parent}; make it" in capsys.readouterr().err
+    assert not Path("none").exists()
+
+
+@pytest.mark.parametrize("out", ["catalog", "catalog/", "catalog/../catalog", "catalog/cup", "link"])
+def test_an_index_is_not_written_among_the_photos(out, workplace, model, capsys):
+    (workplace / "link").symlink_to("catalog")
+    (workplace / "catalog" / "cup").mkdir(exist_ok=True)
+    shutil.copy("a.png", workplace / "catalog" / "cup" / "deep.png")
+    before = sorted(workplace.rglob("*"))
+    assert main(["build-index", "catalog", "--model", str(model), "--out", out]) == 2
+    assert f"the index would be written among the photos in {out}" in capsys.readouterr().err
+    assert sorted(workplace.rglob("*")) == before
+
+
+def test_an_index_may_lie_in_a_folder_of_its_own_in_the_catalogue(workplace, model, capsys, monkeypatch):
+    monkeypatch.chdir("catalog")
+    for photos in (24, 24):
+        assert main(["build-index", ".", "--model", str(model), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["photos"] == photos
+    assert main(["build-index", ".", "--model", str(model), "--preview"]) == 2
+    assert "would be a photo of the catalogue" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["match", "relief", "grasp-success"])
+def test_a_checkpoint_of_another_name_is_refused_before_anything_is_read(task, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "nowhere", "--task", task, "--out", "m.txt"]) == 2
+    assert "must be named *.safetensors, such as m.safetensors; got m.txt" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
+def test_a_history_that_is_no_file_is_refused(make, workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    Path("kept").mkdir()
+    make("kept/history.sqlite")
+    capsys.readouterr()
+    assert main(["serve", "--index", "index", "--history", "kept", "--port", "0"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"kept/history.sqlite must be the history of a service: is a (folder|pipe), not a", last)
+
+
+def test_a_history_whose_folder_is_a_file_is_refused(workplace, model, capsys):
+    main(["build-index", "catalog/", "--model", str(model)])
+    capsys.readouterr()
+    assert main(["serve", "--index", "index", "--history", "a.png", "--port", "0"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) <= 2
 
 
 WRONG_WORDS = {

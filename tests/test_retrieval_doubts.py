@@ -1,5 +1,7 @@
 """What a check says by looks: each fault planted in a recording is found by name, and nothing in a clean one."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -50,7 +52,7 @@ def edit(path, change):
 def test_a_clean_recording_has_no_remark_but_says_what_could_not_be_checked(felt):
     assert remarks(felt) == []
     kinds = {finding.kind for finding in check_recording(felt)}
-    assert kinds <= {"unchecked-photos", "unchecked-copies"}
+    assert kinds <= {"unchecked-photos", "compared-copies"}
 
 
 @pytest.mark.slow
@@ -235,5 +237,39 @@ def test_near_copies_of_another_object_are_named(broken, how):
     } >= found_in(how)
     for finding in found:
         assert set(finding.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
-    notes = [finding for finding in check_recording(broken.folder) if finding.kind == "unchecked-copies"]
-    assert any("(touch a)" in note.message for note in notes)
+    (note,) = (finding for finding in check_recording(broken.folder) if finding.kind == "compared-copies")
+    assert "(touch a)" in note.message
+
+
+@pytest.mark.parametrize("by", [(6, 6), (-6, 5), (0, 6)])
+def test_a_photo_that_was_moved_by_several_pixels_is_a_near_copy(broken, by):
+    """Photos of 120 x 160: a sixteenth of the side is 7 pixels."""
+    image = cv2.imread(str(broken.file(3, "photo")))
+    padded = np.pad(image, ((8, 8), (8, 8), (0, 0)), "edge")
+    height, width = image.shape[:2]
+    copy = padded[8 - by[0] : 8 - by[0] + height, 8 - by[1] : 8 - by[1] + width]
+    cv2.imwrite(str(broken.file(20, "photo")), copy)
+    (found,) = (finding for finding in broken.findings() if finding.kind == "near-copy")
+    assert found.severity == "error"
+    assert set(found.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
+
+
+def test_a_check_ends_by_saying_in_how_many_pictures_copies_were_looked_for_and_why_not_in_the_others(broken, capsys):
+    """Touches that hardly differ from the untouched gel, each with noise of its own; two files are broken."""
+    from retrieval.commands.main import main
+
+    rng = np.random.default_rng(0)
+    gel = cv2.imread(str(broken.file(0, "touch_a_before")))
+    total = 8 * GRASPS
+    for number in [number for number, row in enumerate(broken.rows) if row["grasped"]]:
+        noisy = np.clip(gel + rng.normal(0, 1.5, gel.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(broken.file(number, "touch_a")), noisy)
+    accepted = [number for number, row in enumerate(broken.rows) if row["grasped"]]
+    for number in accepted[:2]:
+        broken.file(number, "photo").write_bytes(b"no picture")
+    main(["check", str(broken.folder)])
+    last = capsys.readouterr().err.splitlines()[-2]
+    assert last.startswith(f"{broken.folder}: ")
+    assert re.search(rf"looked for in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
+    assert "show too little to tell a copy by (a light contact, or a look that many share)" in last
+    assert "6 are of grasps that are named above" in last

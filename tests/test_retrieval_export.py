@@ -1,6 +1,8 @@
 """The touch encoder as ONNX: the same numbers, no PyTorch in a query, and nothing stale or damaged in use."""
 
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import pytest
 import torch
 
 from retrieval.commands.main import main
+from retrieval.console.files import make_cache_folder
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
 from retrieval.model import export as exporting
@@ -241,6 +244,83 @@ def test_the_export_beside_a_checkpoint_comes_first(own, monkeypatch):
     export(checkpoint)
     assert exporting.export_to_cache(checkpoint) is None
     assert not onnx_encoder.cached(checkpoint.digest).exists()
+
+
+def given_away(path):
+    """Another user's file, by its owner's id: that of nobody here."""
+    os.chown(path, 4242, -1)
+
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+OPEN_TO_OTHERS = {
+    "a file that its group can write": lambda path: path.chmod(0o664),
+    "a file that all can write": lambda path: path.chmod(0o646),
+    "a folder that all can write": lambda path: path.parent.chmod(0o1777),
+    "a file of another user": given_away,
+    "a folder of another user": lambda path: given_away(path.parent),
+}
+
+
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=[needs_root] * ("of another user" in how)) for how in OPEN_TO_OTHERS]
+)
+def test_an_export_in_the_cache_that_others_may_have_written_is_not_used(how, own, index, touch, onnx_wins, caplog):
+    """Whoever can write there can write its checksum too: this one would give other halves."""
+    checkpoint = load_checkpoint(own)
+    path = onnx_encoder.cached(checkpoint.digest)
+    exporting.export_to_cache(checkpoint)
+    OPEN_TO_OTHERS[how](path)
+    assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
+    (line,) = caplog.messages
+    assert re.search(r"(belongs to another user|can be written to by other users).*PyTorch is used instead", line)
+
+
+@pytest.mark.parametrize("how", ["a folder that all can write", "a file that all can write"])
+def test_what_others_may_have_written_to_the_cache_is_made_again_where_only_the_user_writes(
+    how, own, onnx_wins, caplog, monkeypatch
+):
+    checkpoint = load_checkpoint(own)
+    path = onnx_encoder.cached(checkpoint.digest)
+    exporting.export_to_cache(checkpoint)
+    path.write_bytes(sealed(b"hostile"))
+    OPEN_TO_OTHERS[how](path)
+    timed(monkeypatch, 2.0, 1.0)
+    made = exporting.export_to_cache(checkpoint)
+    if "folder" in how:
+        assert made is None
+        assert "can be written to by other users (mode 1777" in caplog.text
+        assert path.read_bytes() == sealed(b"hostile")
+    else:
+        assert made.path == str(path)
+        assert (path.stat().st_mode & 0o777, OnnxEncoder(path, checkpoint.digest).name) == (0o644, "onnx")
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o277])
+def test_the_cache_and_every_export_are_for_the_user_alone_to_write_whatever_the_umask(umask, own, index, onnx_wins):
+    checkpoint = load_checkpoint(own)
+    folder = onnx_encoder.cached(checkpoint.digest).parent
+    before = os.umask(umask)
+    try:
+        make_cache_folder(folder)
+        made = Path(export(checkpoint).path) if umask != 0o277 else None
+    finally:
+        os.umask(before)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    if made is not None:
+        assert made.stat().st_mode & 0o777 == 0o644
+        assert onnx_encoder.exported(checkpoint).name == "onnx"
+
+
+@needs_root
+def test_an_export_beside_a_checkpoint_may_be_its_owners_and_nobody_elses(own, onnx_wins, caplog):
+    checkpoint = load_checkpoint(own)
+    beside = Path(export(checkpoint).path)
+    given_away(own)
+    given_away(beside)
+    assert onnx_encoder.exported(checkpoint).name == "onnx"
+    os.chown(beside, 4243, -1)
+    assert onnx_encoder.exported(checkpoint) is None
+    assert "m.onnx belongs to another user (uid 4243); PyTorch is used instead" in caplog.text
 
 
 @pytest.mark.parametrize("content", [sealed(b"model" * 100)[:-1], sealed(b"model" * 100)[:100], b"junk"])

@@ -258,4 +258,4 @@ def test_names_that_no_disk_takes_are_one_sentence(tmp_path, capsys):
     for command in commands:
         code, said = main(command), capsys.readouterr().err.splitlines()
         assert (code, [line for line in said if "unexpected" in line]) == (2, []), command
-        assert len(said[-1]) < 2200, command
+        assert len(said[-1]) < 540, command

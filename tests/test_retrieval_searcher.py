@@ -1,6 +1,8 @@
 """A searcher in a robot's process: arrays, several objects at once, threads, forks, and an end."""
 
+import copy
 import os
+import pickle
 import shutil
 import signal
 import threading
@@ -128,6 +130,12 @@ def test_a_closed_searcher_says_so_and_closes_twice(index, touch):
             use()
     with pytest.raises(BadInput, match="was closed"), searcher:
         pass
+
+
+def test_a_searcher_cannot_be_pickled_and_says_what_to_do(searcher):
+    for attempt in (pickle.dumps, copy.copy, copy.deepcopy):
+        with pytest.raises(BadInput, match=r"cannot be pickled.*open the index in each process: retrieval\.open\('"):
+            attempt(searcher)
 
 
 def test_what_is_under_way_when_a_searcher_is_closed_is_answered(index, touch, monkeypatch):

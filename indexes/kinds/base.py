@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 import numpy as np
 
 from indexes.errors import ParameterError, VectorError
-from indexes.kinds.checks import check_k, check_unit
+from indexes.kinds.checks import check_k, check_slots, check_unit
 from indexes.kinds.scores import Floats, Mask, Slots
 
 MOST = 2**31 - 1
@@ -190,7 +190,8 @@ class VectorIndex(ABC):
         if wanted == 0 or not len(table):
             shape = (len(table), wanted)
             return np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int64)
-        return self._search(table, wanted, live)
+        scores, slots = self._search(table, wanted, live)
+        return scores, check_slots(slots, self.count)
 
     def candidates(self, queries: Floats, k: int, live: Mask | None = None) -> list[Slots]:
         """The slots that `search` finds, of each query and in no order, for whoever scores them otherwise: an exact
@@ -198,7 +199,10 @@ class VectorIndex(ABC):
         table, wanted = self._checked(queries, k, live)
         if wanted == 0:
             return [np.empty(0, dtype=np.int64) for _ in table]
-        return [self._candidate_slots(query[None], wanted, live) for query in table]
+        named = [self._candidate_slots(query[None], wanted, live) for query in table]
+        for slots in named:
+            check_slots(slots[None], self.count)
+        return named
 
     def _checked(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, int]:
         """The queries, and how many slots each can have."""

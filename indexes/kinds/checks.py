@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from indexes.errors import ParameterError, VectorError
-from indexes.kinds.scores import Doubles, Floats
+from indexes.errors import AGAIN, CorruptIndex, ParameterError, VectorError
+from indexes.kinds.scores import Doubles, Floats, Slots
 
 NORM_TOLERANCE = 1e-3
 """Largest distance of a norm from 1. The rounding of float32 is 1e-7, of float16 storage 5e-4."""
@@ -40,6 +40,19 @@ def check_k(k: int) -> int:
     if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
         raise ParameterError(f"k, the number of results, must be a whole number of at least 1; got {k!r}")
     return int(k)
+
+
+def check_slots(found: Slots, count: int, least: int = 0) -> Slots:
+    """Return the slots (Q, n) that a search found, or raise `CorruptIndex`: each lies from `least` to count - 1, and no
+    query has one twice. `least` -1 admits the -1 of FAISS, its word for nothing."""
+    if found.size:
+        if found.min() < least or found.max() >= count:
+            odd = found[(found < least) | (found >= count)][0]
+            raise CorruptIndex(f"a search found slot {odd}, the index has {count}: its structure is damaged; {AGAIN}")
+        ranked = np.sort(found, axis=1)
+        if ((ranked[:, 1:] == ranked[:, :-1]) & (ranked[:, 1:] >= 0)).any():
+            raise CorruptIndex(f"a search found one slot twice: the structure of the index is damaged; {AGAIN}")
+    return found
 
 
 def row_norms(table: Floats) -> Doubles:

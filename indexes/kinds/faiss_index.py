@@ -11,6 +11,7 @@ import numpy as np
 
 from indexes.errors import CorruptIndex, EngineError
 from indexes.kinds.base import VectorIndex
+from indexes.kinds.checks import check_slots
 from indexes.kinds.scores import Doubles, Floats, Mask, Slots, best, grid_scores, on_grid, scan, slack
 
 faiss: Any = _faiss
@@ -131,7 +132,8 @@ class FaissIndex(VectorIndex):
         """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
         parts, first = [], self.covered
         if first:
-            parts.append(self._candidates(queries, min(fetch, first), effort))
+            rough, found = self._candidates(queries, min(fetch, first), effort)
+            parts.append((rough, check_slots(found, first, least=-1)))
         if first < self.count:
             rest = self._vectors[first:]
             rough, found = faiss.knn(queries, rest, min(fetch, len(rest)), faiss.METRIC_INNER_PRODUCT)

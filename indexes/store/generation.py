@@ -24,10 +24,12 @@ from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
 from indexes.store.older import joined, table_files
-from indexes.store.regular import read_json
-from indexes.store.rows import RECORD, Rows, keys_of
+from indexes.store.regular import MAX_JSON_BYTES, read_json
+from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
+DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
+"""Of the JSON of a document: of any, and for each row or touch that it may speak of."""
 SHOWN_IDS = 5
 CHECKED = 1000
 FEWER_OLD = 16
@@ -229,10 +231,11 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     check_files(folder, manifest, verify=verify)
     try:
         rows, arrays, embeddings = _tables(folder, manifest)
-        documents = {name: _document(folder, manifest, name) for name in manifest.documents}
+        documents = _documents(folder, manifest)
         _check_counts(manifest, rows.table, embeddings)
         if verify:
             _check_vectors(folder, embeddings)
+            _check_rows(folder, rows.table)
         kind = load_kind(manifest.kind)
         index = kind.load(
             folder / STRUCTURE if kind.structure_file else None,
@@ -251,9 +254,17 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
-def _document(folder: Path, manifest: Manifest, name: str) -> Any:
-    array = f"{name}.npy"
-    return mapped(folder / array) if array in manifest.files else read_json(folder / f"{name}.json")
+def _documents(folder: Path, manifest: Manifest) -> dict[str, Any]:
+    """The documents by name, arrays first: their rows say how long the others may be."""
+    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.documents if f"{name}.npy" in manifest.files}
+    most = max_document_bytes(manifest.counts.rows, arrays.values())
+    texts = [name for name in manifest.documents if name not in arrays]
+    return arrays | {name: read_json(folder / f"{name}.json", most) for name in texts}
+
+
+def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
+    """How many bytes of JSON a document may have, in an index of so many rows with these documents that are arrays."""
+    return min(MAX_JSON_BYTES, DOCUMENT_BYTES + DOCUMENT_BYTES_PER_ROW * (rows + sum(map(len, arrays))))
 
 
 def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:
@@ -280,6 +291,15 @@ def _check_vectors(folder: Path, embeddings: Floats) -> None:
     for start in range(0, len(embeddings), BLOCK_ROWS):
         if not (np.abs(row_norms(embeddings[start : start + BLOCK_ROWS]) - 1.0) <= NORM_TOLERANCE).all():
             raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
+
+
+def _check_rows(folder: Path, table: NDArray[Any]) -> None:
+    """No row comes twice: neither two with one id, nor two with the same bytes of the text."""
+    if not are_distinct(np.ascontiguousarray(table["id"])):
+        raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
+    starts, stops = np.sort(table["start"]), np.sort(table["stop"])
+    if (starts[1:] < stops[:-1]).any():
+        raise CorruptIndex(f"{folder}: the lines of the rows must not overlap, two do; {AGAIN}")
 
 
 def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:

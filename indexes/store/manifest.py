@@ -9,13 +9,15 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
+from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
 from indexes.store.files import durable, encoded, file_digest
 from indexes.store.regular import open_regular, read_json
 
 FORMAT, OLDER = 3, 2
 """Of what is written; also read."""
 NAME = "manifest.json"
+MAX_BYTES = 4 * 2**20
+"""Of a manifest: of 4096 shards with their names and digests it has 1 MiB."""
 _NUMBER = range(10**9)
 _WORD = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -66,8 +68,11 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     content = {"format": FORMAT} | asdict(manifest)
     del content["segments"]
     content["sha256"] = own_digest(content)
+    text = encoded(content, indent=2) + b"\n"
+    if len(text) > MAX_BYTES:
+        raise RowError(f"a manifest must have at most {MAX_BYTES} bytes, has {len(text)}; shorten `about`")
     with durable(folder / NAME) as handle:
-        handle.write(encoded(content, indent=2) + b"\n")
+        handle.write(text)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -79,7 +84,7 @@ def read_document(path: Path, oldest: int, newest: int) -> dict[str, Any]:
     """A JSON object of one of these formats that ends with the digest of its own content, without that digest. Raises
     CorruptIndex or UnsupportedFormat."""
     try:
-        content = read_json(path)
+        content = read_json(path, MAX_BYTES)
     except OSError as error:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except ValueError as error:
@@ -138,6 +143,9 @@ def _parsed(path: Path, content: dict[str, Any]) -> Manifest:
     wrong = [name for name, is_right in right.items() if not is_right(content[name])]
     if wrong:
         raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
+    names = [*content["arrays"], *content["documents"]]
+    if len(set(names)) < len(names):
+        raise CorruptIndex(f"{path}: arrays and documents must have distinct names, got {names}; {AGAIN}")
     return Manifest(**content | {"counts": Counts(**content["counts"])})
 
 

@@ -14,6 +14,8 @@ DEEPEST = 64
 """Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
 MOST_BYTES = 512 * 2**20
 """Of what is read whole."""
+MAX_JSON_BYTES = 64 * 2**20
+"""Of a JSON file whose reader states no tighter limit; parsed, it takes up to 25 times as much memory."""
 
 _WORDS = {
     stat.S_IFIFO: "is a pipe",
@@ -47,15 +49,18 @@ def read_regular(path: str | Path, most: int = MOST_BYTES) -> bytes:
     return data
 
 
-def read_json(path: str | Path) -> Any:
-    """The JSON document in a regular file. Raises OSError, and ValueError as `parse_json` does."""
-    return parse_json(read_regular(path))
+def read_json(path: str | Path, most: int = MAX_JSON_BYTES) -> Any:
+    """Return the JSON document in a regular file of at most `most` bytes; a larger one is not read.
+
+    Raises OSError, and ValueError as `parse_json` does.
+    """
+    return parse_json(read_regular(path, most))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """A JSON document. Raises ValueError for what is none, or nested deeper than `DEEPEST`."""
+    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `DEEPEST`."""
     try:
-        document = json.loads(text)
+        document = json.loads(text, object_pairs_hook=_object)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {DEEPEST} levels") from error
     if is_deep(document):
@@ -69,6 +74,14 @@ def is_deep(document: Any) -> bool:
     for _ in range(DEEPEST):
         level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
     return any(isinstance(each, dict | list | tuple) for each in level)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it has the key {next(name for name in names if names.count(name) > 1)!r} twice")
+    return found
 
 
 def _inside(each: Any) -> Iterable[Any]:

@@ -21,6 +21,9 @@ KEYS = ("id", "digest", "object_id")
 RECORD = np.dtype([("slot", "<i8"), ("start", "<i8"), ("stop", "<i8"), *((name, "S16") for name in KEYS)])
 """What the table holds of a row: its slot, the bytes of its line in the text, and its keys."""
 
+MAX_LINE_BYTES = 2**20
+"""Of the JSON of a row."""
+
 _BLANK = blake2b(digest_size=16)
 
 
@@ -113,12 +116,18 @@ class Rows(Sequence[dict[str, Any]]):
         return _Places(self.keys("digest"))
 
     def _parsed(self, number: int) -> dict[str, Any]:
+        record = self.table[number]
+        if record["stop"] - record["start"] > MAX_LINE_BYTES:
+            raise CorruptIndex(f"row {number} of the index must have {MAX_LINE_BYTES} bytes or less; {AGAIN}")
         try:
             row = parse_json(self.line(number))
         except ValueError as error:
             raise CorruptIndex(f"row {number} of the index cannot be read ({error}); {AGAIN}") from error
         if not isinstance(row, dict) or not isinstance(row.get("id"), str):
             raise CorruptIndex(f"row {number} of the index must be a plain object with an id; {AGAIN}")
+        for name in KEYS:
+            if record[name] != key_of(row.get(name)).rstrip(b"\0"):  # as numpy gives bytes of a fixed length
+                raise CorruptIndex(f"row {number} of the index: its table has another {name} than its text; {AGAIN}")
         return row
 
 

@@ -18,7 +18,7 @@ from indexes.store.arrays import ArrayFile, mapped, write_array
 from indexes.store.equal import first_of_equals
 from indexes.store.files import finish, json_of
 from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
-from indexes.store.rows import KEYS, RECORD, are_distinct, keys_of
+from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, keys_of
 
 MOST_TOMBSTONES = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
@@ -214,6 +214,8 @@ class TableWriter:
         for place, (row, name, number) in enumerate(zip(rows, ids, numbers.tolist(), strict=True)):
             before = b"" if self.parent is None or number < 0 else self.parent.rows.line(number)
             line = json_of(dict(row), f"row {name!r}", name, checked=before)
+            if len(line) >= MAX_LINE_BYTES:
+                raise RowError(f"row {name!r} must have less than {MAX_LINE_BYTES} bytes, has {len(line)}", name)
             lines.append(line + b"\n")
             same[place] = line == before
         for name in KEYS:

@@ -15,7 +15,7 @@ from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.kinds.scores import Floats
 from indexes.store import files
 from indexes.store.arrays import write_array
-from indexes.store.generation import STRUCTURE, Generation
+from indexes.store.generation import STRUCTURE, Generation, max_document_bytes
 from indexes.store.manifest import Counts, Manifest, sealed, write_manifest
 from indexes.store.tables import Block, Tables, TableWriter
 
@@ -66,12 +66,17 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
     clash = sorted(set(job.documents) & set(tables.arrays))
     if clash:
         raise RowError(f"an array and a document cannot share a name; got {', '.join(clash)}")
+    arrays = {document: content for document, content in job.documents.items() if isinstance(content, np.ndarray)}
+    most = max_document_bytes(len(tables.slots), arrays.values())
     for document, content in job.documents.items():
-        if isinstance(content, np.ndarray):
+        if document in arrays:
             write_array(folder / f"{document}.npy", content.dtype, content.shape[1:], [content])
             continue
+        text = files.encoded(content, indent=2) + b"\n"
+        if len(text) > most:
+            raise RowError(f"document {document!r} must have at most {most} bytes of JSON, has {len(text)}")
         with files.durable(folder / f"{document}.json") as handle:
-            handle.write(files.encoded(content, indent=2) + b"\n")
+            handle.write(text)
     if job.settle is not None:
         job = _settled(job, job.settle(tables))
     index, built_slots, kept = _index(tables, job)

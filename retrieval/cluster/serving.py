@@ -39,6 +39,9 @@ AGAIN_S, AT_HAND_S = 0.05, 0.005
 """Before a shard whose replica was lost is asked again; to take an answer that is there."""
 
 
+MAX_WAIT_S = 86_400
+
+
 @dataclass(frozen=True)
 class Held:
     """How shards are held.
@@ -61,8 +64,8 @@ class Held:
             raise BadInput(f"replicas must be 1 or more, and no more than the most; got {self.replicas}")
         if not 0 < self.least_share <= 1:
             raise BadInput(f"the least share must lie above 0 and be 1 at most; got {self.least_share}")
-        if not self.wait_s > 0:
-            raise BadInput(f"the wait for a shard must be above 0 seconds; got {self.wait_s}")
+        if not 0 < self.wait_s <= MAX_WAIT_S:
+            raise BadInput(f"the wait for a shard must be above 0 and at most {MAX_WAIT_S} seconds; got {self.wait_s}")
 
 
 class Holder:

@@ -12,7 +12,7 @@ from retrieval.cluster.session import connected
 from retrieval.console.output import say
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted, RetrievalError
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
 from retrieval.training.train import require_fresh, state_path, train
 
@@ -38,6 +38,7 @@ def train_by_ray(
     """
     if workers < 1:
         raise BadInput(f"workers must be 1 or more; got {workers}")
+    require_writable(out)
     if not resume:
         require_fresh(out)
     asked = {

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import SPLIT, Recording, read_split
+from retrieval.commands.options import SEED, SPLIT, Recording, read_split
 from retrieval.console.files import TEXT, require_ours
 from retrieval.console.output import say
 
@@ -28,17 +28,18 @@ def adapt(
     cache: Annotated[
         Path | None, typer.Option(help="folder where features of images are kept, to go on where it was stopped")
     ] = None,
-    seed: Annotated[int, typer.Option(help="seed of the folds")] = 0,
+    seed: Annotated[int, typer.Option(parser=SEED, help="seed of the folds")] = 0,
 ) -> None:
     """Fit a model to a new sensor and own objects; minutes on two cores."""
     from retrieval.adaptation.curve import learning_curve, write_curve
     from retrieval.adaptation.recipe import adapt as fit
     from retrieval.data.dataset import finger_count, load_grasps
-    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.model.checkpoint import load_checkpoint, require_writable
     from retrieval.search import defaults
 
     if report:
         require_ours(report / "curve.md", TEXT)
+    require_writable(out)
     fingers = finger_count(load_grasps(recording))
     start = load_checkpoint(model or defaults.shipped_model(min(fingers, 2)))
     material, estimate = fit(recording, out, start, init=init, split=read_split(split), cache=cache, seed=seed)

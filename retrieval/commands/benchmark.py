@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.import_ import run_importer
-from retrieval.commands.options import INIT, Command, Json, Values, training_config
+from retrieval.commands.options import COUNT, INIT, Command, Json, Values, training_config
 from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
@@ -51,12 +51,14 @@ def real(
     ] = None,
     preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
     init: Annotated[str | None, typer.Option(help=INIT)] = None,
-    iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
+    ] = None,
     model: Annotated[
         Values | None,
         typer.Option(parser=Values.read, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="how often folds are drawn and methods fitted")] = 3,
+    seeds: Annotated[int, typer.Option(parser=COUNT, help="how often folds are drawn and methods fitted")] = 3,
     cache: Annotated[
         Path | None, typer.Option(help="folder of recordings, features and measures (default: OUT/cache)")
     ] = None,
@@ -76,10 +78,10 @@ def real(
     try:
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
         skipped = {name: missing[of] for name, of in data_set_of.items() if of in missing}
-        for name, why in skipped.items():
-            say(f"{name}: left out, {why}; with it: {_command(data, out, name, data_set_of[name])}")
         if len(skipped) == len(asked):
             raise BadInput(f"{data} must hold data of a protocol; {'; '.join(dict.fromkeys(missing.values()))}")
+        for name, why in skipped.items():
+            say(f"{name}: left out, {why}; with it: {_command(data, out, name, data_set_of[name])}")
         results = benchmark(
             recordings,
             out,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from indexes import KINDS
-from retrieval.commands.options import Json, Model
+from retrieval.commands.options import COUNT, SHARE, Json, Model, Number
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.data.storage import is_url
@@ -44,21 +44,29 @@ def build_index(
     ] = None,
     min_recall: Annotated[
         float | None,
-        typer.Option(help="least share of touches whose best photo must be found (default: 0.99)"),
+        typer.Option(parser=SHARE, help="least share of touches whose best photo must be found (default: 0.99)"),
     ] = None,
     max_ms: Annotated[
-        float | None, typer.Option(help="longest search in milliseconds: candidates and judging them")
+        float | None,
+        typer.Option(
+            parser=Number(float, 0, 86_400_000), help="longest search in milliseconds: candidates and judging them"
+        ),
     ] = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="write OUT-views.png: what the model sees of some of the photos")
     ] = False,
     shards: Annotated[
         int | None,
-        typer.Option(help="index folders to divide the catalogue over (default: as OUT has it, else one, undivided)"),
+        typer.Option(
+            parser=COUNT,
+            help="index folders to divide the catalogue over (default: as OUT has it, else one, undivided)",
+        ),
     ] = None,
     bad_share: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", help="of shards: photos that may be unreadable (default: 0.05 of all)"),
+        typer.Option(
+            metavar="SHARE", parser=SHARE, help="of shards: photos that may be unreadable (default: 0.05 of all)"
+        ),
     ] = None,
     cluster: Annotated[
         bool,
@@ -75,11 +83,14 @@ def build_index(
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
+    from retrieval.data.catalogue import require_apart
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
     from retrieval.search import build, build_cluster, defaults
     from retrieval.search.object_store import StoredCluster
 
+    if not is_url(out):
+        require_apart(catalogue, out)
     sheet = _sheet(catalogue, out) if preview else None
     shards = _shards(shards, out, of_shards=bad_share is not None or cluster)
     path, why = defaults.find_model(model, out)
@@ -130,6 +141,8 @@ def _sheet(catalogue: str, out: str) -> Path:
     folder = Path(out).resolve()
     sheet = folder.with_name(f"{folder.name}-views.png")
     require_ours(sheet, PREVIEW)
+    if Path(catalogue).resolve() in sheet.parents:
+        raise BadInput(f"{sheet} would be a photo of the catalogue {catalogue}; name an --out outside it for --preview")
     for place, is_far in ((catalogue, is_elsewhere), (out, is_url)):
         if is_far(place):
             raise BadInput(f"--preview shows photos of a folder of this machine beside it; {place} is none")

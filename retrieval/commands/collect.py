@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import refuse
+from retrieval.commands.options import COUNT, SEED, WORKERS, refuse
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
 from retrieval.console.progress import Bar, CollectBar
@@ -15,11 +15,11 @@ from retrieval.errors import BadInput, RetrievalError
 def collect(
     *,
     rig: Annotated[str, typer.Option(help="which rig, by name or TOML file; sim is the simulated one")] = "sim",
-    objects: Annotated[int, typer.Option(help="how many objects")] = 98,
-    grasps: Annotated[int, typer.Option(help="accepted grasps of each object")] = 44,
+    objects: Annotated[int, typer.Option(parser=COUNT, help="how many objects")] = 98,
+    grasps: Annotated[int, typer.Option(parser=COUNT, help="accepted grasps of each object")] = 44,
     out: Annotated[Path, typer.Option(help="recording folder to write or to go on with")],
-    seed: Annotated[int, typer.Option(help="seed of every random choice")] = 0,
-    jobs: Annotated[int, typer.Option(help="simulated rigs that work at once")] = 1,
+    seed: Annotated[int, typer.Option(parser=SEED, help="seed of every random choice")] = 0,
+    jobs: Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")] = 1,
     gate: Annotated[
         Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the area of contact)")
     ] = None,
@@ -34,8 +34,7 @@ def collect(
         ),
     ] = False,
     touches_only: Annotated[
-        bool,
-        typer.Option("--touches-only", help="instead: a labelled press of each simulated object, for the same"),
+        bool, typer.Option("--touches-only", help="instead: a labelled press of each simulated object, for the same")
     ] = False,
 ) -> None:
     """Collect a recording with a rig on its own; goes on where it was stopped."""

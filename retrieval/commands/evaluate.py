@@ -6,8 +6,10 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import (
+    COUNT,
     DEFAULT_PRESET,
     INIT,
+    SEED,
     SPLIT,
     InitPhoto,
     InitTouch,
@@ -43,10 +45,12 @@ def evaluate(
     init_touch: InitTouch = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
-    iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the preset's")] = None,
-    seeds: Annotated[int, typer.Option(help="trainings of each method")] = 1,
+    iterations: Annotated[
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
+    ] = None,
+    seeds: Annotated[int, typer.Option(parser=COUNT, help="trainings of each method")] = 1,
     seed: Annotated[
-        int | None, typer.Option(help="seed of split, queries and first training, instead of the preset's")
+        int | None, typer.Option(parser=SEED, help="seed of split, queries and first training, instead of the preset's")
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     cache: Annotated[

@@ -32,15 +32,12 @@ def import_(
     ] = None,
 ) -> None:
     """Turn a public data set, or pictures of your own, into a recording."""
-    from robot.importers import IMPORTERS, load_importer, read_options
+    from robot.importers import load_importer, read_options
 
     if name is None:
         for line in _list():
             show(line)
         return
-    if name not in IMPORTERS:
-        for line in _list():
-            say(line)
     options = read_options(load_importer(name), option or ())
     if source is None or out is None:
         raise BadInput(

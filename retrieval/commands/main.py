@@ -29,14 +29,15 @@ from retrieval.commands.query import query
 from retrieval.commands.serve import serve
 from retrieval.commands.train import train
 from retrieval.console.interruption import noticed_interrupts
-from retrieval.console.output import give_up_stdout, prepare_streams, printing, say, show
+from retrieval.console.output import give_up_stdout, prepare_streams, printable, printing, say, show
 from retrieval.version import __version__
 
-LONGEST = 2000
-"""Characters of a message; what stands in a hostile file may be of any length."""
+LONGEST, LAST = 500, 150
+"""Characters of a message, and how many of these are its last: what to do mostly stands at its end. What stands in a
+hostile file may be of any length."""
 _WRONG_PATHS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP),
+    *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
 
 app = typer.Typer(
@@ -135,7 +136,10 @@ def _explain(context: Any, error: Exception, interrupts: list[int]) -> int:
 
 def _fail(context: Any, message: str, code: int) -> int:
     words = ["retrieve"] if context is None else ["retrieve", context.invoked_subcommand]
-    say(f"{' '.join(filter(None, words))}: {message if len(message) <= LONGEST else message[:LONGEST] + ' ...'}")
+    message = printable(message)
+    if len(message) > LONGEST:
+        message = f"{message[: LONGEST - LAST]} ... {message[-LAST:]}"
+    say(f"{' '.join(filter(None, words))}: {message}")
     return code
 
 

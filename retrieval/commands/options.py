@@ -52,6 +52,37 @@ class Values(tuple[str, ...]):
         return cls(joined.split(_BETWEEN))
 
 
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """Read the number of an option, from `low` to `high`, so that no command begins with another one.
+
+    kind: int or float. (A range of the library admits nan, and shows its limits in the help.)
+    """
+
+    kind: type[int] | type[float]
+    low: float
+    high: float
+
+    @property
+    def __name__(self) -> str:
+        """As the help names it."""
+        return self.kind.__name__
+
+    def __call__(self, text: str) -> float:
+        """Return the number. Raises BadParameter."""
+        try:
+            value = self.kind(text)
+        except ValueError as error:
+            raise typer.BadParameter(f"{text!r} is not a valid {self.__name__}") from error
+        if not self.low <= value <= self.high:
+            raise typer.BadParameter(f"{text} is not from {self.low} to {self.high}")
+        return value
+
+
+COUNT, SEED, WORKERS = Number(int, 1, 10**9), Number(int, 0, 2**32 - 1), Number(int, 1, 1024)
+SHARE, SECONDS = Number(float, 0, 1), Number(float, 0, 86_400)
+
+
 class Command(TyperCommand):
     """A command whose options of several values, those with a metavar in "...", take the words up to the next option.
 

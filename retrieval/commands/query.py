@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import Json, Values
-from retrieval.console.files import PAGE, require_ours, text_bytes, write_output
+from retrieval.commands.options import COUNT, SHARE, Json, Values
+from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
 
@@ -36,13 +36,16 @@ def query(
         ),
     ] = None,
     model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
-    top: Annotated[int, typer.Option(help="objects to return")] = 10,
+    top: Annotated[int, typer.Option(parser=COUNT, help="objects to return")] = 10,
     candidates: Annotated[
-        int | None, typer.Option(help="photos that the full classifier judges (default: what the index needs)")
+        int | None,
+        typer.Option(parser=COUNT, help="photos that the full classifier judges (default: what the index needs)"),
     ] = None,
     none_prior: Annotated[
         float,
-        typer.Option(metavar="P", help="probability, before anything is felt, that the catalogue lacks the object"),
+        typer.Option(
+            metavar="P", parser=SHARE, help="probability, before anything is felt, that the catalogue lacks the object"
+        ),
     ] = 0.5,
     json: Json = False,
     html: Annotated[Path | None, typer.Option(help="write a page with photos and gel images")] = None,
@@ -59,6 +62,7 @@ def query(
 
     if html:
         require_ours(html, PAGE)
+        require_folder(html)
     searcher = Searcher.open(path, model=model, verify=not no_verify)
     result = searcher.query(
         [[Path(image) for image in grasp] for grasp in gelsight],

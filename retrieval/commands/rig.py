@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from retrieval.commands.options import Command, Json
-from retrieval.console.files import HAND_EYE, require_ours
+from retrieval.console.files import HAND_EYE, require_folder, require_ours
 from retrieval.console.output import print_json, say, show
 from retrieval.errors import RetrievalError
 
@@ -65,6 +65,7 @@ def calibrate(
     from robot.sight.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
     require_ours(out, HAND_EYE)
+    require_folder(out)
     found = fit_hand_eye(*read_pairs(points))
     for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
         say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import refuse
+from retrieval.commands.options import COUNT, SECONDS, SHARE, WORKERS, Number, refuse
 from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
@@ -32,7 +32,7 @@ def serve(
     ] = None,
     model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
     host: Annotated[str, typer.Option(help="where to listen; other machines reach it only with a token")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="port; 0 for a free one")] = 8000,
+    port: Annotated[int, typer.Option(parser=Number(int, 0, 2**16 - 1), help="port; 0 for a free one")] = 8000,
     token_file: Annotated[
         Path | None, typer.Option(help=f"file with the token that requests must carry (or variable {TOKEN})")
     ] = None,
@@ -46,27 +46,41 @@ def serve(
     trials: Annotated[
         Path | None, typer.Option(metavar="RECORDING", help="test people with objects the model never saw")
     ] = None,
-    queue: Annotated[int, typer.Option(help="requests that are held at once; more are told to come again")] = 8,
-    workers: Annotated[int, typer.Option(help="requests in work at once")] = 1,
-    batch_ms: Annotated[float, typer.Option(help="how long a query waits for others to be encoded with it")] = 0.0,
-    deadline: Annotated[float, typer.Option(metavar="SECONDS", help="after which no answer is waited for")] = 30.0,
+    queue: Annotated[
+        int, typer.Option(parser=COUNT, help="requests that are held at once; more are told to come again")
+    ] = 8,
+    workers: Annotated[int, typer.Option(parser=WORKERS, help="requests in work at once")] = 1,
+    batch_ms: Annotated[
+        float,
+        typer.Option(parser=Number(float, 0, 1000), help="how long a query waits for others to be encoded with it"),
+    ] = 0.0,
+    deadline: Annotated[
+        float, typer.Option(metavar="SECONDS", parser=SECONDS, help="after which no answer is waited for")
+    ] = 30.0,
     cluster: Annotated[
         bool, typer.Option("--cluster", help="Ray holds the shards of a cluster: that of RAY_ADDRESS, else one here")
     ] = False,
     replicas: Annotated[
-        int | None, typer.Option(help="of --cluster: processes that hold the same shard (default: 1)")
+        int | None, typer.Option(parser=WORKERS, help="of --cluster: processes that hold the same shard (default: 1)")
     ] = None,
     most_replicas: Annotated[
-        int | None, typer.Option(help="of --cluster: to how many they grow while requests wait (default: they do not)")
+        int | None,
+        typer.Option(
+            parser=WORKERS, help="of --cluster: to how many they grow while requests wait (default: they do not)"
+        ),
     ] = None,
     shard_wait: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="of --cluster: how long a shard is waited for (default: 5)"),
+        typer.Option(
+            metavar="SECONDS", parser=SECONDS, help="of --cluster: how long a shard is waited for (default: 5)"
+        ),
     ] = None,
     least_share: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", help="of --cluster: of the catalogue, that an answer must have searched (default: 1, all)"
+            metavar="SHARE",
+            parser=SHARE,
+            help="of --cluster: of the catalogue, that an answer must have searched (default: 1, all)",
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,

@@ -6,8 +6,11 @@ from typing import Annotated, Any, Literal
 import typer
 
 from retrieval.commands.options import (
+    COUNT,
     INIT,
+    SEED,
     SPLIT,
+    WORKERS,
     InitPhoto,
     InitTouch,
     LabelledPhotos,
@@ -42,9 +45,11 @@ def train(
     init_touch: InitTouch = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
-    iterations: Annotated[int | None, typer.Option(help="optimiser steps, instead of the configuration's")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the configuration's")
+    ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="seed of split, pairs and weights, instead of the configuration's")
+        int | None, typer.Option(parser=SEED, help="seed of split, pairs and weights, instead of the configuration's")
     ] = None,
     split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
@@ -57,7 +62,7 @@ def train(
     cluster: Annotated[
         bool, typer.Option("--cluster", help="Ray Train starts the ranks: that of RAY_ADDRESS, else one here")
     ] = False,
-    workers: Annotated[int | None, typer.Option(help="of --cluster: ranks (default: 2)")] = None,
+    workers: Annotated[int | None, typer.Option(parser=WORKERS, help="of --cluster: ranks (default: 2)")] = None,
 ) -> None:
     """Train a matcher, a tower that sees relief, or a gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}

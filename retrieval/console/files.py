@@ -2,7 +2,9 @@
 
 import json
 import os
+import stat
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,6 +33,27 @@ def cache_folder() -> Path | None:
     except RuntimeError:
         return None
     return Path(home) / "touch-retrieval"
+
+
+def make_cache_folder(folder: Path) -> None:
+    """Make the cache folder with mode 0700, whatever the umask. One that exists stays as it is. Raises OSError."""
+    folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+        folder.chmod(0o700)
+
+
+def require_private(path: Path, status: os.stat_result, *owners: int) -> None:
+    """Raise BadInput unless `path` belongs to this user, to root or to one of `owners` (user ids), and nobody else can
+    write to it.
+
+    status: of the opened file, so that nothing is swapped between this check and the reading.
+    """
+    if status.st_uid not in {0, os.geteuid(), *owners}:
+        raise BadInput(f"{path} belongs to another user (uid {status.st_uid})")
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        mode = stat.S_IMODE(status.st_mode)
+        raise BadInput(f"{path} can be written to by other users (mode {mode:04o}; `chmod go-w` takes that away)")
 
 
 @dataclass(frozen=True)
@@ -98,6 +121,12 @@ def require_ours(path: Path, kind: Kind) -> None:
     raise BadInput(
         f"{path} is not {kind.name} that this program wrote, and is left as it is; name another file, or move it away"
     )
+
+
+def require_folder(path: Path) -> None:
+    """Raise BadInput unless the folder of a file to write exists: a wrong path is more likely than a wish for it."""
+    if not path.parent.is_dir():
+        raise BadInput(f"{path} cannot be written, as there is no folder {path.parent}; make it, or name another file")
 
 
 def _why(error: OSError) -> str:

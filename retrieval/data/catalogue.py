@@ -28,7 +28,7 @@ from retrieval.data.resize import RgbImage
 from retrieval.data.text import require_utf8
 from retrieval.data.touched import CatalogueTouch, grouped, touch_name
 from retrieval.data.walking import SkippedPhoto, Walk
-from retrieval.errors import DatasetError, ImageError
+from retrieval.errors import BadInput, DatasetError, ImageError
 
 METADATA_FILE = "metadata.jsonl"
 UNREAD = frozenset(
@@ -108,6 +108,17 @@ class Catalogue:
     def object_ids(self) -> tuple[str, ...]:
         """The objects, sorted, each once; some may have no photo that can be read."""
         return tuple(sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unread}))
+
+
+def require_apart(catalogue: str | Path, index: str | Path) -> None:
+    """Raise BadInput where an index folder is the folder of a catalogue, or one in it that holds photos.
+
+    Another folder in the catalogue may be an index, as `./index` is of the catalogue `.`.
+    """
+    root, place = Path(catalogue).resolve(), Path(index).resolve()
+    among = root in place.parents and any(path.suffix.lower() in EXTENSIONS for path in place.rglob("*"))
+    if place == root or among:
+        raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
 
 
 @dataclass(frozen=True)

@@ -123,10 +123,10 @@ def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> 
 
 def require_writable(path: Path) -> None:
     """Raise CheckpointError where no checkpoint can be written to `path`; asked before hours are spent on one."""
-    if path.suffix == ".md":
-        raise CheckpointError(f"{path} is where the model card goes; name the checkpoint {path.stem}.safetensors")
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
+    if path.suffix != ".safetensors":
+        raise CheckpointError(f"a checkpoint must be named *.safetensors, such as {path.stem}.safetensors; got {path}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with NamedTemporaryFile(dir=path.parent):

@@ -1,6 +1,7 @@
 """`retrieve export`: the touch encoder as ONNX, if it is faster so on this machine."""
 
 import logging
+import stat
 import statistics
 import time
 import warnings
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from indexes.store.files import write_atomically
-from retrieval.console.files import EXPORT, require_ours
+from retrieval.console.files import EXPORT, make_cache_folder, require_folder, require_ours, require_private
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
@@ -62,9 +63,11 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     if path.suffix != ENDING:
         raise BadInput(f"an export must be named *{ENDING}; got {path}")
     require_ours(path, EXPORT)
+    require_folder(path)
     unsettled = path.with_name(f".{path.name}.unsettled")
     try:
         write_atomically(unsettled, sealed(graph_of(checkpoint)))
+        unsettled.chmod(unsettled.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # else no query takes it
         result = compare(checkpoint, unsettled, path)
         if not max(result.half_difference, result.embedding_difference) <= TOLERANCE:
             raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
@@ -80,17 +83,26 @@ def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
     """Write the export of a checkpoint to the user's cache, where queries look for it too: once, and only where none
     lies beside the checkpoint. For a checkpoint in the folder of an installed package, which is not ours to write to.
 
-    None where there is nothing to do, or nothing can be done: a query works without it.
+    None where there is nothing to do, or nothing can be done: a query works without it. A folder that is open to other
+    users is left alone, and a warning says so.
     """
     path = cached(checkpoint.digest)
     if path is None or checkpoint.path.with_suffix(ENDING).is_file():
         return None
-    with suppress(CheckpointError):  # none yet, or a damaged one
+    try:
+        make_cache_folder(path.parent)
+        require_private(path.parent, path.parent.stat())
+    except BadInput as error:
+        log.warning("%s; no export for queries is kept there", error)
+        return None
+    except OSError as error:
+        log.info("no export for queries: %s", error)
+        return None
+    with suppress(CheckpointError):  # none yet, a damaged one, or one that others could write to
         unsealed(path)
         return None
     try:
         path.unlink(missing_ok=True)  # of the cache everything is ours, whatever it holds by now
-        path.parent.mkdir(parents=True, exist_ok=True)
         return export(checkpoint, path)
     except (OSError, RetrievalError) as error:
         log.info("no export for queries: %s", error)

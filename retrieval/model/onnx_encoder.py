@@ -18,10 +18,10 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.regular import read_regular
-from retrieval.console.files import SEAL, cache_folder
+from indexes.store.regular import MOST_BYTES, open_regular
+from retrieval.console.files import SEAL, cache_folder, require_private
 from retrieval.data.resize import RgbImage
-from retrieval.errors import CheckpointError
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.stored import Stored
 from retrieval.model.touches import TouchCodes
 
@@ -37,10 +37,19 @@ class OnnxEncoder:
 
     name = "onnx"
 
-    def __init__(self, path: Path, checkpoint: str, threads: int | None = None) -> None:
-        """Open `path`, which must be the export of the checkpoint with that digest. threads: None leaves the choice
-        to ONNX Runtime. Raises CheckpointError for another or a damaged one."""
-        self._open = partial(_session, path, checkpoint, threads)
+    def __init__(self, path: Path, checkpoint: str, threads: int | None = None, owners: Sequence[int] = ()) -> None:
+        """Open `path`, which must be the export of the checkpoint with that digest.
+
+        Args:
+            path: the file, which `unsealed` reads.
+            checkpoint: SHA-256 of the checkpoint's file, in hexadecimal.
+            threads: None leaves the choice to ONNX Runtime.
+            owners: ids of users whose file this may be; this user and root are always among them.
+
+        Raises:
+            CheckpointError: the export is of another checkpoint, is damaged, or may have been written by others.
+        """
+        self._open = partial(_session, path, checkpoint, threads, owners)
         self._process, self._session = os.getpid(), self._open()
 
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
@@ -77,8 +86,8 @@ def _leave_alone() -> None:
 os.register_at_fork(after_in_child=_leave_alone)
 
 
-def _session(path: Path, checkpoint: str, threads: int | None) -> Any:
-    return open_session(unsealed(path), str(path), checkpoint, threads)
+def _session(path: Path, checkpoint: str, threads: int | None, owners: Sequence[int]) -> Any:
+    return open_session(unsealed(path, owners), str(path), checkpoint, threads)
 
 
 def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) -> Any:
@@ -113,15 +122,19 @@ def exported(checkpoint: Stored, threads: int | None = None) -> OnnxEncoder | No
     """The export that lies beside a checkpoint, else the one in the user's cache, where it is of this checkpoint and
     ONNX Runtime is installed.
 
-    One that is stale or damaged is not used, and a warning says so.
+    One that is stale, damaged or open to other users is not used, and a warning says so: its checksum and the digest in
+    it tell damage, but anybody can write them. Beside a checkpoint the file may belong to the checkpoint's owner too.
     """
     beside = checkpoint.path.with_suffix(ENDING)
     path = beside if beside.is_file() else cached(checkpoint.digest)
     if path is None or not path.is_file() or find_spec("onnxruntime") is None:
         return None
     try:
+        if path == beside:
+            return OnnxEncoder(path, checkpoint.digest, threads, [checkpoint.path.stat().st_uid])
+        require_private(path.parent, path.parent.stat())
         return OnnxEncoder(path, checkpoint.digest, threads)
-    except CheckpointError as error:
+    except (BadInput, OSError) as error:
         log.warning("%s; PyTorch is used instead (slower to start): run `retrieve export` again", error)
         return None
 
@@ -133,10 +146,14 @@ def sealed(model: bytes) -> bytes:
     return model + _field(14, entry)
 
 
-def unsealed(path: Path) -> bytes:
-    """The bytes of a sealed file. Raises CheckpointError where one of them changed."""
+def unsealed(path: Path, owners: Sequence[int] = ()) -> bytes:
+    """The bytes of a sealed file. Raises CheckpointError where one of them changed, or `require_private` refuses."""
     try:
-        data = read_regular(path)
+        with open_regular(path) as file:
+            require_private(path, os.fstat(file.fileno()), *owners)
+            data = file.read(MOST_BYTES)
+    except BadInput as error:
+        raise CheckpointError(str(error)) from error
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
     if len(data) <= _SEAL_BYTES or sealed(data[:-_SEAL_BYTES]) != data:

@@ -30,7 +30,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.locking import one_at_a_time
 from indexes.store.manifest import NAME as MANIFEST
 from indexes.store.manifest import read_manifest
-from retrieval.console.files import cache_folder
+from retrieval.console.files import cache_folder, make_cache_folder
 from retrieval.data.storage import FINAL, file_system, is_url, tried
 from retrieval.errors import BadInput, StorageError
 
@@ -76,6 +76,7 @@ class StoredCluster:
         cache = cache_folder()
         if cache is None:
             raise BadInput(f"{url}: there is no folder to work in; set XDG_CACHE_HOME")
+        make_cache_folder(cache)
         key = hashlib.sha256(self.url.encode()).hexdigest()[:32]
         self.work, self._fetched = cache / "building" / key, cache / "shards" / key
 

@@ -1,10 +1,9 @@
 """From gel images to ranked objects: encode the touch, take candidates, rerank them by match logit from halves."""
 
-import copy
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +117,12 @@ class Searcher:
         self._closed = True
         for name in ("shard", "encoder", "reader", "judge"):
             vars(self).pop(name, None)
+
+    def __reduce__(self) -> NoReturn:
+        raise BadInput(
+            "a Searcher cannot be pickled, as it holds opened files and a model; open the index in each process: "
+            f"retrieval.open({str(self.index)!r})"
+        )
 
     @property
     def generation(self) -> Generation:
@@ -239,7 +244,8 @@ class Searcher:
 
     def _held(self) -> "Searcher":
         """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
-        held = copy.copy(self)
+        held = object.__new__(type(self))
+        vars(held).update(vars(self))
         if held._closed:
             raise BadInput(f"this searcher of {self.index} was closed; open the index again")
         return held

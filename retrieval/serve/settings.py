@@ -16,6 +16,7 @@ MAX_BODY_PIXELS = 5 * MAX_PIXELS
 MAX_PICTURES = 128
 """Of one request."""
 LEAST_TOKEN = 16
+MAX_WAIT_S = 86_400
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +56,8 @@ class ServiceSettings:
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be 1 or more; got {getattr(self, name)}")
         for name in ("deadline_s", "body_s", "poll_s"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be more than 0 seconds; got {getattr(self, name)}")
+            if not 0 < getattr(self, name) <= MAX_WAIT_S:
+                raise ConfigError(f"{name} must be above 0 and at most {MAX_WAIT_S} seconds; got {getattr(self, name)}")
         if not 0 <= self.batch_ms <= 1000:
             raise ConfigError(f"batch_ms must be from 0 to 1000; got {self.batch_ms}")
         if not 0 <= self.port < 2**16:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from indexes.store.regular import open_regular
 from retrieval.data.text import utf8_of
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.search.answer import QueryResult
@@ -103,7 +104,13 @@ class Store:
     def __init__(self, path: Path, keep: int, keep_bytes: int) -> None:
         self.path, self._keep, self._keep_bytes = path, keep, keep_bytes
         self._lock, self._since_trim = Lock(), 0
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            open_regular(path).close()
+        except FileNotFoundError:  # SQLite makes it
+            pass
+        except OSError as error:
+            raise BadInput(f"{path} must be the history of a service: {error.strerror}; name another folder") from error
         self._database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
         try:
             self._prepare()

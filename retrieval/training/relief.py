@@ -96,8 +96,8 @@ def train_relief(
         )
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
-    kind, pictures = load_labelled(folder)
     require_writable(out)
+    kind, pictures = load_labelled(folder)
     training = ReliefTraining(kind, pictures, config, iterations)
     state = beside(out, ".state.safetensors")
     if resume:

@@ -90,6 +90,7 @@ def train(
         raise ConfigError(
             "images are kept for towers that are trained; frozen ones look at each once: leave out the cache"
         )
+    require_writable(out)
     distributed.start()
     grasps = load_grasps(recording)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
@@ -100,7 +101,6 @@ def train(
         )
     else:
         require_fit(split, grasps)
-    require_writable(out)
     trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
     if not resume:
         require_fresh(out)

@@ -14,6 +14,9 @@ the others only copies are found that are as near as the gentlest of these chang
 Measured on simulated recordings of 12 objects: limits of .002 to .12, other objects from .17 on; JPEG 20 left 64-bit
 perceptual hashes 0 to 18 bits from their picture, where other objects' touches began at 2: no threshold tells these
 apart, since hashes see what the pictures share. Hence shapes, and no hash library with its wavelets.
+
+Copies that were moved farther are found among the nearest pictures of the nearest objects by a finer comparison, at
+every shift (`retrieval.data.check.aligned`).
 """
 
 from collections.abc import Sequence
@@ -25,12 +28,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.check.aligned import LEAST_LIMIT, MAX_DISTANCE, PART, AlignedSet, Doubles, Fine, fine
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import RgbImage
 
 PX = 16
 SLACK = 1.25
 _FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_MOVES = tuple((rows, columns) for rows in (-1, 0, 1) for columns in (-1, 0, 1))
+_LOOKED_THROUGH, _NEAR_OBJECTS, _OF_EACH = 64, 5, 3
+"""Pictures from which the candidates of the finer comparison are taken: how many objects, and how many of each."""
 _BLOCK = 512
 _MANY, _PART = 3, 0.25
 _LEAST_LIMIT, _MOST_LIMIT = 0.02, 0.1
@@ -43,11 +50,13 @@ Greys = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """One picture: the digest of its bytes, its grey levels (256,), and those of its damaged copies (4, 256)."""
+    """One picture: the digest of its bytes, its grey levels (256,), those of its damaged copies (4, 256), and those of
+    the finer comparison."""
 
     digest: str
     grey: Greys
     damaged: Greys
+    fine: Fine
 
 
 def look_at(path: Path) -> Thumbnail:
@@ -60,7 +69,10 @@ def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
     """The thumbnail of a picture: `data` are the bytes of its file, `image` what they decode to."""
     picture = np.rint(255 * image).astype(np.uint8)
     return Thumbnail(
-        sha256(data).hexdigest(), _small(picture), np.stack([_small(changed(picture)) for changed in DAMAGES])
+        sha256(data).hexdigest(),
+        _small(picture),
+        np.stack([_small(changed(picture)) for changed in DAMAGES]),
+        fine(picture),
     )
 
 
@@ -128,6 +140,13 @@ class Nearest:
     copy: NDArray[np.bool_]
 
 
+def moved(greys: Greys, rows: int, columns: int) -> Greys:
+    """Thumbnails (n, 256) moved by at most one of their pixels down and to the right; the border repeats."""
+    padded = np.pad(greys.reshape(-1, PX, PX), ((0, 0), (1, 1), (1, 1)), "edge")
+    part = padded[:, 1 - rows : 1 - rows + PX, 1 - columns : 1 - columns + PX]
+    return np.ascontiguousarray(part).reshape(-1, PX**2)
+
+
 class PictureSet:
     """All pictures of one kind, such as the photos or the touches of one finger, and the objects that they are of."""
 
@@ -139,6 +158,7 @@ class PictureSet:
         copies = [shapes(one.damaged, self.common) for one in thumbnails]
         likeness = [copy @ shape for copy, shape in zip(copies, self._shapes, strict=True)]
         self.changed = SLACK * (1 - np.array(likeness, dtype=np.float64).reshape(-1, len(DAMAGES)))
+        self._aligned = AlignedSet([one.fine for one in thumbnails])
 
     def nearest(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> Nearest:
         """For each of the pictures `queries` (rows of this set), the nearest of those in `among` that show another
@@ -146,7 +166,9 @@ class PictureSet:
         if not len(queries) or not len(among):
             nothing = np.zeros(len(queries), dtype=bool)
             return Nearest(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)
-        parts = [self._nearest(queries[at : at + _BLOCK], among) for at in range(0, len(queries), _BLOCK)]
+        among = among[np.argsort(self.objects[among], kind="stable")]
+        blocks = [queries[at : at + _BLOCK] for at in range(0, len(queries), _BLOCK)]
+        parts = [self._nearest(block, among) for block in blocks]
         row, distance, third = (np.concatenate(part) for part in zip(*parts, strict=True))
         most = _PART * third
         checked = self.changed[queries].max(axis=1) < most
@@ -154,25 +176,65 @@ class PictureSet:
         changed = np.maximum(self.changed[queries], self.changed[row])
         farthest, gentlest = changed.max(axis=1), changed.min(axis=1)
         limit = np.where(farthest < most, farthest, np.minimum(gentlest, most))
-        return Nearest(row, distance, checked, np.asarray(distance <= limit))
+        found = Nearest(row, distance, checked, np.asarray(distance <= limit))
+        return self._with_moved(queries, [one for block in blocks for one in self._candidates(block, among)], found)
+
+    def _with_moved(self, queries: NDArray[np.int64], candidates: Sequence[list[int]], found: Nearest) -> Nearest:
+        """What was found, and those of each query's candidates that are copies of it which were moved."""
+        row, distance, checked, copy = (
+            found.row.copy(),
+            found.distance.copy(),
+            found.checked.copy(),
+            found.copy.copy(),
+        )
+        for at, (query, others) in enumerate(zip(queries.tolist(), candidates, strict=True)):
+            if not others or copy[at]:
+                continue
+            away = self._aligned.distances(query, others)
+            by_object = np.sort([away[self.objects[others] == one].min() for one in np.unique(self.objects[others])])
+            third = by_object[_MANY - 1] if len(by_object) >= _MANY else 1.0
+            most = min(MAX_DISTANCE, PART * third)
+            nearest = int(away.argmin())
+            own, its = (SLACK * self._aligned.moved_by_half(one) for one in (query, others[nearest]))
+            checked[at] |= max(own, LEAST_LIMIT) <= most
+            if away[nearest] <= min(max(own, its, LEAST_LIMIT), most):  # either may be the copy
+                row[at], distance[at], copy[at] = others[nearest], away[nearest], True
+        return Nearest(row, distance, checked, copy)
 
     def _nearest(
         self, queries: NDArray[np.int64], among: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Row of the nearest picture of another object, its distance, and that of the third nearest other object (1
-        where there are fewer)."""
-        among = among[np.argsort(self.objects[among], kind="stable")]
-        likeness = np.full((len(queries), len(among)), -1.0, np.float32)
-        for flip in _FLIPS:
-            turned = shapes(flipped(self.greys[queries], flip), self.common)
-            np.maximum(likeness, turned @ self._shapes[among].T, out=likeness)
-        distance = 1.0 - likeness.astype(np.float64)
-        distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
+        where there are fewer). `among` is sorted by object."""
+        distance = self._least(queries, among, [flipped(self.greys[queries], flip) for flip in _FLIPS])
         first = np.flatnonzero(np.diff(self.objects[among], prepend=-1))
         by_object = np.sort(np.minimum.reduceat(distance, first, axis=1), axis=1)
         third = by_object[:, _MANY - 1] if by_object.shape[1] >= _MANY else np.full(len(queries), np.inf)
         at = distance.argmin(axis=1)
         return among[at], distance[np.arange(len(queries)), at], np.minimum(third, 1.0)
+
+    def _candidates(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> list[list[int]]:
+        """For each query the nearest pictures, roughly moved: a few of each of the nearest other objects."""
+        distance = self._least(queries, among, [moved(self.greys[queries], *by) for by in _MOVES])
+        found = []
+        for away in distance:
+            near: dict[int, list[int]] = {}
+            for place in np.argsort(away, kind="stable")[:_LOOKED_THROUGH].tolist():
+                owner = int(self.objects[among[place]])
+                if np.isfinite(away[place]) and (owner in near or len(near) < _NEAR_OBJECTS):
+                    near.setdefault(owner, []).append(int(among[place]))
+            found.append([row for rows in near.values() for row in rows[:_OF_EACH]])
+        return found
+
+    def _least(self, queries: NDArray[np.int64], among: NDArray[np.int64], turned: Sequence[Greys]) -> Doubles:
+        """The least distance (q, n) of any of the turned thumbnails of each query to each picture of another object;
+        infinity for the query's own."""
+        likeness = np.full((len(queries), len(among)), -1.0, np.float32)
+        for greys in turned:
+            np.maximum(likeness, shapes(greys, self.common) @ self._shapes[among].T, out=likeness)
+        distance = 1.0 - likeness.astype(np.float64)
+        distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
+        return distance
 
     def within_objects(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Distance of each of the pictures to the nearest other one of its own object; objects with one are left

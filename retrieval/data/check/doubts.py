@@ -19,6 +19,8 @@ from retrieval.data.check.findings import Files, Finding, named
 from retrieval.data.check.looks import Looks, distance, exchanged_photos, named_by, swapped_fingers, swapped_moments
 from retrieval.data.dataset import Grasp
 
+COMPARED = "compared-copies"
+"""The finding that says in how many pictures near copies were looked for."""
 _LEAST_GRASPS = 4
 _BY_LIGHT, _BY_TOUCH = 0.35, 0.6
 """How far from chance to always may light alone name the object: by frames without contact, and by the mean colour of
@@ -174,17 +176,15 @@ def own_photo(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
     yield from named("error", "same-modality", "a touch shows its own photo", names, grasps)
 
 
-def copies(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
-    """Near copies of pictures of another object.
+def copies(grasps: Sequence[Grasp], seen: Files, accepted: Sequence[Grasp]) -> Iterator[Finding]:
+    """Near copies of pictures of another object, and in how many of those of all accepted grasps they were looked for.
 
     Of touches a warning only: smooth things pressed in the same way look so without being copies. (68 pairs of 4,991
     touches of VT60, boxes, mugs and bowls; none of those looked at was a copy.)
     """
-    kinds = {"photo": [(grasp, grasp.photo) for grasp in grasps]}
-    for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
-        kinds[f"touch {ascii_lowercase[finger]}"] = [(grasp, grasp.touches[finger]) for grasp in grasps]
-    for kind, frames in kinds.items():
-        one_each = list({path: (grasp, path) for grasp, path in frames}.values())  # grasps may share a photo
+    counts, faint, left_out = [], 0, 0
+    for kind, every in _by_kind(accepted).items():
+        one_each = [(grasp, path) for path, grasp in _by_kind(grasps).get(kind, {}).items()]
         pictures = PictureSet([_thumbnail(seen, path) for _, path in one_each], [one.object_id for one, _ in one_each])
         rows = np.arange(len(one_each))
         found = pictures.nearest(rows, rows)
@@ -197,9 +197,20 @@ def copies(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
             severity, or_else = ("error", "") if kind == "photo" else ("warning", ", or of things that feel alike")
             yield Finding(severity, "near-copy", f"{text}{or_else}: {some(list(pairs.values()))}")
-        if not found.checked.all():
-            text = f"near copies could be looked for of {found.checked.sum()} of {len(rows)} images ({kind})"
-            yield Finding("note", "unchecked-copies", f"{text}; the others show too little to tell a copy by")
+        counts.append(f"{found.checked.sum()} of {len(every)} images ({kind})")
+        faint += int((~found.checked).sum())
+        left_out += len(every) - len(one_each)
+    why = [f"{faint} show too little to tell a copy by (a light contact, or a look that many share)"] * bool(faint)
+    why += [f"{left_out} are of grasps that are named above"] * bool(left_out)
+    yield Finding("note", COMPARED, f"near copies were looked for in {'; '.join([', '.join(counts), *why])}")
+
+
+def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
+    """Photos, and touches of each finger: a grasp of each file, which several may share."""
+    kinds = {"photo": {grasp.photo: grasp for grasp in grasps}}
+    for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
+        kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}
+    return kinds
 
 
 # Helpers ---------------------------------------------------------------------------------------------------

@@ -57,12 +57,16 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     of_all: tuple[_Check, ...] = (_same_images, published.dead, doubts.swapped, doubts.fingers, doubts.moments)
     of_accepted: tuple[_Check, ...] = (
         *(published.frozen, published.one_background, published.repeated),
-        *(doubts.own_photo, doubts.light, doubts.exchanged, doubts.copies),
+        *(doubts.own_photo, doubts.light, doubts.exchanged),
     )
-    for check in of_all + of_accepted:
+
+    def unnamed() -> list[Grasp]:
         known = {name for finding in findings for name in finding.grasps}
-        left = [grasp for grasp in whole if grasp.grasp_id not in known]
-        findings += check([one for one in left if check in of_all or one.grasp_id in trained_on], seen)
+        return [grasp for grasp in whole if grasp.grasp_id not in known]
+
+    for check in of_all + of_accepted:
+        findings += check([one for one in unnamed() if check in of_all or one.grasp_id in trained_on], seen)
+    findings += doubts.copies([one for one in unnamed() if one.grasp_id in trained_on], seen, accepted)
     if split:
         findings += check_split(accepted, split)
         looked_at = [grasp for grasp in whole if grasp.grasp_id in trained_on]
