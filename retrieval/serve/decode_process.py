@@ -26,15 +26,12 @@ DECODE_CPU_S = 5
 """Processor time of one picture; the slowest one of the most pixels that we could make takes 2 s."""
 DECODE_BYTES = 200_000_000
 """Memory of one picture. PNG, JPEG, BMP and TIFF pictures of the most pixels take less, some others more."""
-NICENESS = 5
-"""Of the process, so that the event loop goes first where cores are short."""
 LENGTHS = struct.Struct(">II")
 READY: dict[str, Any] = {"ready": True}
 
 
 def serve_pictures() -> None:
     """Read pictures until standard input ends."""
-    os.nice(NICENESS)
     for number in (signal.SIGINT, signal.SIGTERM):  # they end the service, which lets its processes finish
         signal.signal(number, signal.SIG_IGN)
     _one_thread()

@@ -37,7 +37,10 @@ class Decoders:
 
     async def start(self) -> None:
         """Start the processes, so that the first query does not wait for them. Raises RetrievalError."""
-        self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
+        await asyncio.gather(*(self._start_one() for _ in range(PROCESSES)))
+
+    async def _start_one(self) -> None:
+        self._idle.append(await _Process.start())
 
     async def close(self) -> None:
         """End all processes; what is being read fails."""
@@ -55,10 +58,18 @@ class Decoders:
         """
         small = (self._read_small(name, data, px, compares) for name, data in named)
         found = await asyncio.gather(*small, return_exceptions=True)
-        if wrong := [one for one in found if isinstance(one, BaseException)]:
-            raise wrong[0]
+        for (name, _), one in zip(named, found, strict=True):
+            if isinstance(one, BaseException):
+                raise one
+            if isinstance(one, PictureSize):
+                _check_size(name, one)
         first = [one for one in found if not isinstance(one, BaseException)]
-        _check_sizes([(name, one) for (name, _), one in zip(named, first, strict=True) if isinstance(one, PictureSize)])
+        total = sum(one.pixels for one in first if isinstance(one, PictureSize))
+        if total > MAX_BODY_PIXELS:
+            raise Problem(
+                "too-large",
+                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; the large ones have {total:,}",
+            )
         images = []
         for (name, data), one in zip(named, first, strict=True):
             if isinstance(one, PictureSize):
@@ -127,7 +138,7 @@ class _Process:
         except EOFError:
             pass
         except BaseException:
-            process._kill()
+            await process.end()
             raise
         await process.end()
         raise RetrievalError("the process that decodes pictures ended as it started; the log of the service says more")
@@ -147,24 +158,13 @@ class _Process:
 
     async def end(self) -> None:
         """End it, whatever it does."""
-        self._kill()
-        await self._process.wait()
-
-    def _kill(self) -> None:
         if self._process.returncode is None:
             self._process.kill()
+        await self._process.wait()
 
 
-def _check_sizes(large: Sequence[tuple[str, PictureSize]]) -> None:
-    """Raises ImageError for a picture that is too large, and Problem for pictures that are too large together."""
-    for name, size in large:
-        if size.pixels > MAX_PIXELS:
-            raise ImageError(
-                name, f"{size.width} x {size.height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
-            )
-    total = sum(size.pixels for _, size in large)
-    if total > MAX_BODY_PIXELS:
-        raise Problem(
-            "too-large",
-            f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; the large ones have {total:,}",
+def _check_size(name: str, size: PictureSize) -> None:
+    if size.pixels > MAX_PIXELS:
+        raise ImageError(
+            name, f"{size.width} x {size.height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
         )
