@@ -8,9 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from retrieval.model.encode import has_fast_bfloat16
-from tests.benchmarks import __main__ as program
-from tests.benchmarks import (
+from benchmarks import __main__ as program
+from benchmarks import (
     again,
     arm,
     build,
@@ -30,6 +29,7 @@ from tests.benchmarks import (
     table,
     training,
 )
+from retrieval.model.encode import has_fast_bfloat16
 from tests.conftest import TINY
 
 SMALLEST = {

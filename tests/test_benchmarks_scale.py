@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import needed, scale, several
+from benchmarks.common import matcher_of
 from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import judge_of
-from tests.benchmarks import needed, scale, several
-from tests.benchmarks.common import matcher_of
 from tests.conftest import TINY
 
 

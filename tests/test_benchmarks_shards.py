@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from tests.benchmarks import queueing, shards
-from tests.benchmarks.queueing import ENCODE_S, HOP_S, Service, answers, service_of, tables
+from benchmarks import queueing, shards
+from benchmarks.queueing import ENCODE_S, HOP_S, Service, answers, service_of, tables
 
 MEASURED = [
     {

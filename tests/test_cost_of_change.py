@@ -11,18 +11,16 @@ import torch
 
 import indexes
 import robot
+from benchmarks import hard_cases
 from indexes.kinds.exact import ExactIndex
-from retrieval import methods
+from retrieval import frontier, methods
 from retrieval.commands import main as command_line
 from retrieval.data import views
 from retrieval.data.dataset import PairBatch
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.evaluation import real
 from retrieval.evaluation.real.protocol import Protocol, first_guess
-from retrieval.lab import frontier, hard_cases
-from retrieval.lab.frontier.points import Row
-from retrieval.lab.hard_cases import linear
-from retrieval.lab.hard_cases.case import HardCase
+from retrieval.frontier.points import Row
 from retrieval.methods.base import Setting
 from retrieval.methods.chance import Chance
 from retrieval.metrics import protocols, registry
@@ -43,6 +41,8 @@ from robot.readings import Frame
 from robot.sim.objects import draw, materials, relief, shapes
 from robot.sim.rig import SimRig
 from tests.documents import CONTRIBUTING, ROOT, table_rows
+from tests.hard_case import HardCase
+from tests.retrieval.methods import hard_linear as linear
 
 HERE = "tests.test_cost_of_change"
 TINY = MatcherConfig(tower="small", tower_output="pooled", fingers=1, hidden=4, embedding_dim=4)
@@ -209,7 +209,7 @@ def approximation(sample):
 def add_a_hard_case(monkeypatch):
     case = HardCase("mine", "", "", "", "", True, False)
     monkeypatch.setattr(linear, "hard_cases", lambda: [case])
-    monkeypatch.setattr(hard_cases, "KERNELS", {"retrieval": ("linear",)})
+    monkeypatch.setattr(hard_cases, "KERNELS", {"retrieval": (linear.__name__,)})
     assert hard_cases.hard_cases("retrieval") == [case]
 
 
@@ -250,6 +250,6 @@ def test_what_the_table_says_is_enough(row, monkeypatch, tmp_path):
 @pytest.mark.parametrize("row", rows())
 def test_at_most_two_places_are_named(row):
     """A file to write and a row beside it; three places where one row names three things."""
-    named = re.findall(r"`((?:retrieval|robot|indexes|docs|tests)/[\w/.]*)`", " ".join(rows()[row]))
+    named = re.findall(r"`((?:retrieval|robot|indexes|docs|tests|benchmarks)/[\w/.]*)`", " ".join(rows()[row]))
     assert len(named) <= 3
     assert all((ROOT / name).exists() for name in named)

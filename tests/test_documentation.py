@@ -13,15 +13,15 @@ import pytest
 import torch
 import typer
 
+from benchmarks.reference import COMMANDS
+from benchmarks.reference import commands as commands_page
 from retrieval.commands.main import main
 from retrieval.model.towers import build_tower
 from retrieval.search.answer import EXIT_CODES
-from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.rig import load_rig
 from tests import real_data_sets, serving, synthetic
 from tests.documents import PAGES, README, ROOT, blocks, text_of
-from tests.reference import COMMANDS
-from tests.reference import commands as commands_page
+from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.replay_rig import replay_file
 from tests.test_project import pins
 from tests.test_retrieval_rig_commands import POINTS
@@ -39,7 +39,7 @@ SHORTER = {
     "export": [],
     "export-recording": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
-    "frontier": ["--quick", "--only", "closing"],
+    "frontier": ["--quick", "--only", "halves", "--recording", "recording"],
     "serve": ["--port", "0"],
     "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca_pca"],
 }
@@ -59,7 +59,7 @@ def of_program(name, *pages):
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
     """Everything that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
-    model.safetensors, rig.toml, mobilenet_v2.pth, tests/shipped_rig.toml."""
+    model.safetensors, rig.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copy(model, tmp_path / "model.safetensors")
@@ -77,8 +77,8 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
     real_data_sets.write_billets(tmp_path / "data" / "billets")
-    (tmp_path / "tests").mkdir()
-    shutil.copy(ROOT / "tests" / "shipped_rig.toml", tmp_path / "tests")
+    (tmp_path / "benchmarks" / "models").mkdir(parents=True)
+    shutil.copy(ROOT / "benchmarks" / "models" / "shipped_rig.toml", tmp_path / "benchmarks" / "models")
     (tmp_path / "points.csv").write_text(POINTS)
     (tmp_path / "grey.toml").write_text(next(block for block in blocks("toml") if "grey" in block))
     torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
@@ -99,8 +99,7 @@ def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
             continue
         # An export that is not the faster one on this machine is refused, with exit code 1.
         accepted = {"export": {0, 1}, "query": set(EXIT_CODES.values())}.get(line[1], {0})
-        shorter = [] if "--stability" in line else SHORTER[line[1]]  # hard cases are small, and take no such options
-        assert main([*line[1:], *shorter]) in accepted, line
+        assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line
 
 
 def test_every_retrieve_command_stands_in_a_block_that_is_run():
@@ -141,7 +140,7 @@ def test_every_python_command_exists():
 
 @pytest.mark.skipif(typer.__version__ != pins("constraints.txt")["typer"], reason="typers lay help out differently")
 def test_the_help_of_every_command_stands_in_its_page(monkeypatch, capsys):
-    assert text_of(COMMANDS) == commands_page(), "run `python -m tests.reference`"
+    assert text_of(COMMANDS) == commands_page(), "run `python -m benchmarks.reference`"
     monkeypatch.setenv("COLUMNS", "100")
     for asked in re.findall("^## retrieve ?(.*)$", text_of(COMMANDS), re.M):
         assert main([*asked.split(), "--help"]) == 0

@@ -10,7 +10,7 @@ from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, 
 
 LINKED = (*PAGES, CONTRIBUTING, *NOTEBOOKS)
 LONGEST_README = 150
-OURS = r"(?:retrieval|robot|indexes|tests)"
+OURS = r"(?:retrieval|robot|indexes|tests|benchmarks)"
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.stem)
@@ -48,7 +48,8 @@ def test_the_readmes_tables_are_parts_of_those_in_the_pages():
 
 
 def test_every_module_that_is_named_to_be_run_is_there():
-    code = [path for folder in ("retrieval", "robot", "indexes", "tests") for path in (ROOT / folder).rglob("*.py")]
+    folders = ("retrieval", "robot", "indexes", "tests", "benchmarks")
+    code = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     named = {
         (path.name, module)
         for path in (*LINKED, *code)

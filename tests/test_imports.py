@@ -11,9 +11,8 @@ from tests.documents import CONTRIBUTING, table_rows
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("indexes", "robot", "retrieval")
-# Only these know the rigs: the reader of recordings, what shows a rig on the page, the commands around a rig, and what
-# measures the project.
-MAY_TOUCH_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/", "retrieval/lab/")
+# Only these know the rigs: the reader of recordings, what shows a rig on the page, and the commands around a rig.
+MAY_TOUCH_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/")
 # In `retrieval` the layers run one way; a module may import those of its own layer and of layers before it.
 LAYERS = (
     ("errors", "version", "console", "metrics"),
@@ -24,7 +23,7 @@ LAYERS = (
     ("methods",),
     ("evaluation",),
     ("report",),
-    ("adaptation", "lab", "serve"),
+    ("adaptation", "frontier", "serve"),
     ("commands",),
     ("__main__",),
 )
@@ -51,9 +50,14 @@ def packages_of(path):
 
 @pytest.mark.parametrize("package", ["indexes", "robot"])
 def test_indexes_and_robot_know_nothing_of_anyone(package):
-    others = set(PACKAGES) - {package} | {"tests", "notebooks"}
+    others = set(PACKAGES) - {package} | {"tests", "benchmarks", "notebooks"}
     for path in modules(package):
         assert not packages_of(path) & others, path
+
+
+def test_retrieval_knows_neither_tests_nor_benchmarks():
+    for path in modules("retrieval"):
+        assert not packages_of(path) & {"tests", "benchmarks", "notebooks"}, path
 
 
 def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_images():
@@ -63,7 +67,7 @@ def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_image
         assert not packages_of(path) & {"torch", "cv2", "PIL"}, path
 
 
-def test_only_the_dataset_reader_the_rig_of_the_service_the_commands_and_the_lab_touch_robot():
+def test_only_the_dataset_reader_the_rig_of_the_service_and_the_commands_touch_robot():
     touching = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
     assert not [path for path in touching if not path.startswith(MAY_TOUCH_ROBOT)]
     assert "retrieval/data/dataset.py" in touching

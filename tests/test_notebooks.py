@@ -6,9 +6,9 @@ import re
 
 import pytest
 
+from benchmarks.notebooks import FOLDER, execute, kinds
 from retrieval.model.judge import CONTACT, GelCheck
 from tests import synthetic
-from tests.notebooks import FOLDER, execute, kinds
 
 TINY = {
     "comparing_baselines": {

@@ -11,10 +11,11 @@ import pytest
 
 import retrieval
 import robot
+from benchmarks import reference
+from benchmarks.reference import PACKAGES, PAGE
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import build_index
-from tests import reference, synthetic
-from tests.reference import PACKAGES, PAGE
+from tests import synthetic
 from tests.test_imports import HEAVY, run_blocked
 
 
@@ -61,7 +62,7 @@ def test_every_public_name_has_an_example_that_runs(folder, monkeypatch, capsys)
 
 
 def test_the_reference_page_is_up_to_date():
-    assert PAGE.read_text("utf-8") == reference.reference(), "run `python -m tests.reference`"
+    assert PAGE.read_text("utf-8") == reference.reference(), "run `python -m benchmarks.reference`"
 
 
 def test_importing_the_packages_and_naming_what_they_have_imports_nothing_heavy():

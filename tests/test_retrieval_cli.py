@@ -13,7 +13,7 @@ import pytest
 from indexes import KINDS
 from retrieval.commands.main import main
 from retrieval.commands.options import Command
-from retrieval.lab.frontier import APPROXIMATIONS
+from retrieval.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.search import defaults
 
@@ -418,8 +418,6 @@ def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["frontier", "--out", "f", "--stability", "--quick"], "--quick is of the frontier; --stability runs every"),
-        (["frontier", "--out", "f", "--stability", "--only", "closing"], "--only is of the frontier"),
         (["collect", "--out", "r", "--dry-run", "--preview"], "--preview is of a collection; --dry-run moves and"),
         (["serve", "--index", "i", "--replicas", "2"], "--replicas is for shards that Ray holds; give --cluster too"),
         (["serve", "--index", "i", "--least-share", "0"], "--least-share is for shards that Ray holds"),

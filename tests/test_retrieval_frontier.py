@@ -3,19 +3,19 @@
 import dataclasses
 import json
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 
 from retrieval.errors import ConfigError, DatasetError
-from retrieval.lab.frontier import APPROXIMATIONS, NEED_NOTHING, load_approximation, run
-from retrieval.lab.frontier.candidates import default_k, ranks
-from retrieval.lab.frontier.clock import timed
-from retrieval.lab.frontier.correlation import Problem, _by_covariance, _by_svd, known_problem
-from retrieval.lab.frontier.formats import FORMATS, encoders
-from retrieval.lab.frontier.pixels import load_touch
-from retrieval.lab.frontier.points import Panel, Row, Tradeoff, duration, missed, number
-from retrieval.lab.frontier.sample import Sample, Scale, blend
+from retrieval.frontier import APPROXIMATIONS, load_approximation, run
+from retrieval.frontier.candidates import default_k, ranks
+from retrieval.frontier.clock import timed
+from retrieval.frontier.formats import FORMATS, encoders
+from retrieval.frontier.pixels import load_touch
+from retrieval.frontier.points import Panel, Row, Tradeoff, duration, missed, number
+from retrieval.frontier.sample import Sample, Scale, blend
 from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
@@ -134,7 +134,7 @@ def test_every_row_measures_points_and_names_its_reference(name, rows):
         assert len({(point.series, point.setting) for point in one.points}) == len(one.points)
 
 
-@pytest.mark.parametrize("name", sorted(set(APPROXIMATIONS) - {"contact", "closing", "gel_optics"}))
+@pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
 def test_every_panel_of_ours_marks_one_default(name, rows):
     for one in rows[name].panels:
         assert sum(point.is_default for point in one.points) == 1, one.title
@@ -211,16 +211,6 @@ def test_images_have_the_default_size_in_a_query(rows, sample):
     ]
 
 
-def test_the_rig_solves_contacts_at_the_default():
-    from retrieval.lab.frontier.contact import contact_panels
-    from robot.sim.pinch import Hand
-
-    panels = contact_panels(1, rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)
-    hand = Hand()
-    wanted = f"{hand.grid[0]}x{hand.grid[1]}, tolerance {hand.tolerance:g}"
-    assert [panel.default.name for panel in panels] == [wanted] * 3
-
-
 # Sample ----------------------------------------------------------------------------------------------------
 
 
@@ -270,30 +260,11 @@ def test_winners_are_the_photos_of_the_highest_logit_and_are_found_once(sample, 
     assert again.winners.tolist() == sample.winners.tolist()
 
 
-# Canonical correlations ------------------------------------------------------------------------------------
-
-
-def test_the_constructed_problem_has_the_correlations_that_it_says():
-    """By a route of its own: principal angles between the column spaces."""
-    problem = known_problem(300, 6, spread=10.0)
-    x, y = (np.linalg.qr(one - one.mean(0))[0] for one in (problem.x, problem.y))
-    assert np.linalg.svd(x.T @ y, compute_uv=False) == pytest.approx(problem.rho, abs=1e-12)
-
-
-def test_the_textbook_way_fails_where_ours_does_not():
-    problem = known_problem(500, 24, spread=1e6)
-    assert _by_svd(problem) == pytest.approx(problem.rho, abs=1e-6)
-    naive = _by_covariance(np.float32, problem)
-    assert np.abs(naive - problem.rho).max() > 0.05
-
-
-def test_a_correlation_that_was_not_found_counts_as_zero():
-    problem = known_problem(40, 3, spread=2.0)
-    same = Problem(np.repeat(problem.x[:, :1], 3, axis=1), problem.y, problem.rho)
-    assert _by_svd(same)[1:].tolist() == [0.0, 0.0]
-
-
 # Run -------------------------------------------------------------------------------------------------------
+
+
+TABLE = {"one": "nowhere:one", "other": "nowhere:other"}
+measure = partial(run.measure, table=TABLE, need_no_model=TABLE)
 
 
 def nobody():
@@ -305,9 +276,9 @@ def bare(model, tmp_path, monkeypatch):
     """A sample without a recording; and the names of the rows that were measured, each of one point."""
     calls = []
 
-    def measuring(name):
-        if name not in APPROXIMATIONS:
-            return load_approximation(name)
+    def measuring(name, table):
+        if name not in TABLE:
+            return load_approximation(name, table)
         return lambda sample: calls.append(name) or Row(name, "text", (panel((1e-3, 2)),))
 
     monkeypatch.setattr(run, "load_approximation", measuring)
@@ -316,31 +287,30 @@ def bare(model, tmp_path, monkeypatch):
 
 def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
     made, calls = bare
-    document = run.measure(made, tmp_path, ["contact", "closing"])
-    assert calls == ["contact", "closing"]
-    assert set(calls) < NEED_NOTHING
-    assert list(document["rows"]) == ["contact", "closing"]
+    document = measure(made, tmp_path, ["one", "other"])
+    assert calls == ["one", "other"]
+    assert list(document["rows"]) == ["one", "other"]
     assert json.loads((tmp_path / "frontier.json").read_text()) == document
-    point = document["rows"]["contact"]["panels"][0]["points"][0]
+    point = document["rows"]["one"]["panels"][0]["points"][0]
     assert (point["setting"], point["error"], point["seconds"]) == ("s0", 2, 1e-3)
     assert (point["recommended"], point["pareto"], point["is_default"]) == (True, True, False)
 
 
 def test_a_second_run_measures_nothing_again_unless_what_made_it_changed(bare, tmp_path):
     made, calls = bare
-    first = run.measure(made, tmp_path, ["contact"])
-    assert run.measure(made, tmp_path, ["contact"]) == first
-    assert calls == ["contact"]
-    run.measure(dataclasses.replace(made, scale=dataclasses.replace(TINY, repeats=2)), tmp_path, ["contact"])
-    assert calls == ["contact"] * 2
+    first = measure(made, tmp_path, ["one"])
+    assert measure(made, tmp_path, ["one"]) == first
+    assert calls == ["one"]
+    measure(dataclasses.replace(made, scale=dataclasses.replace(TINY, repeats=2)), tmp_path, ["one"])
+    assert calls == ["one"] * 2
 
 
 def test_a_damaged_part_is_measured_again(bare, tmp_path):
     made, calls = bare
-    run.measure(made, tmp_path, ["contact"])
-    (tmp_path / "parts" / "contact.json").write_text("[")
-    run.measure(made, tmp_path, ["contact"])
-    assert calls == ["contact"] * 2
+    measure(made, tmp_path, ["one"])
+    (tmp_path / "parts" / "one.json").write_text("[")
+    measure(made, tmp_path, ["one"])
+    assert calls == ["one"] * 2
 
 
 def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, monkeypatch):
@@ -351,15 +321,17 @@ def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as stopping:
-        stopping.setattr(run, "load_approximation", lambda name: stop if name == "closing" else measuring(name))
+        stopping.setattr(
+            run, "load_approximation", lambda name, table: stop if name == "other" else measuring(name, table)
+        )
         with pytest.raises(KeyboardInterrupt):
-            run.measure(made, tmp_path, ["contact", "closing"])
-    run.measure(made, tmp_path, ["contact", "closing"])
-    assert calls == ["contact", "closing"]
+            measure(made, tmp_path, ["one", "other"])
+    measure(made, tmp_path, ["one", "other"])
+    assert calls == ["one", "other"]
 
 
 def test_an_unknown_row_is_refused_before_anything_is_measured(bare, tmp_path):
     made, calls = bare
     with pytest.raises(ConfigError):
-        run.measure(made, tmp_path, ["contact", "nothing"])
+        measure(made, tmp_path, ["one", "nothing"])
     assert not calls

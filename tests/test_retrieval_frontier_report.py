@@ -5,16 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.frontier import APPROXIMATIONS as KERNELS
+from retrieval.commands.frontier import _recording as collected
 from retrieval.commands.main import main
-from retrieval.lab import reports as frontier_report
-from retrieval.lab.frontier import APPROXIMATIONS
-from retrieval.lab.frontier.points import Panel, Row, Tradeoff
-from retrieval.lab.frontier.report import figure, write_frontier
-from retrieval.lab.hard_cases import run
-from retrieval.lab.hard_cases.case import HardCase
-
-GOOD = HardCase("top k", "a <NaN>", "is refused", "ranked first", "refused", True, False)
-BAD = HardCase("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
+from retrieval.frontier import APPROXIMATIONS
+from retrieval.frontier.points import Panel, Row, Tradeoff
+from retrieval.frontier.report import figure, write_frontier
 
 
 def document(*panels, skipped=None):
@@ -54,7 +50,8 @@ def test_a_row_that_was_left_out_says_why_and_has_no_plot(tmp_path):
 
 def test_the_page_of_performance_says_how_many_approximations_there_are():
     said = (Path(__file__).parents[1] / "docs" / "performance.md").read_text()
-    assert f"for {len(APPROXIMATIONS)} approximations" in said
+    assert f"for {len(APPROXIMATIONS)} approximations of a search" in " ".join(said.split())
+    assert f"for {len(KERNELS)} approximations of our kernels" in " ".join(said.split())
 
 
 def test_labels_of_points_that_stand_together_stand_above_and_below():
@@ -66,13 +63,13 @@ def test_labels_of_points_that_stand_together_stand_above_and_below():
     assert heights["third"] > 0
 
 
-def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, tmp_path, capsys):
-    command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--quick", "--json"]
-    assert main([*command, "--only", "closing"]) == 0
+def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, recording, tmp_path, capsys):
+    command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording), "--quick"]
+    assert main([*command, "--only", "halves", "--json"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out)["rows"].keys() == {"closing"}
-    assert "closing: closing step (against closed form of a spring)" in said.err
-    assert (tmp_path / "figures" / "closing.png").is_file()
+    assert json.loads(said.out)["rows"].keys() == {"halves"}
+    assert "halves: largest error of a match logit (against halves in float32)" in said.err
+    assert (tmp_path / "figures" / "halves.png").is_file()
     assert (tmp_path / "frontier.html").is_file()
     assert not (tmp_path / "recording").exists()
 
@@ -83,47 +80,8 @@ def test_wrong_names_are_one_line_and_exit_code_2(model, tmp_path, capsys):
 
 
 def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, capsys):
-    first = frontier_report._recording(None, tmp_path, quick=True)
+    first = collected(None, tmp_path, quick=True)
     lines = (first / "metadata.jsonl").read_bytes()
-    assert frontier_report._recording(None, tmp_path, quick=True) == first
+    assert collected(None, tmp_path, quick=True) == first
     assert (first / "metadata.jsonl").read_bytes() == lines
     assert "of 6 simulated objects" in capsys.readouterr().err
-
-
-# Stability -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def few_cases(monkeypatch):
-    """Packages that have no hard case but what a test gives the robot."""
-
-    def give(*cases):
-        monkeypatch.setattr(run, "hard_cases", lambda package: cases if package == "robot" else ())
-
-    return give
-
-
-def test_hard_cases_that_hold_are_shown_and_the_exit_code_is_0(few_cases, tmp_path, capsys):
-    few_cases(GOOD)
-    assert main(["frontier", "--stability", "--out", str(tmp_path)]) == 0
-    assert "holds  top k, a <NaN>: must hold: is refused; naive ranked first; ours refused" in capsys.readouterr().err
-    page = (tmp_path / "stability.html").read_text()
-    assert "a &lt;NaN&gt;" in page
-    assert "What must hold does" in page
-    assert json.loads((tmp_path / "stability.json").read_text())["failed"] == 0
-
-
-def test_a_hard_case_that_does_not_hold_is_exit_code_1(few_cases, tmp_path, capsys):
-    few_cases(GOOD, BAD)
-    assert main(["frontier", "--stability", "--out", str(tmp_path), "--json"]) == 1
-    said = capsys.readouterr()
-    assert json.loads(said.out)["failed"] == 1
-    assert said.err.splitlines()[-1] == "retrieve frontier: 1 of 2 hard cases do not hold; see the page"
-    assert "DOES NOT HOLD" in (tmp_path / "stability.html").read_text()
-
-
-def test_cases_name_the_package_that_they_are_of(monkeypatch):
-    monkeypatch.setattr(run, "hard_cases", lambda package: {"robot": [BAD], "indexes": [GOOD]}.get(package, []))
-    made = run.run_hard_cases(quiet=True)
-    assert [case["package"] for case in made["cases"]] == ["indexes", "robot"]
-    assert made["failed"] == 1

@@ -1,6 +1,6 @@
 """A cluster in an object store: built, torn, killed and fetched, it is the cluster in a folder.
 
-The store is fsspec's in this process; `tests.faults` and one slow test ask a server that speaks S3 (moto).
+The store is fsspec's in this process; `benchmarks.faults` and one slow test ask a server that speaks S3 (moto).
 """
 
 import dataclasses

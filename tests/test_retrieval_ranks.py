@@ -52,7 +52,7 @@ def settings(tmp_path):
     ("program", "instead"),
     [
         ("retrieval", {"freeze_towers": "true", "validate_every": 20}),
-        ("tests.in_double", {"iterations": 40, "validate_every": 40}),
+        ("benchmarks.models.in_double", {"iterations": 40, "validate_every": 40}),
     ],
 )
 def test_two_ranks_reach_the_figures_of_one_process(program, instead, recording, settings, tmp_path):

@@ -8,11 +8,11 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import pytest
 
+from benchmarks.models.next_grasp import another_grasp
 from retrieval.search.searcher import Searcher
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.browser import address, ask, chromium, gel_files, page, serious
-from tests.next_grasp import another_grasp
 
 pytestmark = pytest.mark.slow
 MANY = 100_000

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from robot.drivers.sawyer import rosbridge
 from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
-from robot.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
 from robot.errors import DeviceError
+from tests.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
 from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
 
 
@@ -339,7 +339,7 @@ def test_faults_are_drawn_from_a_seed_and_counted():
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
-    command = [sys.executable, "-m", "robot.emulators.sawyer.server", "--port", "0", "--faults", "1"]
+    command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0", "--faults", "1"]
     with running([*by, *command]) as process:
         url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
         link = RosbridgeLink(url, timeout_s=60.0)

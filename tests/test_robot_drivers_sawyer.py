@@ -21,10 +21,10 @@ from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.sawyer.messages import JOINTS, Mount
 from robot.drivers.sawyer.rosbridge import Arrival
 from robot.drivers.sawyer.straight_line import Schedule, way_points
-from robot.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
-from robot.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Pose, Region
+from tests.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
+from tests.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
 from tests.waiting import running, until
 
 WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.errors import DeviceError, RobotConfigError
+from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, bench
 
 

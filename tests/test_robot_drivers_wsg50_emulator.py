@@ -5,10 +5,10 @@ import struct
 import pytest
 
 from robot.drivers.wsg50.codec import Packet, decode, encode
-from robot.emulators.wsg50.faults import LineFaults
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.mechanics import Mechanics
 from robot.errors import RobotConfigError
+from tests.emulators.wsg50.faults import LineFaults
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.mechanics import Mechanics
 from tests.wsg50_packets import bytes_of
 
 MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x21, 0x22, 0x23, 0x24, 0x25, 0x26

@@ -7,9 +7,9 @@ import pytest
 
 from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.link import LinkLost
-from robot.emulators.wsg50.faults import LineFaults, Piece
-from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.errors import DeviceError
+from tests.emulators.wsg50.faults import LineFaults, Piece
+from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.waiting import until
 from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench
 

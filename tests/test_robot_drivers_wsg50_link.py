@@ -441,6 +441,6 @@ def test_without_pyserial_it_says_what_to_install(monkeypatch):
 
 def test_no_module_of_the_driver_needs_pyserial_to_be_imported():
     blocked = (
-        "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, robot.emulators.wsg50.server"
+        "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, tests.emulators.wsg50.server"
     )
     subprocess.run([sys.executable, "-c", blocked], check=True, timeout=60)

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from robot.drivers.wsg50.codec import Packet, encode
-from robot.emulators.wsg50 import gripper as wsg50_emulated
-from robot.emulators.wsg50.faults import LineFaults
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.server import main, serve_pty, serve_tcp
+from tests.emulators.wsg50 import gripper as wsg50_emulated
+from tests.emulators.wsg50.faults import LineFaults
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.server import main, serve_pty, serve_tcp
 from tests.waiting import STARTED, STARTED_IDS, first_line, running
 from tests.wsg50_packets import bytes_of
 
@@ -152,7 +152,7 @@ def test_a_line_that_is_cut_can_be_taken_up_again():
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 @pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
 def test_it_runs_as_a_program_and_says_where(port, end, by):
-    program = [sys.executable, "-m", "robot.emulators.wsg50.server", *port, "--object-mm", "40"]
+    program = [sys.executable, "-m", "tests.emulators.wsg50.server", *port, "--object-mm", "40"]
     with running([*by, *program]) as process:
         line = first_line(process)
         assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())

@@ -13,9 +13,9 @@ import pytest
 from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.commands import Status
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50 import gripper as wsg50_emulated
-from robot.emulators.wsg50.gripper import EmulatedWSG50
 from robot.errors import DeviceError
+from tests.emulators.wsg50 import gripper as wsg50_emulated
+from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.waiting import until
 from tests.wsg50_bench import ACK, FAST_STOP, GRASP, HOME, PORTS, QUICK, STOP, TARE, Script, bench
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from benchmarks.reference import DATA_SETS, data_sets
 from retrieval.commands.main import main
 from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Split, load_grasps
@@ -18,7 +19,6 @@ from robot.recording.folder import RecordingWriter, Shared, read_recording
 from robot.storage import object_of
 from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
-from tests.reference import DATA_SETS, data_sets
 
 PICTURES = {".png", ".jpg"}
 SAID_BY_THE_SOURCE = ("folder", "lerobot", "open-x-tactile")
@@ -184,7 +184,7 @@ def test_every_miniature_has_its_importer():
 
 
 def test_the_page_of_data_sets_is_that_of_the_importers():
-    assert text_of(DATA_SETS) == data_sets(), "run `python -m tests.reference`"
+    assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
 
 
 def test_an_unknown_name_lists_the_known_ones(capsys):

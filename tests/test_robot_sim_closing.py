@@ -5,7 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from retrieval.lab.contact.closing_jaws import (
+from robot.errors import RobotConfigError, SceneError
+from robot.readings import Pose
+from robot.sim.contact.layer import Layer, press
+from robot.sim.rig import SimRig
+from tests.robot.sim.closing_jaws import (
     ForceLaw,
     Jaws,
     LinearLaw,
@@ -15,12 +19,16 @@ from retrieval.lab.contact.closing_jaws import (
     pressed_law,
     settle,
 )
-from retrieval.lab.frontier.contact import spring_closing
-from retrieval.lab.hard_cases.contact import naive_close
-from robot.errors import RobotConfigError, SceneError
-from robot.readings import Pose
-from robot.sim.contact.layer import Layer, press
-from robot.sim.rig import SimRig
+from tests.robot.sim.hard_contact import naive_close
+
+
+def spring_closing(jaws, stiffness_n_mm, times_s):
+    """Travel in mm of a jaw that starts at rest on a spring: m s'' + c s' + k s = F, underdamped."""
+    mass = jaws.jaw_mass_kg / 1e3
+    decay = jaws.jaw_damping_n_s_mm / (2.0 * mass)
+    turn = math.sqrt(stiffness_n_mm / mass - decay**2)
+    swing = np.exp(-decay * times_s) * (np.cos(turn * times_s) + decay / turn * np.sin(turn * times_s))
+    return jaws.force_n / stiffness_n_mm * (1.0 - swing)
 
 
 def on_springs(stiffness_n_mm, force_n=20.0, clearance=(0.0, 0.0), **jaws):
@@ -38,6 +46,11 @@ def test_jaws_on_a_spring_move_as_the_damped_oscillator_does():
     assert states[:, 0] == pytest.approx(exact, abs=4e-4 * 0.2)
     assert states[:, 1] == pytest.approx(states[:, 0])
     assert states[:, 2] == pytest.approx(0.0)
+
+
+def test_a_spring_s_closed_form_starts_at_rest_and_ends_at_f_over_k():
+    travel = spring_closing(Jaws(20.0), 100.0, np.array([0.0, 1e-6, 10.0]))
+    assert travel == pytest.approx([0.0, 0.5 * 20.0 / 0.3e-3 * 1e-12, 0.2], rel=1e-3, abs=1e-16)
 
 
 def test_the_error_falls_with_the_square_of_the_step():

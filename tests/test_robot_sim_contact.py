@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from retrieval.lab.contact.closed_forms import closed_form_table
+from benchmarks.frontier.closed_forms import closed_form_table
 from robot.errors import RobotConfigError, SceneError
 from robot.sim.contact import kernels
 from robot.sim.contact import scaled_problem as pressing

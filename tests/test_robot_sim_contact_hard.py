@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.lab.hard_cases.contact import hard_cases, hard_gaps, hard_layers, is_finite, naive_solve
 from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, nearest_of_sum
 from robot.sim.contact.kernels import Operator, influence, periodic_influence
 from robot.sim.contact.layer import SINGLE_FROM, Layer, press
+from tests.robot.sim.hard_contact import hard_cases, hard_gaps, hard_layers, is_finite, naive_solve
 
 
 @pytest.fixture(scope="module")

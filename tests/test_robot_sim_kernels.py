@@ -7,7 +7,6 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j0
 
-from retrieval.lab.hard_cases.contact import naive_patch, naive_symbol
 from robot.sim.contact.kernels import (
     REACH,
     THIN_PIXELS,
@@ -19,6 +18,7 @@ from robot.sim.contact.kernels import (
     love_patch,
     periodic_influence,
 )
+from tests.robot.sim.hard_contact import naive_patch, naive_symbol
 
 POISSON = (-0.9, 0.0, 0.3, 0.48, 0.5)
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from retrieval.lab.frontier.light import shaded
+from benchmarks.frontier.light import shaded
 from robot.sim.camera import PinholeCamera, Placement, hidden_sky, look
 from robot.sim.light import GAMMA, Lamps, Surfaces, developed, radiance
 from robot.sim.objects.draw import draw_object

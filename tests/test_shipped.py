@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from benchmarks.models import shipped
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search import defaults
-from tests import shipped
 
 
 @pytest.mark.slow
