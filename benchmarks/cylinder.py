@@ -12,7 +12,7 @@ from benchmarks.common import Line
 from robot.errors import PlanError
 from robot.sight.cylinder import fit_cylinder
 from tests import views
-from tests.test_robot_cylinder import naive_fit
+from tests.robot.sight.test_cylinder import naive_fit
 from tests.views import Ball, Block, Lying, Upright
 
 X, Y = 12.0, -7.0

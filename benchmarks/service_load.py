@@ -43,8 +43,8 @@ from robot.recording.folder import RecordingWriter
 from robot.sim.rig import SimRig
 from tests import synthetic
 from tests.conftest import TINY
+from tests.retrieval.serve.test_uploads import HEAD, png
 from tests.serving import command, listening
-from tests.test_retrieval_serve_uploads import HEAD, png
 
 SEED = 20_000
 QUEUE = 8

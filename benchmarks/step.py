@@ -5,8 +5,8 @@
     batch       48 pairs in one batch, each touch 8 times in it
     one         pair by pair: forward, backward, and one step of the optimiser on the sum
 
-The first three rows' gradients of the same pairs are equal (tests/test_retrieval_batches.py); pair by pair they are too
-where batch normalisation keeps to the running statistics, for in training it sees a batch of one.
+The first three rows' gradients of the same pairs are equal (tests/retrieval/training/test_batches.py); pair by
+pair they are too where batch normalisation keeps to the running statistics, for in training it sees a batch of one.
 """
 
 from collections.abc import Callable, Iterator
