@@ -205,27 +205,6 @@ def test_an_index_needs_a_vector(kind):
         kind.build(np.empty((0, 4), np.float32))
 
 
-def test_naive_argsort_puts_nan_first_where_ours_refuses_it():
-    scores = np.array([0.2, np.nan, 0.9])
-    assert np.argsort(scores)[::-1].tolist() == [1, 2, 0]
-    vectors = unit(3)
-    vectors[1, 0] = np.nan
-    with pytest.raises(VectorError, match=r"row '1': .*NaN"):
-        ExactIndex.build(vectors)
-    with pytest.raises(VectorError, match=r"query '1': .*NaN"):
-        ExactIndex.build(unit(3)).search(vectors, 1)
-
-
-def test_naive_faiss_takes_nan_and_never_finds_it_again():
-    import faiss
-
-    vectors = unit(3)
-    vectors[1, 0] = np.nan
-    naive = faiss.IndexFlatIP(DIM)
-    naive.add(vectors)
-    assert 1 not in naive.search(unit(1), 3)[1]
-
-
 def test_ties_come_in_the_order_of_slots_also_at_the_last_rank(exact_kind):
     # Slots 10..49 hold the same vector, so 40 partners tie for places 1 to 6.
     vectors = unit(300, seed=7)
@@ -241,15 +220,6 @@ def test_ties_of_different_vectors_come_in_the_order_of_slots(exact_kind):
     scores, slots = exact_kind.build(axes).search(np.eye(DIM, dtype=np.float32)[:1], 4)
     assert slots[0].tolist() == [15, 0, 1, 2]
     assert scores[0].tolist() == [1.0, 0.0, 0.0, 0.0]
-
-
-def test_naive_faiss_gives_ties_in_another_order():
-    import faiss
-
-    vectors = np.repeat(unit(1), 50, axis=0)
-    naive = faiss.IndexFlatIP(DIM)
-    naive.add(vectors)
-    assert naive.search(vectors[:1], 6)[1][0].tolist() != [0, 1, 2, 3, 4, 5]
 
 
 def test_vectors_closer_than_rounding_are_still_ranked_truly(exact_kind):

@@ -18,7 +18,7 @@ from robot.sim.contact.kernels import (
     love_patch,
     periodic_influence,
 )
-from tests.robot.sim.hard_contact import naive_patch, naive_symbol
+from tests.robot.sim.hard_contact import naive_symbol
 
 POISSON = (-0.9, 0.0, 0.3, 0.48, 0.5)
 
@@ -69,14 +69,6 @@ def test_the_layer_formula_is_the_printed_one_where_that_can_be_computed(poisson
     assert layer_symbol(x, poisson) == pytest.approx(naive_symbol(x, poisson), rel=1e-11)
 
 
-@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
-def test_the_printed_layer_formula_overflows_and_cancels_where_ours_does_not():
-    assert math.isnan(naive_symbol(np.array([400.0]), 0.48)[0])
-    assert layer_symbol(np.array([400.0]), 0.48)[0] == 1.0
-    assert naive_symbol(np.array([1e-8]), 0.5)[0] == 0.0
-    assert layer_symbol(np.array([1e-8]), 0.5)[0] == pytest.approx(2.0 / 3.0 * 1e-24, rel=1e-12)
-
-
 @pytest.mark.parametrize("poisson", POISSON)
 @pytest.mark.parametrize("rho", [0.0, 0.37, 2.0, 7.77])
 def test_the_correction_is_the_transform_that_it_claims_to_be(poisson, rho):
@@ -105,12 +97,6 @@ def test_love_s_patch_is_the_sum_of_point_forces_over_the_pixel(row, col):
 def test_the_loaded_pixel_itself_sinks_by_the_known_amount():
     # Centre of a uniformly loaded square of side 1: 4 ln(1 + sqrt 2) / pi / E*.
     assert love_patch((1, 1))[0, 0] == pytest.approx(4.0 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-14)
-
-
-def test_love_s_formula_on_the_negative_side_loses_what_a_quadrant_keeps():
-    exact = 1.0 / (math.pi * 10_000)
-    assert abs(naive_patch(0.0, -10_000) / exact - 1.0) > 1e-4
-    assert love_patch((10_001, 1))[-1, 0] == pytest.approx(exact, rel=1e-8)
 
 
 # Influence tables ------------------------------------------------------------------------------------------
