@@ -11,6 +11,7 @@ Each runs in a checkout of the repository:
     python -m benchmarks.optics.photometric    fits the simulated gels' optics to real presses
     python -m benchmarks.models.shipped        makes, scores and trains again the checkpoint of the package
     python -m benchmarks.models.verdicts       how good its "match", "none of these", ... are
+    python -m benchmarks.models.answers        verdict, ranking and P(object | present) of answers, and of advice
     python -m benchmarks.models.next_grasp     information of another grasp, compared with what the page expects
     python -m benchmarks.models.scaling        accuracy by the number of objects and grasps to train on
     python -m benchmarks.models.in_double      a command in float64

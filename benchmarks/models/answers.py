@@ -1,6 +1,6 @@
 """Measure answers from a catalogue of 30 simulated objects: verdict, ranking, P(object | present), advice.
 
-    python -m tests.answers RECORDING [RECORDING ...] [--photos 3] [--references 0] [--touches 5]
+    python -m benchmarks.models.answers RECORDING [RECORDING ...] [--photos 3] [--references 0] [--touches 5]
 
 The photos of each object's first grasps are the catalogue, its next touches reference touches, its last touches the
 queries, in as many orders. Each query is asked of 30 objects with the true one, and of 30 others, with the shipped
@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.models.verdicts import interval, redrawn
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.answer import is_clear
@@ -26,7 +27,6 @@ from retrieval.search.build import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import Felt
-from tests.verdicts import interval, redrawn
 
 OBJECTS = 30
 BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)

@@ -24,9 +24,9 @@ from retrieval.serve.service import Grasped, LiveRig
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import Asked, Options
 from robot.recording.folder import RecordingWriter
+from tests.retrieval.serve.test_connections import opened
+from tests.retrieval.serve.test_history import INFO
 from tests.serving import listening, problem, service
-from tests.test_retrieval_serve_connections import opened
-from tests.test_retrieval_serve_history import INFO
 from tests.waiting import until
 
 
