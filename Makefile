@@ -28,11 +28,11 @@ test-lowest:
 	.venv-lowest/bin/$(PYTEST)
 
 benchmark: $(VENV)/installed
-	$(BIN)/python -m tests.benchmarks
+	$(BIN)/python -m benchmarks
 
 # Opens from the disk; its search wants a server: `python3 -m http.server -d site`.
 docs: $(VENV)/installed
-	$(BIN)/python -m tests.reference
+	$(BIN)/python -m benchmarks.reference
 	$(BIN)/zensical build --clean --strict
 
 clean:

@@ -3,7 +3,7 @@
 Public names are imported when they are used, so `import retrieval` costs nothing. The layers run one way:
 
     errors, version, console, metrics -> data -> model -> training, search -> cluster -> methods -> evaluation -> report
-    -> adaptation, lab, serve -> commands
+    -> adaptation, frontier, serve -> commands
 
 >>> import retrieval
 >>> with retrieval.open("index") as searcher:

@@ -27,16 +27,16 @@ from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.video import opencv_stream
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.sawyer import server as rosbridge_emulator
-from robot.emulators.wsg50.faults import LineFaults
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD, Intrinsics, Pose, Region
 from robot.recording.folder import read_recording
 from robot.rig import Rig
 from tests import views
+from tests.emulators.sawyer import server as rosbridge_emulator
+from tests.emulators.wsg50.faults import LineFaults
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.server import serve_pty, serve_tcp
 from tests.fake_video import FakeCamera
 
 WORKSPACE = Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))

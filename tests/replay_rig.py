@@ -12,12 +12,12 @@ from unittest.mock import patch
 import numpy as np
 
 from robot.collect import CollectSettings, collect
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.server import serve_tcp
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye
 from tests import views
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.server import serve_tcp
 from tests.fake_rig import LENS, FakeRig
 
 FILE = """

@@ -8,10 +8,10 @@ from serial.urlhandler import protocol_socket
 
 from robot.drivers.wsg50.codec import Packet, encode
 from robot.drivers.wsg50.driver import WSG50
-from robot.emulators.wsg50.faults import LineFaults, Piece
-from robot.emulators.wsg50.gripper import EmulatedWSG50
-from robot.emulators.wsg50.server import serve_pty, serve_tcp
 from robot.errors import DeviceError
+from tests.emulators.wsg50.faults import LineFaults, Piece
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.server import serve_pty, serve_tcp
 
 SERVE = {"tcp": serve_tcp, "pty": serve_pty}
 QUICK = {"timeout_s": 0.3, "reconnect_s": 0.01, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}

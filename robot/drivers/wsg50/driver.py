@@ -1,7 +1,7 @@
 """The WSG-50 parallel gripper (Weiss Robotics, SCHUNK) as a Gripper of the contract.
 
 Beside this file: bytes (codec), what they mean (commands), the line, serial or TCP (link), how a motion is watched
-(motion), settings and what a force is (setup). Tried against robot.emulators.wsg50, not yet on a gripper.
+(motion), settings and what a force is (setup). Tried against an emulator, not yet on a gripper.
 
 Before use set in the gripper's web page: binary command interface; "part width tolerance" and "clamping travel" at
 their greatest, since the width of what is grasped is not known beforehand (a note in the Robotics Library's driver);

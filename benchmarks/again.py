@@ -1,0 +1,192 @@
+"""Building again: CPU time of one thread, for one new photo among many, and where the time goes.
+
+    python -m benchmarks.again --photos 100000
+
+The photos are small files, three in the folder of an object; the codes of the first generation are drawn, not encoded,
+so that a large catalogue is there in a minute. Large files would take longer to read, which is what is left out.
+
+Every build is a process of its own, whose time is told in three parts: what every command takes until the model is
+loaded; decoding and encoding the new photo, which is done once before the build too, as the first time takes longer;
+and the rest, which is said first. Beside it stands what listing the folders and asking how the files look takes without
+a line of ours.
+"""
+
+import argparse
+import hashlib
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from benchmarks.common import Line
+from indexes import load_kind
+from indexes.store.folder import IndexStore
+from indexes.store.tables import Block
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import encode_photos
+from retrieval.model.stored import fingerprint
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.search.operating import Asked
+
+PHOTOS, ROUNDS = 10_000, 3
+OLD_S = 3600
+
+
+def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[Line]:
+    """One line: the first build over an index that noted no looks, then in turns builds of nothing and of one photo
+    new, and one that reads all."""
+    checkpoint = load_checkpoint(shipped_model())
+    with tempfile.TemporaryDirectory() as name:
+        catalogue, index = Path(name) / "catalog", Path(name) / "index"
+        picture = write_catalogue(catalogue, photos)
+        write_index(catalogue, index, checkpoint)
+        told: dict[str, list[float]] = defaultdict(list)
+        told["unnoted"].append(_build(catalogue, index, 0)["rest"])
+        for number in range(rounds):
+            told["looking"].append(_cpu_s(lambda: _look(catalogue)))
+            told["nothing"].append(_build(catalogue, index, 0)["rest"])
+            told["verify"].append(_build(catalogue, index, 0, verify=True)["rest"])
+            _write(catalogue / "new" / f"{number}.jpg", picture + b"new %d" % number)
+            one = _build(catalogue, index, 1)
+            told["one"].append(one["rest"])
+            for part in ("started", "first_encoding", "encoding"):
+                told[part].append(one[part])
+    median = {arm: float(np.median(seconds)) for arm, seconds in told.items()}
+    shown = ", ".join(
+        f"{what} {median[arm]:.2f} s ({min(told[arm]):.2f} to {max(told[arm]):.2f})"
+        for arm, what in (
+            ("one", "one new photo"),
+            ("nothing", "nothing new"),
+            ("verify", "all read again"),
+            ("unnoted", "an index that noted no looks"),
+            ("looking", "`os.walk` and `os.stat` alone"),
+        )
+    )
+    text = (
+        f"{photos} photos, CPU time of one thread: {shown}; besides, decoding and encoding the new photo "
+        f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s once it has been done), and what every command "
+        f"takes, Python, its imports and the model, {median['started']:.2f} s"
+    )
+    yield Line("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(told))
+
+
+def build(catalogue: Path, index: Path, new: int, verify: bool) -> dict[str, float]:
+    """Build again, `new` photos of the folder "new" among the others; CPU seconds of the parts of this process."""
+    torch.set_num_threads(1)
+    checkpoint = load_checkpoint(shipped_model())
+    load_kind("flat")  # imports FAISS
+    parts = {"started": time.process_time(), "first_encoding": 0.0, "encoding": 0.0}
+    if new:
+        path = max((catalogue / "new").iterdir())
+
+        def encode() -> None:
+            encode_photos(checkpoint.matcher, [checkpoint.config.preprocessing.load_photo(path)])
+
+        def on_a_thread() -> None:  # as the build does
+            with ThreadPoolExecutor(1) as pool:
+                pool.submit(encode).result()
+
+        parts |= {"first_encoding": _cpu_s(encode), "encoding": _cpu_s(on_a_thread)}
+    start = time.process_time()
+    report = build_index(catalogue, checkpoint, index, verify=verify, quiet=True)
+    assert report.embedded == new, report
+    return parts | {"rest": time.process_time() - start - parts["encoding"]}
+
+
+def _build(catalogue: Path, index: Path, new: int, verify: bool = False) -> dict[str, float]:
+    """`build` in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.again", "--build", str(catalogue), str(index), str(new)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command + ["--verify"] * verify, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    parts: dict[str, float] = json.loads(done.stdout)
+    return parts
+
+
+def _look(folder: Path) -> None:
+    for path, _, names in os.walk(folder):
+        for name in names:
+            os.stat(f"{path}/{name}")
+
+
+def write_catalogue(folder: Path, photos: int) -> bytes:
+    """Files of one picture, each with bytes of its own at the end, three an object; an hour old. Gives the picture."""
+    held = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(256, size=(32, 32, 3), dtype=np.uint8)).save(held, "JPEG")
+    for number in range(photos):
+        _write(folder / f"object-{number // 3:06d}" / f"{number % 3}.jpg", held.getvalue() + b"%d" % number)
+    return held.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    os.utime(path, (time.time() - OLD_S,) * 2)
+
+
+def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
+    """The index over the catalogue, as `build_index` would have written it but for the codes."""
+    rng, matcher, paths = np.random.default_rng(0), checkpoint.config.matcher, sorted(catalogue.rglob("*.jpg"))
+    embeddings = rng.normal(size=(len(paths), matcher.embedding_dim)).astype(np.float32)
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    rows = []
+    for path in paths:
+        name = path.relative_to(catalogue).as_posix()
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        rows.append({"id": name, "object_id": path.parent.name, "path": name, "digest": digest, "metadata": {}})
+    halves, asked = rng.normal(size=(len(paths), matcher.half)).astype(np.float16), asdict(Asked())
+    measured = {"k": 100, "winner_recall": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
+    measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "asked": asked, "changed": 0}
+    IndexStore(out).write_blocks(
+        [Block(rows, embeddings, {"halves": halves})],
+        {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
+        fingerprint=fingerprint(checkpoint),
+        about={
+            "checkpoint": str(checkpoint.path.resolve()),
+            "catalogue": str(catalogue.resolve()),
+            "objects_from": "folder",
+            "asked": asked,
+            "half_error": 1e-3,
+            "reason": "Drawn codes.",
+            "candidates": measured | {"photos": len(rows)},
+        },
+    )
+
+
+def _cpu_s(work: Callable[[], object]) -> float:
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def main() -> None:
+    """Print the line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.again", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--photos", type=float, default=PHOTOS)
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--build", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--verify", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.build:
+        catalogue, index, new = arguments.build
+        print(json.dumps(build(Path(catalogue), Path(index), int(new), arguments.verify)))
+        return
+    for line in measure(int(arguments.photos), arguments.rounds):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()

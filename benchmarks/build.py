@@ -1,0 +1,128 @@
+"""Building an index from JPEG files end to end, against encoding images that are ready, and against building again.
+
+Bare is what the build itself uses: `encode_photos`, batch by batch, with PyTorch's own team of threads. What is left
+of 1 is reading, decoding and resizing, where the tower is large; where it is small these are most of the work, and no
+order of doing them hides them.
+"""
+
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+from benchmarks.common import Line, Times, as_text, duration, in_turns, matcher_of
+from retrieval.data.images import read_bytes
+from retrieval.data.photo_resize import resize_photo
+from retrieval.data.resize import RgbImage
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.model.config import Config
+from retrieval.model.encode import batches, encode_photos, one_thread
+from retrieval.model.photo_encoder import fastest
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.search.embed import BATCH, MANY, ahead
+from tests import synthetic
+
+PHOTOS = {"small": 256}
+DRAWN = 16
+
+
+def measure(config: Config, photos: int | None = None, photo_px: int = 512, repetitions: int = 3) -> Iterator[Line]:
+    """One line. Files: `photos` JPEG of `photo_px` x `photo_px` pixels, of `DRAWN` different pictures."""
+    number = photos or PHOTOS.get(config.matcher.tower, 64)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        provenance = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
+        model, matcher = folder / "random.safetensors", matcher_of(config)
+        save_checkpoint(model, matcher, config, split=None, provenance=provenance)
+        checkpoint = load_checkpoint(model)
+        images, build = _ready(folder, checkpoint, number, photo_px)
+
+        def bare() -> None:
+            encode_photos(checkpoint.matcher, images, BATCH)
+
+        build("index")
+        arms = {"build": build, "bare": bare, "again": lambda: build("index")}
+        times = in_turns(arms, repetitions)
+    ours, other, ratio = number / times.median("build"), number / times.median("bare"), times.ratio("bare", "build")
+    again = times.ratio("build", "again")
+    yield Line(
+        "build",
+        config.matcher.tower,
+        f"{ours:.3g} photos per second end to end ({number} JPEG files of {photo_px} px), {other:.3g} through the bare "
+        f"tower: {as_text(ratio)} its rate; building again with nothing changed is faster {as_text(again)}",
+        {"photos": number, "build_per_s": ours, "bare_per_s": other, "ratio": ratio[0], "ratio_again": again[0]},
+        times.seconds,
+    )
+
+
+def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3) -> Iterator[Line]:
+    """One line for the shipped model, with photos enough that a build looks for a faster encoder, which is told apart.
+
+    Bare is that encoder alone, on as many threads, of images that lie ready; work is decoding, cutting out and
+    encoding, without an index.
+    """
+    checkpoint = load_checkpoint(shipped_model())
+    photo_of = checkpoint.config.preprocessing.photo_of
+
+    def see(path: Path) -> RgbImage:
+        return photo_of(read_bytes(path), path, resize_photo)
+
+    with tempfile.TemporaryDirectory() as name:
+        images, build = _ready(Path(name), checkpoint, photos, photo_px)
+        paths = sorted((Path(name) / "catalog").rglob("*.jpg"))
+        encode, threads = fastest(checkpoint), torch.get_num_threads()
+
+        def on_threads(work: Callable[[Any], object], items: Iterable[Any]) -> None:
+            with one_thread():
+                deque(ahead(work, batches(items, BATCH), threads, 2 * threads), maxlen=0)
+
+        arms = {
+            "build": build,
+            "bare": lambda: on_threads(encode, images),
+            "work": lambda: on_threads(lambda some: encode([see(path) for path in some]), paths),
+            "looking": lambda: fastest(checkpoint),
+        }
+        taken = in_turns(arms, repetitions).seconds
+    if photos < MANY:
+        taken["looking"] = [0.0] * repetitions
+    beyond = [whole - looked for whole, looked in zip(taken["build"], taken["looking"], strict=True)]
+    times = Times({**taken, "beyond": beyond})
+    rate = {arm: photos / times.median(arm) for arm in ("beyond", "bare", "work", "build")}
+    ratio, share = times.ratio("bare", "beyond"), times.ratio("work", "beyond")
+    yield Line(
+        "build",
+        "shipped",
+        f"{rate['beyond']:.3g} photos per second end to end ({photos} JPEG files of {photo_px} px) beyond looking for "
+        f"a faster encoder, which takes {duration(times.median('looking'))}; {rate['bare']:.3g} through it alone: "
+        f"{as_text(ratio)} its rate; {rate['work']:.3g} decoded and encoded alone: {as_text(share)}",
+        {"photos": photos, "ratio": ratio[0], "ratio_work": share[0]}
+        | {f"{arm}_per_s": one for arm, one in rate.items()},
+        times.seconds,
+    )
+
+
+def _ready(
+    folder: Path, checkpoint: Checkpoint, photos: int, photo_px: int
+) -> tuple[list[RgbImage], Callable[..., None]]:
+    """What the towers see of a drawn catalogue, and what builds an index of it, each time another one unless named."""
+    catalogue, fresh = _write_catalogue(folder / "catalog", photos, photo_px), count()
+
+    def build(out: str | None = None) -> None:
+        build_index(catalogue, checkpoint, folder / (out or f"index{next(fresh)}"), quiet=True)
+
+    return [checkpoint.config.preprocessing.load_photo(path) for path in sorted(catalogue.rglob("*.jpg"))], build
+
+
+def _write_catalogue(folder: Path, photos: int, px: int) -> Path:
+    drawn = [synthetic.draw_photo(synthetic.make_object(seed), 0, px) for seed in range(min(DRAWN, photos))]
+    for number in range(photos):
+        path = folder / f"object{number % 16:02}" / f"{number}.jpg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), drawn[number % len(drawn)][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    return folder

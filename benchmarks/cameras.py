@@ -1,0 +1,142 @@
+"""What reading cameras costs: pictures a second, their age when read, the skew of two fingers, and one picture's work.
+
+The cameras are stand-ins that keep a camera's pace; everything between them and the reader is what runs on a rig.
+"""
+
+import math
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+
+from benchmarks.common import Line, duration
+from robot.devices import TactileSensor, read_together
+from robot.drivers.gels.opencv import OpencvTactile
+from robot.drivers.replay import VideoSensor
+from robot.drivers.video.rectify import Rectifier, in_rgb
+from tests.fake_video import FakeCamera
+
+SIZE = (640, 480)
+APART_S = 0.010
+QUICK: dict[str, Any] = {"warmup_s": 0.2, "timeout_s": 10.0}
+
+
+def measure(seconds: float = 3.0) -> Iterator[Line]:
+    """A line for each rate, for each way to match two fingers, for a film, and for the work on one picture."""
+    for fps in (30.0, 60.0):
+        yield _rate(fps, seconds)
+    yield _skew("newest of each", 1, seconds)
+    yield _skew("nearest in time", 4, seconds)
+    yield _film()
+    yield from _work()
+
+
+class _Rig(ExitStack):
+    """Sensors over stand-in cameras, closed at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cameras: dict[str, FakeCamera] = {}
+        self._folder = Path(self.enter_context(tempfile.TemporaryDirectory())).resolve()
+        self.enter_context(mock.patch("cv2.VideoCapture", lambda path, backend: self._cameras[path].open(path)))
+
+    def gel(self, finger: str, camera: FakeCamera, keep: int = 4) -> OpencvTactile:
+        """A connected sensor of that camera."""
+        path = self._folder / f"usb-{finger}"
+        path.touch()
+        self._cameras[str(path)] = camera
+        return self.enter_context(OpencvTactile(finger=finger, device=str(path), keep=keep, **QUICK))
+
+
+def _rate(fps: float, seconds: float) -> Line:
+    """Pictures a second that arrive, and how old the newest is at random moments."""
+    rng = np.random.default_rng(0)
+    ages: list[float] = []
+    with _Rig() as rig:
+        gel = rig.gel("a", FakeCamera(fps=fps, size=SIZE, stamps=True))
+        start, before = time.monotonic(), gel.frames_seen
+        while time.monotonic() - start < seconds:
+            time.sleep(rng.uniform(0.0, 2 / fps))
+            ages.append(time.monotonic() - gel.read().time_s)
+        rate = (gel.frames_seen - before) / (time.monotonic() - start)
+    median, late = float(np.median(ages)), float(np.quantile(ages, 0.99))
+    text = f"{rate:.1f} of {fps:g} pictures a second; read at an age of {duration(median)}, .99: {duration(late)}"
+    figures = {"per_s": rate, "age_s": median, "age_99_s": late}
+    return Line("cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, figures)
+
+
+def _skew(way: str, keep: int, seconds: float) -> Line:
+    """Two cameras of 30 pictures a second, 10 ms apart, read at random moments."""
+    rng = np.random.default_rng(1)
+    skews: list[float] = []
+    with _Rig() as rig:
+        sensors: dict[str, TactileSensor] = {
+            finger: rig.gel(finger, FakeCamera(fps=30.0, size=SIZE, phase_s=phase, stamps=True), keep)
+            for finger, phase in (("a", 0.0), ("b", APART_S))
+        }
+        start = time.monotonic()
+        while time.monotonic() - start < seconds:
+            time.sleep(rng.uniform(0.0, 0.06))
+            skews.append(read_together(sensors)[1])
+    mean, most = float(np.mean(skews)), float(np.max(skews))
+    text = f"two fingers 10 ms out of step: {duration(mean)} apart in the mean, {duration(most)} at most"
+    return Line("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": most})
+
+
+def _film(pictures: int = 120) -> Line:
+    """A film of 640 x 480 as a sensor, each picture asked for as soon as the last has come."""
+    rng = np.random.default_rng(2)
+    now = [0.0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "film.avi")
+        writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, SIZE)
+        for _ in range(pictures):
+            writer.write(cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), SIZE))
+        writer.release()
+        with VideoSensor(finger="a", path=path, clock=lambda: now[0]) as gel:
+            start = time.perf_counter()
+            for number in range(1, pictures):
+                now[0] = (number + 0.5) / 30.0
+                gel.read()
+            each = (time.perf_counter() - start) / (pictures - 1)
+    return Line("cameras", "film, MJPG 640 x 480", f"{1 / each:.0f} pictures a second decoded", {"per_s": 1 / each})
+
+
+def _work() -> Iterator[Line]:
+    """What is done to one picture when it is read, one thread."""
+    picture = np.random.default_rng(3).integers(0, 255, (960, 1280, 3), np.uint8)
+    corners = ((100.0, 80.0), (1180.0, 95.0), (1170.0, 900.0), (120.0, 890.0))
+    ways = {
+        "crop": Rectifier(crop=(0.15,) * 4),
+        "crop to 640 x 480": Rectifier(crop=(0.15,) * 4, output_px=(640, 480)),
+        "four corners to 640 x 480": Rectifier(corners_px=corners, image_px=(1280, 960), output_px=(640, 480)),
+    }
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        for name, way in ways.items():
+            seconds = _seconds(way, picture)
+            yield Line("cameras", f"1280 x 960, {name}", f"{duration(seconds)} a picture", {"seconds": seconds})
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _seconds(way: Rectifier, picture: np.ndarray) -> float:
+    """Least of ten: the rest is the machine's."""
+    best = math.inf
+    for _ in range(10):
+        start = time.perf_counter()
+        in_rgb(way.apply(picture))
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+if __name__ == "__main__":
+    for line in measure():
+        print(line)

@@ -1,0 +1,122 @@
+"""`retrieve query` from nothing: where the time of a fresh process goes, step by step, by PyTorch and ONNX Runtime."""
+
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from benchmarks.common import Line
+from benchmarks.query import STAGES, gel_images, write_index
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.export import graph_of
+from retrieval.model.onnx_encoder import ENDING, sealed
+from retrieval.search.defaults import shipped_model
+
+PHOTOS = 1000
+REPETITIONS = 5
+
+# What `retrieve query` and `Searcher.open` do, a step at a time, in a process of its own. A step's imports are those
+# that the steps before it have not made.
+PROGRAM = f"""
+import sys, time
+from importlib import import_module
+started, index, model, backend, *touch = sys.argv[1:]
+ms = {{"python": 1e3 * (time.time() - float(started))}}
+def step(name, function):
+    start = time.perf_counter()
+    value = function()
+    ms[name] = 1e3 * (time.perf_counter() - start)
+    return value
+names = ("numpy", "PIL.Image", "retrieval.commands.main", "retrieval.search.searcher", backend, "indexes.kinds.flat")
+for name in names:
+    step("import " + name, lambda: import_module(name))
+from pathlib import Path
+import retrieval.search.searcher as search
+generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
+stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
+encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))
+judge = step("read the head", lambda: search.read_judge(Path(model)))
+shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
+searcher = search.Searcher(Path(index), shard, stored, encoder, judge)
+result = searcher.query([touch])
+assert result.index["encoder"] == ("torch" if backend == "torch" else "onnx")
+for name in {STAGES!r}:
+    ms[name] = result.timing_ms[name]
+step("import retrieval.report.terminal", lambda: import_module("retrieval.report.terminal"))
+step("print", lambda: import_module("retrieval.report.terminal").print_table(result))
+import json
+print(json.dumps(ms | {{"CPU": 1e3 * time.process_time()}}), file=sys.stderr)
+"""
+
+
+def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | None = None) -> Iterator[Line]:
+    """A line for `--help`, and one for each backend that is installed, with the shipped checkpoint."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        models = _models(folder, model or shipped_model())
+        checkpoint = load_checkpoint(models["torch"])
+        write_index(folder / "index", checkpoint, photos)
+        touch = gel_images(folder, checkpoint.config.matcher.fingers)
+        yield _help(repetitions)
+        told: dict[str, list[dict[str, float]]] = {backend: [] for backend in models}
+        for _ in range(repetitions + 1):  # the first fills the disk's cache and is left out
+            for backend, path in models.items():
+                told[backend].append(_steps(folder / "index", path, backend, touch))
+        for backend, runs in told.items():
+            yield _line(backend, checkpoint, runs[1:], photos)
+
+
+def _models(folder: Path, source: Path) -> dict[str, Path]:
+    """Backend -> the same checkpoint, alone or with an export beside it."""
+    backends = ["torch"] + (["onnxruntime"] if find_spec("onnx") and find_spec("onnxruntime") else [])
+    models = {}
+    for backend in backends:
+        (folder / backend).mkdir()
+        models[backend] = Path(shutil.copy(source, folder / backend / "model.safetensors"))
+        if backend != "torch":
+            path = models[backend]
+            path.with_suffix(ENDING).write_bytes(sealed(graph_of(load_checkpoint(path))))
+    return models
+
+
+def _steps(index: Path, model: Path, backend: str, touch: Sequence[Path]) -> dict[str, float]:
+    arguments = [str(item) for item in (time.time(), index, model, backend, *touch)]
+    own = {**os.environ, "XDG_CACHE_HOME": str(model.parent)}  # where no build has left an export
+    command = [sys.executable, "-c", PROGRAM, *arguments]
+    done = subprocess.run(command, env=own, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    steps: dict[str, float] = json.loads(done.stderr.splitlines()[-1])
+    return steps
+
+
+def _line(backend: str, checkpoint: Checkpoint, runs: Sequence[dict[str, float]], photos: int) -> Line:
+    cpu = [run.pop("CPU") for run in runs]
+    ms = {step: statistics.median(run[step] for run in runs) for step in runs[0]}
+    each = [sum(run.values()) for run in runs]
+    total = statistics.median(each)
+    shown = ", ".join(f"{step} {value:.0f}" for step, value in ms.items() if value >= 0.5)
+    return Line(
+        "cold",
+        checkpoint.config.matcher.tower,
+        f"{backend}, {photos} photos: {total:.0f} ms a query from nothing, {statistics.median(cpu):.0f} of CPU time: "
+        f"{shown}",
+        {"photos": photos, "total_ms": total, **{f"{step} ms": value for step, value in ms.items()}},
+        {"total_ms": each, "cpu_ms": cpu},
+    )
+
+
+def _help(repetitions: int) -> Line:
+    seconds = []
+    for _ in range(repetitions + 1):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "retrieval", "--help"], capture_output=True, check=True)
+        seconds.append(time.perf_counter() - start)
+    median = 1e3 * statistics.median(seconds[1:])
+    return Line("cold", "no tower", f"`retrieve --help` takes {median:.0f} ms", {"help_ms": median})

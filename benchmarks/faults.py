@@ -1,0 +1,384 @@
+"""`python -m benchmarks.faults [--times 20] [--only NAME ...]`: faults of a cluster, and their consequences.
+
+    router      the service is killed while it is asked, and started again
+    shard       a process that holds a shard is killed while queries go on
+    worker      a process of Ray Data is killed while it embeds
+    job         a build from and into an object store is killed about halfway, and run again: on the same machine, and
+                on another one, which has nothing but the store
+    refusals    the store refuses one request of twenty
+    torn        of one upload in five half arrives
+
+After each, every photo must be there once with the code of an undisturbed build, and every answer be whole and right.
+A line of figures for each kind; it ends with exit code 1 where something was lost, doubled or wrong.
+"""
+
+import argparse
+import json
+import mmap
+import os
+import random
+import shutil
+import signal
+import struct
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from functools import cached_property
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from indexes.errors import NoIndex
+from indexes.store.folder import IndexStore
+from retrieval.errors import RetrievalError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build_cluster import build_cluster
+from retrieval.search.object_store import folder_with, read_cluster
+from retrieval.search.searcher import Searcher
+from tests import on_ray, s3, serving, synthetic
+
+PHOTOS, OBJECTS, SHARDS, BLOCKS = 240, 40, 4, 8
+ATOL = 2e-3
+"""Between halves (float16), and logits of them, that were encoded in batches of another size."""
+SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
+
+
+class Wrong(Exception):
+    """Something was lost, doubled, or answered wrongly."""
+
+
+def must(holds, what):
+    """Raises Wrong."""
+    if not holds:
+        raise Wrong(what)
+
+
+def write_photos(folder, photos=PHOTOS, objects=OBJECTS):
+    """A catalogue of so many drawn photos, no two alike."""
+    return synthetic.write_catalogue(folder, synthetic.make_objects(objects, seed=9), photos // objects)
+
+
+def _make(folder):
+    """The checkpoint, trained for six steps. In a process of its own: the other one forks, and must have no threads."""
+    from retrieval.training.train import train
+    from tests.conftest import TINY
+
+    recording = synthetic.write_recording(folder / "recording", synthetic.make_objects(12), 3)
+    train(recording, folder / "tiny.safetensors", TINY, quiet=True)
+
+
+class Bench:
+    """The photos, the model, a cluster that nothing disturbed, and touches with what it answers."""
+
+    def __init__(self, folder, seed=0):
+        self.folder, self.rng = folder, random.Random(seed)
+        process = get_context("spawn").Process(target=_make, args=(folder,))
+        process.start()
+        process.join()
+        self.model = folder / "tiny.safetensors"
+        self.photos = write_photos(folder / "photos")
+        self.cluster = folder / "cluster"
+        self.forked(lambda: self.build(self.photos, self.cluster)).join()
+        objects = synthetic.make_objects(3, seed=9)
+        drawn = synthetic.write_queries(folder / "touches", objects)
+        self.touches = [pair for pairs in drawn.values() for pair in pairs]
+        self.codes = self.codes_of(self.cluster)
+        must(len(self.codes) == PHOTOS, "the undisturbed build lacks photos")
+        with Searcher.open(self.cluster) as searcher:
+            self.expected = [logits(searcher.query(touch, top=OBJECTS)) for touch in self.touches]
+
+    def build(self, photos, out, shards=SHARDS, **how):
+        """Build in this process."""
+        return build_cluster(photos, load_checkpoint(self.model), out, shards, quiet=True, **how)
+
+    @staticmethod
+    def forked(work):
+        """A process that does this and ends."""
+        process = get_context("fork").Process(target=work)
+        process.start()
+        return process
+
+    def codes_of(self, cluster):
+        """{photo: (object, half)} of all shards; raises Wrong for a photo in two of them."""
+        found = {}
+        for entry in read_cluster(cluster).shards:
+            store = IndexStore(folder_with(cluster, entry) / entry.folder)
+            generation = store.open(name=entry.generation)
+            for row, half in zip(generation.rows, generation.arrays["halves"], strict=True):
+                must(row["id"] not in found, f"{row['id']} is there twice")
+                found[row["id"]] = row["object_id"], half.astype(np.float32)
+        return found
+
+    def check_codes(self, cluster):
+        """All photos, once, with the codes of the undisturbed build."""
+        found = self.codes_of(cluster)
+        must(found.keys() == self.codes.keys(), f"{len(found)} photos of {len(self.codes)} are there")
+        for name, (owner, half) in found.items():
+            must(owner == self.codes[name][0], f"{name} is of {owner}")
+            must(np.allclose(half, self.codes[name][1], atol=ATOL), f"{name} has another code")
+
+    def check_answer(self, number, answer):
+        """Whole, and that of the undisturbed cluster."""
+        must(answer.index["searched"] == 1.0, f"only {answer.index['searched']} was searched")
+        found, expected = logits(answer), self.expected[number]
+        best = sorted(expected.values(), reverse=True)[: len(found)]
+        right = len(found) == 10 and np.allclose(list(found.values()), best, atol=ATOL)
+        right = right and all(abs(logit - expected[name]) <= ATOL for name, logit in found.items())
+        must(right, f"touch {number} is answered by {found}")
+
+    def check_answers(self, cluster):
+        """Of all touches."""
+        with Searcher.open(cluster) as searcher:
+            for number, touch in enumerate(self.touches):
+                self.check_answer(number, searcher.query(touch))
+
+    @cached_property
+    def stored(self):
+        """The photos in an object store."""
+        s3.put(self.photos, "faults/photos")
+        return "s3://faults/photos"
+
+
+def logits(answer):
+    """{object: its logit}, the best first; of batches of another size they differ, and so may the order of equals."""
+    return {match.object_id: match.logit for match in answer.results}
+
+
+def another_machine():
+    """This one, without what it keeps."""
+    shutil.rmtree(Path(os.environ["XDG_CACHE_HOME"]), ignore_errors=True)
+
+
+class Encoded:
+    """How many photos the processes forked from this one encode, while it is used."""
+
+    def __enter__(self):
+        from retrieval.model import photo_encoder
+
+        self._shared, self._plain = mmap.mmap(-1, 8), photo_encoder.encode_photos
+
+        def counted(matcher, photos, batch):
+            photos = list(photos)
+            made = self._plain(matcher, photos, batch)
+            self.set(self.count + len(photos))
+            return made
+
+        photo_encoder.encode_photos = counted
+        return self
+
+    def __exit__(self, *_):
+        from retrieval.model import photo_encoder
+
+        photo_encoder.encode_photos = self._plain
+
+    @property
+    def count(self):
+        """Until now."""
+        return struct.unpack("q", self._shared[:8])[0]
+
+    def set(self, count):
+        """Count on from there."""
+        self._shared[:8] = struct.pack("q", count)
+
+
+# Builds ---------------------------------------------------------------------------------------------------------------
+
+
+def job(bench, times):
+    """Killed when 40 to 60 % of the photos were encoded. What another machine repeats are blocks: one of 8 shards."""
+    figures = {"killed": 0}
+    with s3.served(), Encoded() as encoded:
+        for where in ("same", "other"):
+            repeated, shares = [], []
+            for turn in range(times):
+                another_machine()
+                url, aim = f"s3://faults/{where}-{turn}", bench.rng.uniform(0.4, 0.6) * PHOTOS
+                encoded.set(0)
+                process = bench.forked(lambda url=url: bench.build(bench.stored, url, BLOCKS))
+                while process.is_alive() and encoded.count < aim:
+                    time.sleep(0.001)
+                time.sleep(bench.rng.uniform(0, 0.05))
+                process.kill()
+                process.join()
+                figures["killed"] += process.exitcode == -signal.SIGKILL
+                done = encoded.count
+                try:
+                    read_cluster(url)
+                    must(process.exitcode == 0, "a build that was killed put a cluster")
+                except NoIndex:
+                    pass
+                if where == "other":
+                    another_machine()
+                process = bench.forked(lambda url=url: bench.build(bench.stored, url, BLOCKS))
+                process.join()
+                must(process.exitcode == 0, "the next build failed")
+                repeated.append(encoded.count - PHOTOS)
+                if done < PHOTOS:
+                    shares.append(repeated[-1] / (PHOTOS - done))
+                bench.check_codes(url)
+                bench.check_answers(url)
+            figures |= {f"{where}_repeated_mean": float(np.mean(repeated)), f"{where}_repeated_most": max(repeated)}
+            figures |= {f"{where}_of_the_rest_p50": float(np.median(shares)), f"{where}_of_the_rest_most": max(shares)}
+    return figures
+
+
+def disturbed(bench, times, kind, **faults):
+    """Builds into a store with faults, and searches of it, until there were so many faults; a few builds at least."""
+    builds = 0
+    with s3.served() as server:
+        photos = bench.stored
+        for name, every in faults.items():
+            setattr(server, name, every)
+        while getattr(server, kind) < times or builds < max(2, times // 4):
+            another_machine()
+            url = f"s3://faults/{kind}-{builds}"
+            process = bench.forked(lambda url=url: bench.build(photos, url))
+            process.join()
+            must(process.exitcode == 0, "the build failed")
+            another_machine()
+            bench.check_codes(url)
+            bench.check_answers(url)
+            builds += 1
+        return {kind: getattr(server, kind), "requests": server.requests, "uploads": server.uploads, "builds": builds}
+
+
+def refusals(bench, times):
+    """One request of twenty."""
+    return disturbed(bench, times, "refused", refuse=20)
+
+
+def torn(bench, times):
+    """One upload of five."""
+    return disturbed(bench, times, "torn", tear=5)
+
+
+def worker(bench, times):
+    """Killed whenever new codes were kept, at most four times a build."""
+    from retrieval.cluster.building import by_ray
+
+    killed = builds = 0
+    while killed < times:
+        out, done = bench.folder / f"by-ray-{builds}", {}
+
+        def work(out=out, done=done):
+            done["report"] = bench.build(bench.photos, out, run=by_ray(2, workers=1), bad_share=0)
+
+        thread, known, own = threading.Thread(target=work), 0, 0
+        thread.start()
+        while thread.is_alive():
+            kept = sum(path.stat().st_size for path in out.glob("shard-*/unfinished/*.records"))
+            if kept > known and own < min(4, times - killed) and (workers := on_ray.called(WORKER)):
+                for process in workers:
+                    os.kill(process, signal.SIGKILL)
+                own, known = own + 1, kept
+            known = min(known, kept)  # a finished shard leaves none
+            time.sleep(0.002)
+        thread.join()
+        must("report" in done, "the build failed")
+        bench.check_codes(out)
+        bench.check_answers(out)
+        killed, builds = killed + own, builds + 1
+    return {"killed": killed, "builds": builds}
+
+
+# Answers --------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def asked(bench, ask):
+    """What a thread tells of its queries, one after the other, while the block runs: {"answers", "errors", "wrong"}."""
+    told, stop = {"answers": 0, "errors": 0, "wrong": []}, threading.Event()
+
+    def go_on():
+        number = 0
+        while not stop.is_set():
+            number = (number + 1) % len(bench.touches)
+            try:
+                answer = ask(bench.touches[number])
+                bench.check_answer(number, answer)
+                told["answers"] += 1
+            except RetrievalError:  # said to whoever asks
+                told["errors"] += 1
+                time.sleep(0.05)
+            except Wrong as error:
+                told["wrong"].append(str(error))
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        yield told
+    finally:
+        stop.set()
+        thread.join()
+        must(not told["wrong"], "; ".join(told["wrong"][:3]))
+
+
+def grow(told, name="answers", by=1, limit_s=240):
+    """Wait until so many more were told."""
+    start, until = told[name], time.monotonic() + limit_s
+    while told[name] < start + by and not told["wrong"]:
+        must(time.monotonic() < until, f"no {name} within {limit_s} s")
+        time.sleep(0.005)
+
+
+def shard(bench, times):
+    """While queries go on, one after the other."""
+    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.session import connected
+
+    with connected(2) as ray:
+        held = Deployments(ray, Held(cpus=0.1, wait_s=120.0))
+        with Searcher.open(bench.cluster, shards=held.open) as searcher, asked(bench, searcher.query) as told:
+            grow(told)
+            for turn in range(times):
+                processes = on_ray.called(SHARD)
+                os.kill(processes[turn % len(processes)], signal.SIGKILL)
+                grow(told, by=3)
+            return {"killed": times, "answers": told["answers"], "errors": told["errors"]}
+
+
+def router(bench, times):
+    """The service with a Ray of its own."""
+    from retrieval import Client
+
+    answers = errors = 0
+    options = ["--index", bench.cluster, "--cluster", "--no-history", "--port", 0]
+    for _ in range(times):
+        with serving.command(*options) as (process, address, _), Client(address) as client:
+            with asked(bench, client.query) as told:
+                grow(told, by=2)
+                process.kill()
+                grow(told, "errors")
+            answers, errors = answers + told["answers"], errors + told["errors"]
+    return {"killed": times, "answers": answers, "errors": errors}
+
+
+KINDS = {one.__name__: one for one in (refusals, torn, job, worker, shard, router)}
+
+
+def main():
+    """Print a line of figures for each kind."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.faults", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--times", type=int, default=20, help="how often each")
+    parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME", help=", ".join(KINDS))
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        os.environ["XDG_CACHE_HOME"], os.environ["XDG_STATE_HOME"] = f"{name}/cache", f"{name}/state"
+        bench, failed = Bench(Path(name), arguments.seed), 0
+        for kind in arguments.only:
+            start = time.monotonic()
+            try:
+                figures = KINDS[kind](bench, arguments.times)
+            except Wrong as error:
+                figures, failed = {"wrong": str(error)}, 1
+            minutes = round((time.monotonic() - start) / 60, 1)
+            print(json.dumps({"kind": kind, **figures, "minutes": minutes}), flush=True)
+        return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

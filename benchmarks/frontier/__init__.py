@@ -1,0 +1,19 @@
+"""Error against run time of the kernels: the simulated rig, canonical correlations, photos decoded at a fraction.
+
+`python -m benchmarks.frontier --out report/` measures and plots them as `retrieve frontier` does those of a search.
+"""
+
+APPROXIMATIONS = {
+    "reduced": "benchmarks.frontier.large_photos:reduced",
+    "cca_solver": "benchmarks.frontier.correlation:cca_solver",
+    "cca_components": "benchmarks.frontier.correlation:cca_components",
+    "rays": "benchmarks.frontier.rays:rays",
+    "hidden_sky": "benchmarks.frontier.light:sky",
+    "contact": "benchmarks.frontier.contact:contact",
+    "contact_products": "benchmarks.frontier.contact:contact_products",
+    "gel_optics": "benchmarks.frontier.optics:gel_optics",
+}
+"""Name -> the function that measures it, as in `retrieval.frontier`."""
+
+NEED_NO_MODEL = frozenset({"cca_solver", "rays", "hidden_sky", "contact", "contact_products", "gel_optics"})
+"""Measured without a model and without a recording."""

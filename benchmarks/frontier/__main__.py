@@ -1,0 +1,31 @@
+"""`python -m benchmarks.frontier --out FOLDER [--only NAME ...] [--recording R] [--model M] [--quick]`."""
+
+import argparse
+from pathlib import Path
+
+from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
+from retrieval.commands.frontier import report
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Write frontier.json, frontier.html and figures/ of the kernels' approximations."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.frontier", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder for frontier.json, frontier.html and plots")
+    parser.add_argument("--only", nargs="+", default=(), choices=APPROXIMATIONS, metavar="NAME")
+    parser.add_argument("--recording", type=Path, help="grasps of unseen objects (default: a small one is collected)")
+    parser.add_argument("--model", help="a checkpoint (default: as of `retrieve frontier`)")
+    parser.add_argument("--quick", action="store_true", help="smallest sizes, to see that it runs")
+    of = parser.parse_args(argv)
+    report(
+        of.out,
+        model=of.model,
+        recording=of.recording,
+        only=of.only,
+        quick=of.quick,
+        table=APPROXIMATIONS,
+        need_no_model=NEED_NO_MODEL,
+    )
+
+
+if __name__ == "__main__":
+    main()

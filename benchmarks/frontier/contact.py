@@ -1,0 +1,182 @@
+"""The simulated rig's approximations: grid, tolerance and precision of the gel's contact."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from benchmarks.frontier.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
+from retrieval.frontier.clock import timed
+from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.sample import Sample
+from robot.sim.contact.kernels import Floats
+from robot.sim.contact.layer import SINGLE_FROM, Contact, Layer, press
+from robot.sim.contact.scaled_problem import ElasticSurface, Task
+from robot.sim.gel.optics import LedOptics
+from robot.sim.gel.surface import Field, Surface
+from robot.sim.pinch import Hand
+
+LAYER = Layer(HALF_SPACE.modulus_mpa, 0.48, 2.0)
+CAMERA_NOISE = 0.8
+"""Grey levels of a sensor's read noise: what the model can see lies above."""
+
+# Contact ---------------------------------------------------------------------------------------------------
+
+
+def contact(sample: Sample) -> Row:
+    """Grid and tolerance of the gel's contact. Under a minute."""
+    text = (
+        "A ball pressed into the gel: on a half-space against Hertz's closed form, on a layer, which the simulated "
+        "fingers have, against a fine grid. Then what the camera sees of a ball with ridges 1.5 mm apart, the finest "
+        "that objects are drawn with: this decides the grid, since an error below the camera's noise is not seen. Each "
+        "colour is a grid, each point a tolerance of the solver."
+    )
+    repeats = sample.scale.repeats
+    panels = contact_panels(repeats, (30, 120), (1e-1, 1e-2), 240) if sample.scale.quick else contact_panels(repeats)
+    return Row("Contact of the gel: grid and tolerance", text, panels)
+
+
+def contact_panels(
+    repeats: int,
+    rows: Sequence[int] = (30, 60, 120, 240),
+    tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
+    reference_rows: int = 480,
+) -> tuple[Panel, Panel, Panel]:
+    """Grid, tolerance and padding of the contact solver.
+
+    A ball of 4 mm on the half-space against Hertz; on a layer of 2 mm against `reference_rows` at a tolerance of 1e-6,
+    of which each number of rows must be an even part; then the gel image of a ridged ball against the same grid's.
+    """
+    return (
+        _half_space(repeats, rows, tolerances),
+        _layer(repeats, rows, tolerances, reference_rows),
+        _gel_image(repeats, rows, tolerances, reference_rows),
+    )
+
+
+def _half_space(repeats: int, rows: Sequence[int], tolerances: Sequence[float], force_n: float = 0.5) -> Panel:
+    depth = hertz(force_n, BALL_MM, HALF_SPACE.plane_modulus_mpa)[1]
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
+    for grid in map(Grid.of_field, rows):
+        for tolerance in tolerances:
+            works.append(partial(pressed_ball, grid, HALF_SPACE, force_n, tolerance))
+            points.append(_point(grid, tolerance, percent(works[-1]().approach_mm, depth)))
+    return _panel("half-space", "% of depth", "Hertz", 0.1, points, works, repeats)
+
+
+def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
+    fine = pressed_ball(Grid.of_field(reference_rows), LAYER, 1.0, 1e-6)
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
+    for grid in map(Grid.of_field, rows):
+        exact = _at_centres(fine.displacement_mm, reference_rows // grid.rows)
+        for padded in (False, True):
+            for tolerance in tolerances:
+                works.append(partial(pressed_ball, grid, LAYER, 1.0, tolerance, padded))
+                error = 1e3 * math.sqrt(float(np.mean((works[-1]().displacement_mm - exact) ** 2)))
+                points.append(_point(grid, tolerance, error, padded))
+    reference = f"{Grid.of_field(reference_rows)}, tolerance 1e-06"
+    return _panel("layer", "um rms of surface", reference, 0.1, points, works, repeats)
+
+
+def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
+    """What the camera sees of ridges: the error that matters to who looks at gel images."""
+    exact = _picture(_pressed_ridges(_of_gel(reference_rows), 1e-6))
+    points, works = list[Tradeoff](), list[Callable[[], Contact]]()
+    for grid in map(_of_gel, rows):
+        for tolerance in tolerances:
+            works.append(partial(_pressed_ridges, grid, tolerance))
+            error = math.sqrt(float(np.mean((_picture(works[-1]()) - exact) ** 2)))
+            points.append(_point(grid, tolerance, error))
+    reference = f"{_of_gel(reference_rows)}, tolerance 1e-06"
+    return _panel("gel image of ridges", "grey levels rms", reference, CAMERA_NOISE, points, works, repeats)
+
+
+def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Tradeoff:
+    """One setting of the solver; the default is what the gripper's contacts are solved with."""
+    hand, series = Hand(), f"{grid}" if padded else f"{grid} periodic"
+    is_default = padded and ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
+    return Tradeoff(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
+
+
+def _panel(
+    surface: str,
+    unit: str,
+    reference: str,
+    tolerance: float,
+    points: Sequence[Tradeoff],
+    works: Sequence[Callable[[], object]],
+    repeats: int,
+) -> Panel:
+    title, made = f"contact grid and tolerance, {surface}", timed(points, works, repeats)
+    return Panel(title, "one contact", unit, reference, tolerance, made, smallest(made))
+
+
+def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
+    """A ball of 15 mm with ridges 1.5 mm apart, the finest that objects are drawn with, and .2 mm high, at 3 N."""
+    ridges = 0.1 * (1.0 - np.cos(2.0 * math.pi * grid.axes()[1] / 1.5))
+    gap = grid.radius() ** 2 / 30.0 + ridges
+    return press(gap, grid.pixel_mm, LAYER, force_n=3.0, tolerance=tolerance)
+
+
+def _of_gel(rows: int) -> Grid:
+    """`rows` rows over what the gel's camera sees."""
+    return Grid(rows, rows * 4 // 3, Field().size_mm[0] / rows)
+
+
+def _picture(contact: Contact) -> Floats:
+    """(240, 320, 3) grey levels of the gel by its lamps, before noise and rounding."""
+    surface = Surface(contact.displacement_mm, Field())
+    return LedOptics().colours(surface, surface.slopes).astype(np.float64)
+
+
+def _at_centres(fine: Floats, factor: int) -> Floats:
+    """A fine field at the centres of blocks of `factor` pixels: the mean of the four pixels that meet there."""
+    rows, cols = (n // factor for n in fine.shape)
+    blocks = fine.reshape(rows, factor, cols, factor)
+    middle = slice(factor // 2 - 1, factor // 2 + 1)
+    return np.asarray(blocks[:, middle, :, middle].mean(axis=(1, 3)))
+
+
+# Products ---------------------------------------------------------------------------------------------------
+
+
+def contact_products(sample: Sample) -> Row:
+    """float32 in the products of the gel's contact."""
+    text = (
+        "A ball with ridges pressed into a layer on the rig's grid: the products of pressure and influence by FFT in "
+        "float32 or in float64, and the solver's tolerance. The rig's contacts, at a tolerance of "
+        f"{SINGLE_FROM:g} or more, take float32."
+    )
+    repeats = sample.scale.repeats
+    panel = products_panel(repeats, rows=48) if sample.scale.quick else products_panel(repeats)
+    return Row("Contact of the gel: float32", text, (panel,))
+
+
+def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3)) -> Panel:
+    """A point for each precision and tolerance: rms error of the surface against float64 at 1e-8 on the same grid."""
+    hand = Hand()
+    grid = hand.grid if rows is None else (rows, rows * 4 // 3)
+    pixel_mm = 15.2 / grid[0]
+    y, x = (pixel_mm * (np.arange(n) - (n - 1) / 2) for n in grid)
+    gap = (y[:, None] ** 2 + x**2) / 30.0 + 0.1 * (1.0 - np.cos(2.0 * math.pi * x / 1.5))
+    exact = _pressed(gap, pixel_mm, 1e-8, False)
+    points, works = list[Tradeoff](), []
+    for single in (False, True):
+        for tolerance in tolerances:
+            works.append(partial(_pressed, gap, pixel_mm, tolerance, single))
+            error = 1e3 * math.sqrt(float(np.mean((works[-1]() - exact) ** 2)))
+            is_default = (tolerance, single) == (hand.tolerance, True)
+            series = "float32" if single else "float64"
+            points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
+    made = timed(points, works, repeats)
+    reference = "float64, tolerance 1e-08"
+    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, made, smallest(made))
+
+
+def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single: bool, force_n: float = 3.0) -> Floats:
+    """(rows, cols) mm of displacement by so much force."""
+    scale = force_n / LAYER.plane_modulus_mpa / pixel_mm**2
+    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single)
+    solution = Task(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()
+    return np.asarray(solution.displacement * scale * pixel_mm)

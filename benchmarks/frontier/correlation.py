@@ -1,0 +1,161 @@
+"""Canonical correlations: how they are computed, and how many components a score keeps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.frontier.clock import timed
+from retrieval.frontier.pixels import SLACK
+from retrieval.frontier.points import Panel, Row, Tradeoff, missed, smallest
+from retrieval.frontier.sample import Sample
+from retrieval.methods.base import Setting
+from retrieval.methods.cca import Cca, admissible, canonical, cosine, decompose, unit_rows
+
+Matrix = NDArray[np.float64]
+Solver = Callable[["Problem"], Matrix]
+OURS = "SVD of the data, float64 (ours)"
+SIZES = (4, 8, 16, 32, 64, 128, 256)
+FEWEST = 8
+"""Objects: half of them are fitted on, a quarter chosen on, a quarter judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Two views (n, d) whose canonical correlations are known: mixed sources, `rho` (d,) falling."""
+
+    x: Matrix
+    y: Matrix
+    rho: Matrix
+
+
+def known_problem(rows: int, width: int, spread: float, seed: int = 0) -> Problem:
+    """Orthonormal sources U and V with U'V = diag(rho), each mixed by a matrix whose singular values span `spread`."""
+    rng = np.random.default_rng([seed, 3])
+    drawn = rng.normal(size=(rows, 2 * width))
+    sources = np.linalg.qr(drawn - drawn.mean(0))[0]
+    rho = np.linspace(0.95, 0.05, width)
+    left = sources[:, :width]
+    right = left * rho + sources[:, width:] * np.sqrt(1 - rho**2)
+    return Problem(left @ _mixing(width, spread, rng), right @ _mixing(width, spread, rng), rho)
+
+
+def _mixing(width: int, spread: float, rng: np.random.Generator) -> Matrix:
+    turns = [np.linalg.qr(rng.normal(size=(width, width)))[0] for _ in range(2)]
+    return np.asarray(turns[0] * np.geomspace(1.0, 1.0 / spread, width) @ turns[1])
+
+
+def cca_solver(sample: Sample) -> Row:
+    """Ours against the textbook's and scikit-learn's, where the answer is known."""
+    size = (200, 12) if sample.scale.quick else (2000, 64)
+    problem = known_problem(*size, spread=1e6)
+    solvers: dict[str, Solver] = {
+        OURS: _by_svd,
+        "eigenvalues of X'X, float64": partial(_by_covariance, np.float64),
+        "eigenvalues of X'X, float32": partial(_by_covariance, np.float32),
+        "scikit-learn's NIPALS, first 8": _by_sklearn,
+    }
+    points = timed(
+        [_point(problem, name, solve) for name, solve in solvers.items()],
+        [partial(solve, problem) for solve in solvers.values()],
+        sample.scale.repeats,
+    )
+    panel = Panel(
+        title=f"canonical correlations, {size[0]:,} pairs of {size[1]} features, condition number 1e6",
+        time="fitting, one thread",
+        unit="largest error of a correlation",
+        reference="correlations known by construction",
+        tolerance=1e-6,
+        points=points,
+        resolution=smallest(points),
+    )
+    return Row(
+        "CCA: solver",
+        "X'X squares the condition number of the data; the singular value decomposition of X does not. scikit-learn's "
+        "CCA iterates one component after the other (NIPALS), here its first eight.",
+        (panel,),
+    )
+
+
+def _point(problem: Problem, name: str, solve: Solver) -> Tradeoff:
+    found = solve(problem)
+    return Tradeoff(name, "", float(np.abs(found - problem.rho[: len(found)]).max()), is_default=name == OURS)
+
+
+def _by_svd(problem: Problem) -> Matrix:
+    views = decompose(problem.x), decompose(problem.y)
+    return _padded(canonical(*views, np.arange(len(problem.x))).correlations, len(problem.rho))
+
+
+def _by_covariance(kind: type[np.floating], problem: Problem) -> Matrix:
+    """Whiten by eigenvalues of the covariance, as textbooks print it; only here, to be compared."""
+    x, y = (one.astype(kind) - one.astype(kind).mean(0) for one in (problem.x, problem.y))
+    whitened = [one @ _root(one.T @ one) for one in (x, y)]
+    found = np.linalg.svd(whitened[0].T @ whitened[1], compute_uv=False)
+    return _padded(np.asarray(found, dtype=np.float64), len(problem.rho))
+
+
+def _root(covariance: NDArray[np.floating]) -> NDArray[np.floating]:
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > np.finfo(values.dtype).eps * values[-1]
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def _padded(found: Matrix, count: int) -> Matrix:
+    """A correlation that was not found counts as 0, one above 1 stays wrong."""
+    return np.pad(found[:count], (0, max(0, count - len(found))))
+
+
+def _by_sklearn(problem: Problem) -> Matrix:
+    """Its first eight components; not all of them, for it takes seconds a component."""
+    from sklearn.cross_decomposition import CCA
+
+    found = CCA(n_components=8, max_iter=5000).fit_transform(problem.x, problem.y)
+    return np.array([abs(np.corrcoef(a, b)[0, 1]) for a, b in zip(found[0].T, found[1].T, strict=True)])
+
+
+# Components ------------------------------------------------------------------------------------------------
+
+
+def cca_components(sample: Sample) -> Row:
+    """Wrong first guesses by number of canonical components, fitted on half of the sample's objects."""
+    title = "CCA: components"
+    names = [str(name) for name in np.unique(sample.features.object_ids)]
+    if len(names) < FEWEST:
+        return Row(title, "", skipped=f"it needs {FEWEST} objects or more; the recording has {len(names)}")
+    order = np.random.default_rng([sample.seed, 4]).permutation(names)
+    parts = np.split(order, [len(names) // 2, len(names) * 3 // 4])
+    train, validation, test = (sample.features.of_objects(part) for part in parts)
+    method = Cca(Setting(sample.checkpoint.config))
+    method.fit(train, validation)
+    views = decompose(train.touch), decompose(train.photo)
+    found = canonical(*views, train.owner, method.chosen["ridge"])
+    weights = found.correlations ** method.chosen["power"]
+    touch = views[0].standardise(test.touch) @ found.touch_weights * weights
+    photo = views[1].standardise(test.photo) @ found.photo_weights * weights
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
+    many = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
+    for count in sorted({*admissible(SIZES, len(weights)), method.chosen["components"]}):
+        codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
+        scores = cosine(*codes)
+        np.fill_diagonal(scores, -np.inf)  # the photo of the touch's own grasp
+        wrong = test.owner[scores.argmax(1)] != test.owner
+        points.append(missed("", f"{count} components", wrong, count == method.chosen["components"]))
+        works.append(partial(cosine, codes[0][:1], unit_rows(many[:, :count])))
+    points = list(timed(points, works, sample.scale.repeats))
+    panel = Panel(
+        title="wrong first guesses by number of canonical components",
+        time=f"scores of one touch with {sample.scale.photos:,} photos, one thread",
+        unit="% of queries",
+        reference=f"the object in the hand, one of {len(parts[2])}",
+        tolerance=round(min(point.error for point in points) + SLACK, 1),
+        points=tuple(points),
+        resolution=100 / len(test),
+    )
+    text = (
+        f"Fitted on {len(parts[0])} objects, ridge, power and the default number of components chosen on "
+        f"{len(parts[1])} others, judged on {len(parts[2])} that neither has seen."
+    )
+    return Row(title, text, (panel,))

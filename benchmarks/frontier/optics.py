@@ -1,0 +1,58 @@
+"""Degree of the fitted gel optics: errors on real presses against the time of a picture."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks.optics.photometric import DEGREES, by_degree
+from retrieval.frontier.clock import timed
+from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.sample import Sample
+from robot.sim.gel.fitted_optics import FittedOptics, feature_count, fitted_document, load_fitted
+from robot.sim.gel.surface import Field, Surface
+
+
+def gel_optics(sample: Sample) -> Row:
+    """Degree of the fitted gel optics, against real presses."""
+    text = (
+        "Pictures of real balls pressed into a real gel that were left out of the fit, and what the model says of them."
+    )
+    return Row("Gel optics: degree of the fitted model", text, (optics_panel(sample.scale.repeats),))
+
+
+def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
+    """A point per degree of the fitted optics of a sensor: a picture of 240 x 320 pixels, its maps made before.
+
+    The error is the rms over held-out real presses, in grey levels, from the shipped file.
+    """
+    shipped, figures = load_fitted(name), fitted_document(name)["held_out"]
+    x, y = Field().unit_positions()
+    surface = Surface(np.maximum(0, 0.5 - x * x - y * y), Field())
+    points = [
+        Tradeoff(
+            series=name,
+            setting=f"degree {degree}",
+            error=math.sqrt(figures[by_degree(degree)]["mse"]["mean"]),
+            is_default=degree == shipped.degree,
+        )
+        for degree in DEGREES
+    ]
+    works = [partial(_of_degree(shipped, degree).colours, surface, surface.slopes) for degree in DEGREES]
+    made = timed(points, works, repeats)
+    return Panel(
+        title="gel optics",
+        time="one picture of 240 x 320 pixels",
+        unit="grey levels rms",
+        reference="real presses held out",
+        tolerance=3.5,
+        points=made,
+        resolution=smallest(made),
+    )
+
+
+def _of_degree(optics: FittedOptics, degree: int) -> FittedOptics:
+    """Optics that cost what this degree costs; time does not depend on what the weights are."""
+    count = feature_count(degree, len(optics.reaches_mm)) * optics.places
+    return replace(optics, degree=degree, weights=((0.0, 0.0, 0.0),) * count)

@@ -1,0 +1,220 @@
+"""Rays of the simulated rig: the steps of those from a gel and from the camera, and how many a ray may take."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.frontier.light import light_panel
+from retrieval.frontier.clock import timed
+from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.sample import Sample
+from robot.readings import Pose
+from robot.sim.camera import NOISE, PinholeCamera
+from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors
+from robot.sim.objects.boxes import clipped
+from robot.sim.objects.draw import draw_object
+from robot.sim.objects.packets import MOST_STEPS, first_hits, hits
+from robot.sim.pinch import Grip
+from robot.sim.scene import Scene
+
+_FAMILIES = ("knurl", "bumps", "weave")
+_OBJECTS, _PX = 8, 256
+_EXACT = 1 / 20
+"""Of the detail that a photo's ray asks for: equal steps so short are the reference."""
+_UNBOUNDED = 100_000
+"""Steps that no ray needs."""
+
+
+def rays(sample: Sample) -> Row:
+    """Steps of the rays of gels and photos, how many a ray may take, and float32 where light is worked out."""
+    text = (
+        "Rays to a solid that wears relief: no step is shorter than half the detail that is asked for, and where f "
+        "changes sign two secants find the place. A gel asks for 0.1 mm; its picture shows heights of some thousandths "
+        "of a mm. The camera asks for one of its pixels on the object, and two on the way to the lamp: photos are "
+        "compared with those whose rays go in equal steps of a twentieth of that in plain numpy, over the same relief, "
+        "which is as fine as a pixel; errors below the noise of the camera's sensor are tolerated. A ray that has met "
+        "nothing after so many steps is a miss. Light is worked out in float32, in one compiled pass."
+    )
+    repeats = sample.scale.repeats
+    few, objects, px = (12, 2, 64) if sample.scale.quick else (48, _OBJECTS, _PX)
+    panels = (
+        gel_panel(repeats, few),
+        photo_panel(repeats, objects, px),
+        limit_panel(repeats, objects, px),
+        light_panel(repeats, objects, px),
+    )
+    return Row("Rays and light of the simulated rig", text, panels)
+
+
+class Marched(SdfBody):
+    """The solid of a body, met by steps `stride` times as long, at most `most_steps`; `asked` are the casts so far,
+    to be made again."""
+
+    def __init__(self, body: SdfBody, stride: float = 1.0, most_steps: int = MOST_STEPS) -> None:
+        super().__init__(body.shape, body.relief)
+        self.wall = body.wall
+        self.stride, self.most_steps = stride, most_steps
+        self.asked: list[Callable[[], NDArray[Any]]] = []
+
+    def _cast(self, rays: ClippedRays) -> Vectors:
+        return self._kept(partial(self._by, first_hits, rays))
+
+    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
+        return self._kept(partial(self._by, hits, rays))
+
+    def _kept(self, cast: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        self.asked.append(cast)
+        return cast()
+
+    def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
+        return met(self.worn(rays.step_mm), rays.ways, self.stride * rays.step_mm, self.most_steps)
+
+
+class SteppedThrough(Marched):
+    """The same in equal steps of plain numpy, `stride` times the detail that is asked for, as many as it takes."""
+
+    def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
+        found = by_equal_steps(self, rays, self.stride * rays.step_mm)
+        return np.isfinite(found) if met is hits else found
+
+
+def by_equal_steps(body: SdfBody, rays: ClippedRays, step_mm: float) -> Vectors:
+    """Where the field in plain numpy first changes sign, and there by its chord; inf where it does not."""
+    found, before, along = np.full(len(rays.near_mm), np.inf), np.zeros(len(rays.near_mm)), 0.0
+    open_ = np.flatnonzero(rays.near_mm <= rays.far_mm)
+    while len(open_):
+        t = rays.near_mm[open_] + along
+        x, y, z = (rays.origins[open_] + t[:, None] * rays.directions[open_]).astype(np.float32).T
+        f = body.field(x, y, z, rays.step_mm).astype(np.float64)
+        inside = f <= 0
+        hit, share = open_[inside], f[inside] / (before[open_[inside]] - f[inside]) if along else 0.0
+        found[hit] = t[inside] + step_mm * share
+        before[open_] = f
+        open_, along = open_[~inside & (t <= rays.far_mm[open_])], along + step_mm
+    return found
+
+
+# Gels ------------------------------------------------------------------------------------------------------
+
+
+def gel_panel(repeats: int, rows: int = 48, steps_mm: Sequence[float] = (1.6, 0.8, 0.4, 0.2, 0.1, 0.05)) -> Panel:
+    """A point for each step: the rms error of depth over the walls of three objects, `rows` by 4/3 `rows` rays each."""
+    walls = [(body, *_rays_onto(body, rows)) for body in map(_wall, _FAMILIES)]
+    exact = np.concatenate([_exact_depth(*wall) for wall in walls])
+    met = np.isfinite(exact)
+    points, works = list[Tradeoff](), [partial(_cast, walls, step) for step in steps_mm]
+    for step, work in zip(steps_mm, works, strict=True):
+        found = work()
+        both = met & np.isfinite(found)
+        error = 1e3 * math.sqrt(float(np.mean((found[both] - exact[both]) ** 2)))
+        points.append(Tradeoff("", f"{step:g} mm", error, is_default=step == GEL_STEP_MM))
+    made = timed(points, works, repeats)
+    reference, time = "equal steps of 0.01 mm", f"{len(exact):,} rays"
+    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, made, smallest(made))
+
+
+def _wall(relief: str) -> SdfBody:
+    body = draw_object(0, 0, family="box", relief=relief).body
+    assert isinstance(body, SdfBody)
+    return body
+
+
+def _rays_onto(body: SdfBody, rows: int) -> tuple[Vectors, Vectors]:
+    """Parallel rays from the front, 6 mm apart from the box, over 12 x 16 mm of its middle."""
+    height, width = 12.0, 16.0
+    z = 0.5 * body.upper[2] + height * (np.arange(rows) / rows - 0.5)
+    x, up = np.meshgrid(width * (np.arange(rows * 4 // 3) / (rows * 4 // 3) - 0.5), z)
+    origins = np.stack([x, np.full_like(x, body.lower[1] - 6.0), up], axis=-1).reshape(-1, 3)
+    return origins, np.tile([0.0, 1.0, 0.0], (len(origins), 1))
+
+
+def _exact_depth(body: SdfBody, origins: Vectors, directions: Vectors) -> Vectors:
+    near, far = clipped(origins, directions, body.lower, body.upper)
+    return by_equal_steps(body, ClippedRays(origins, directions, near, far, GEL_STEP_MM), 0.01)
+
+
+def _cast(walls: Sequence[tuple[SdfBody, Vectors, Vectors]], step_mm: float) -> Vectors:
+    return np.concatenate([body.cast(origins, directions, step_mm) for body, origins, directions in walls])
+
+
+# Photos ----------------------------------------------------------------------------------------------------
+
+
+def photo_panel(
+    repeats: int, objects: int = _OBJECTS, px: int = _PX, strides: Sequence[float] = (16, 8, 4, 2, 1, 0.5, 0.25)
+) -> Panel:
+    """A point for each step: the rms error of photos of so many objects, and the time of all of their rays."""
+    ways = [("as the rig casts", Marched, stride) for stride in strides]
+    ways += [("equal steps, plain numpy", SteppedThrough, stride) for stride in (1, 0.25, _EXACT)]
+    taken = [_photos(way, stride, objects, px) for _, way, stride in ways]
+    exact = taken[-1][0]
+    points = [
+        Tradeoff(
+            series,
+            f"{stride:g} px",
+            math.sqrt(float(np.mean((pictures - exact) ** 2))),
+            is_default=way is Marched and stride == 1,
+        )
+        for (series, way, stride), (pictures, _) in zip(ways, taken, strict=True)
+    ]
+    made = timed(points, [casts for _, casts in taken], repeats)
+    time, reference = f"rays of {objects} photos of {px} px, shadows included", f"equal steps of {_EXACT:g} px"
+    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, made, smallest(made))
+
+
+def _photos(way: type[Marched], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:
+    """(objects, px, px, 3) grey levels, and what casts all of their rays once more."""
+    scenes = [_scene(way, stride, number, px) for number in range(objects)]
+    pictures = np.array([scene.run()["photo"] for scene, _ in scenes], np.float64)
+    asked = [again for _, body in scenes for again in body.asked]
+    return pictures, lambda: [again() for again in asked]
+
+
+def _scene(way: type[Marched], stride: float, number: int, px: int) -> tuple[Scene, Marched]:
+    """An object with its body, before a camera that sees as much as the rig's; two bare fingers can close on it."""
+    obj = draw_object(0, number)
+    assert isinstance(obj.body, SdfBody)
+    body = way(obj.body, stride)
+    camera = PinholeCamera(px=px, focal_px=PinholeCamera.focal_px * px / PinholeCamera.px)
+    grip = Grip(Pose(0.0, 0.0, 0.5 * float(obj.body.upper[2]), 0.0), 10.0)
+    return Scene(dataclasses.replace(obj, body=body), camera=camera, grip=grip, seed=number, outputs={"photo"}), body
+
+
+# Steps -----------------------------------------------------------------------------------------------------
+
+
+def limit_panel(
+    repeats: int,
+    objects: int = _OBJECTS,
+    px: int = _PX,
+    limits: Sequence[int] = (25, 50, 100, 200, 300, MOST_STEPS, 2 * MOST_STEPS),
+) -> Panel:
+    """A point for each limit: how many rays miss by it, of photos and of fingers that find where an object rests."""
+    bodies = []
+    for number in range(objects):
+        scene, body = _scene(Marched, 1.0, number, px)
+        scene.run()
+        assert scene.pinch.turned  # its rays graze the object's sides
+        bodies.append(body)
+    exact = _met(bodies, _UNBOUNDED)
+    points, works = list[Tradeoff](), [partial(_met, bodies, limit) for limit in limits]
+    for limit, work in zip(limits, works, strict=True):
+        lost = 100.0 * float(np.mean(work() != exact))
+        points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MOST_STEPS))
+    made = timed(points, works, repeats)
+    time = f"{len(exact):,} rays of photos and fingers"
+    return Panel("most steps of a ray", time, "% of rays lost", "no limit", 0.01, made, 100.0 / len(exact))
+
+
+def _met(bodies: Sequence[Marched], most_steps: int) -> NDArray[np.bool_]:
+    """Which of all the rays that were asked of the bodies meet them within so many steps."""
+    met = []
+    for body in bodies:
+        body.most_steps = most_steps
+        met += [again() for again in body.asked]
+    return np.concatenate([found if found.dtype == bool else np.isfinite(found) for found in met])

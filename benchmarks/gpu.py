@@ -1,0 +1,123 @@
+"""What a graphics card gives: building, asking, training and simulating, on a device and on the processor in turns.
+
+    python -m benchmarks.gpu [--device cuda] [--tower mobilenet_v2] [--json]
+
+The towers are those that the commands run, moved to the device: images come from the processor and codes go back, as in
+a build. What is judged and what is simulated is numpy's work: it is timed once, to show what a card cannot shorten.
+"""
+
+import argparse
+import copy
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+import torch
+
+from benchmarks import grasp
+from benchmarks.common import Line, as_text, config_of, duration, in_turns, matcher_of, random_images
+from benchmarks.step import pair_batch, shared_photos
+from retrieval.model.config import Config
+from retrieval.model.encode import default_device, encode_photos, encode_touches, to_batch, touch_batch
+from retrieval.model.fusion import Matcher, judge_of
+from retrieval.model.towers import TOWERS
+from retrieval.training.step import batch_loss
+from retrieval.training.train import set_training_mode
+
+PHOTOS, JUDGED, REPETITIONS = 64, 1000, 5
+
+
+def measure(
+    config: Config, device: torch.device | str, photos: int = PHOTOS, repetitions: int = REPETITIONS
+) -> Iterator[Line]:
+    """A line each for building, asking and training; times wait for the device to be done."""
+    matcher, pre, there = matcher_of(config), config.preprocessing, torch.device(device)
+    arms = {"cpu": matcher, str(there): copy.deepcopy(matcher).to(there)}
+    images = random_images(photos, pre.photo_px, seed=1)
+    strips = [np.concatenate([image] * len(pre.views), axis=1) for image in images]
+    touch = random_images(config.matcher.fingers, pre.touch_px, seed=2)
+    halves = np.random.default_rng(0).normal(size=(JUDGED, config.matcher.half)).astype(np.float16)
+    judge = judge_of(matcher.head)
+
+    def ask(model: Matcher) -> object:
+        return judge.logits(encode_touches(model, [touch]).half.numpy(), halves)
+
+    works: dict[str, Callable[[Matcher], object]] = {
+        f"build, {photos} photos in batches of 16": lambda model: encode_photos(model, strips),
+        f"ask, one touch, {JUDGED} photos judged": ask,
+    }
+    for name, work in works.items():
+        yield _line(
+            name,
+            config,
+            {arm: _waiting(partial(work, model), there) for arm, model in arms.items()},
+            repetitions,
+        )
+    steps = {arm: _waiting(_step(model, config, photos), there) for arm, model in arms.items()}
+    yield _line("train, a step of 6 touches x 8 photos", config, steps, repetitions)
+
+
+def _line(name: str, config: Config, arms: dict[str, Callable[[], object]], repetitions: int) -> Line:
+    times = in_turns(arms, repetitions)
+    here, there = "cpu", list(arms)[-1]
+    ratio = times.ratio(here, there)
+    text = f"{name}: {duration(times.median(there))} on {there}, {duration(times.median(here))} on the processor"
+    text += f": {as_text(ratio)}"
+    return Line(
+        "gpu", config.matcher.tower, text, {f"{arm}_s": times.median(arm) for arm in arms} | {"ratio": ratio[0]}
+    )
+
+
+def _step(matcher: Matcher, config: Config, photos: int, touches: int = 6) -> Callable[[], object]:
+    """A step of training on the matcher's device, from images that lie in the processor's memory."""
+    set_training_mode(matcher, config.training)
+    for norm in (matcher.touch_norm, matcher.photo_norm):
+        norm.eval()
+    pre, device = config.preprocessing, next(matcher.parameters()).device
+    optimizer = torch.optim.Adam(matcher.parameters(), lr=1e-6)
+    shared = shared_photos(touches, 8)
+    grasps = [random_images(config.matcher.fingers, pre.touch_px, seed=number) for number in range(touches)]
+    own = [np.concatenate([each] * len(pre.views), axis=1) for each in random_images(shared.max() + 1, pre.photo_px, 9)]
+    labels = (np.arange(len(shared)) % 8 < 4).astype(np.float32)
+    batch = pair_batch(np.repeat(np.arange(touches), 8), shared, labels)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        features = matcher.touch_features(touch_batch(grasps, device)), matcher.photo_features(to_batch(own, device))
+        batch_loss(matcher, config.training, batch, *features)[0].backward()
+        optimizer.step()
+
+    return step
+
+
+def _waiting(work: Callable[[], object], device: torch.device) -> Callable[[], object]:
+    """The work, and what it left to the device."""
+    if device.type != "cuda":
+        return work
+
+    def done() -> None:
+        work()
+        torch.cuda.synchronize(device)
+
+    return done
+
+
+def main() -> None:
+    """Print every line as soon as it is there."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--device", default=str(default_device()))
+    parser.add_argument("--tower", choices=sorted(TOWERS), default="mobilenet_v2")
+    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    arguments = parser.parse_args()
+    for lines in (
+        measure(config_of(arguments.tower), arguments.device),
+        grasp.measure(objects=4, grasps=1, collected=0),
+    ):
+        for line in lines:
+            print(json.dumps(dataclasses.asdict(line)) if arguments.json else line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""What a simulated grasp costs: the whole, each output alone, what leaving one out saves; then whole collections."""
+
+import dataclasses
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.common import Line, duration
+from robot.collect import CollectSettings, collect
+from robot.readings import Pose
+from robot.rig import load_rig
+from robot.sim.pinch import Grip
+from robot.sim.rig import SimRig
+from robot.sim.scene import Scene
+
+FRAMES = ("", "_before", "_after")
+EVERYTHING = {"photo", "depth", *(f"touch_{finger}{moment}" for finger in "ab" for moment in FRAMES)}
+ARMS = {
+    "everything": EVERYTHING,
+    "without depth": EVERYTHING - {"depth"},
+    "without shadow": EVERYTHING,
+    "without finger b": {name for name in EVERYTHING if not name.startswith("touch_b")},
+    "without photo and depth": EVERYTHING - {"photo", "depth"},
+    "photo alone": {"photo"},
+    "depth alone": {"depth"},
+    "one touched gel alone": {"touch_a"},
+    "one untouched gel alone": {"touch_a_before"},
+}
+
+
+def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator[Line]:
+    """A line an arm, each over the same scenes, one thread; then a line for one job and one for two."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        scenes = list(_scenes(objects, grasps + 1))
+        yield from _arms(scenes[objects:], scenes[:objects])
+    finally:
+        cv2.setNumThreads(threads)
+    if collected:
+        for jobs in (1, 2):
+            yield _collected(collected, jobs)
+
+
+def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
+    """Grips about the middle of the rig's objects, each round over all of them."""
+    rig = SimRig(40_000)
+    held = {name: rig._find(name) for name in rig.object_ids(objects)}
+    rng = np.random.default_rng(0)
+    for number in range(grasps):
+        for name, obj in held.items():
+            rig.prepare(name, number)
+            scene = dataclasses.replace(rig.world.now(), obj=obj)
+            height = max(10.0, rng.uniform(0.3, 0.8) * float(obj.body.upper[2]))
+            pose = Pose(scene.placement.x_mm, scene.placement.y_mm, height, rng.uniform(0, np.pi))
+            yield dataclasses.replace(scene, grip=Grip(pose, rng.uniform(5, 25)))
+
+
+def _arms(scenes: list[Scene], warm: list[Scene]) -> Iterator[Line]:
+    """Arms in turns, scene by scene; `warm` bakes each object's relief and fills the caches."""
+    for scene in warm:
+        dataclasses.replace(scene, outputs=frozenset(EVERYTHING)).run()
+    seconds: dict[str, list[float]] = {name: [] for name in ARMS}
+    for scene in scenes:
+        for name in ARMS:
+            seconds[name].append(_seconds(_arm(scene, name)))
+    whole = float(np.mean(seconds["everything"]))
+    for name, each in seconds.items():
+        mean = float(np.mean(each))
+        text = f"{duration(mean)} a grasp, {1 / mean:.1f} a second; {mean / whole:.0%} of everything"
+        yield Line("grasp", name, text, {"seconds": mean, "share": mean / whole})
+
+
+def _arm(scene: Scene, name: str) -> Scene:
+    bare = {finger: sensor for finger, sensor in scene.sensors.items() if name != "without finger b" or finger != "b"}
+    return dataclasses.replace(
+        scene, sensors=bare, shadow=name != "without shadow", outputs=frozenset(ARMS[name]), passes=Counter()
+    )
+
+
+def _seconds(scene: Scene) -> float:
+    """Of CPU time: it is one thread's."""
+    start = time.process_time()
+    scene.run()
+    return time.process_time() - start
+
+
+def _collected(objects: int, jobs: int) -> Line:
+    """A whole collection, from starting processes to the last file on the disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        make_rig = partial(load_rig, "sim", seed=1)
+        tallies = collect(
+            make_rig, Path(folder) / "r", objects=objects, seed=1, settings=CollectSettings(grasps=4), jobs=jobs
+        )
+        seconds = time.perf_counter() - start
+    attempts = sum(tally.attempts for tally in tallies)
+    accepted = sum(tally.accepted for tally in tallies)
+    text = f"{attempts / seconds:.2f} attempts and {accepted / seconds:.2f} accepted grasps a second, all files written"
+    figures = {"attempts_per_s": attempts / seconds, "accepted_per_s": accepted / seconds}
+    return Line("grasp", f"collect with {jobs} job{'s' * (jobs > 1)}", text, figures)

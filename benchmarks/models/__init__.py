@@ -1,0 +1,1 @@
+"""What makes the shipped models, and what says how good they are."""

@@ -1,0 +1,203 @@
+"""Measure answers from a catalogue of 30 simulated objects: verdict, ranking, P(object | present), advice.
+
+    python -m benchmarks.models.answers RECORDING [RECORDING ...] [--photos 3] [--references 0] [--touches 5]
+
+The photos of each object's first grasps are the catalogue, its next touches reference touches, its last touches the
+queries, in as many orders. Each query is asked of 30 objects with the true one, and of 30 others, with the shipped
+checkpoint, which must not have seen them. An object's logit does not depend on the rest of the catalogue, so that one
+index of all objects of a recording gives the logits of all these catalogues. Intervals resample objects.
+"""
+
+import argparse
+import itertools
+import shutil
+import sys
+import tempfile
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.models.verdicts import interval, redrawn
+from retrieval.data.dataset import load_grasps
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.answer import is_clear
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import Felt
+
+OBJECTS = 30
+BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer to some grasps of one object: is the first object right, is the verdict "match", its P(o | present),
+    and the further grasps that it asks for."""
+
+    right: bool
+    match: bool
+    if_present: float
+    more: int | None
+
+    @property
+    def advice(self):
+        """The kind of the advice where the verdict is "none of these"."""
+        if not is_clear(self.if_present):
+            return "the ranking is not clear"
+        return "more grasps hardly change it" if self.more is None else "another grasp would help"
+
+
+@dataclass(frozen=True)
+class Series:
+    """Answers after the first grasp, after two, ...; whose grasps, and whether the catalogue has the object."""
+
+    owner: str
+    present: bool
+    answers: list[Answer]
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
+    parser.add_argument("--photos", type=int, default=3, help="grasps of each object whose photos are the catalogue")
+    parser.add_argument("--references", type=int, default=0, help="grasps of each object that are reference touches")
+    parser.add_argument("--touches", type=int, default=5, help="grasps of each object that query")
+    given = parser.parse_args()
+    counts = (given.photos, given.references, given.touches)
+    series = [one for recording in given.recordings for one in asked(recording, *counts)]
+    print(f"{len({one.owner for one in series})} objects, {len(series) // 2} orders of their grasps")
+    for table in (verdicts, calibration, advised):
+        print("\n".join(table(series)) + "\n")
+
+
+def asked(recording, photos, references, touches):
+    """Two series of answers for each object and order of its grasps: with the object in the catalogue, and without."""
+    with tempfile.TemporaryDirectory() as folder:
+        queries = arrange(recording, photos, references, touches, Path(folder, "catalog"))
+        build_index(Path(folder, "catalog"), load_checkpoint(shipped_model()), Path(folder, "index"), quiet=True)
+        with Searcher.open(Path(folder, "index")) as searcher:
+            names, draw = np.array(sorted(queries)), np.random.default_rng(0)
+            for name in names:
+                codes = searcher.encode(queries[name])
+                for start in range(touches):
+                    order = np.roll(np.arange(touches), -start)
+                    logits = [logits_of(searcher, codes, order[:count], len(names)) for count in range(1, touches + 1)]
+                    others = draw.permutation(names[names != name])
+                    for catalogue in (np.append(others[: OBJECTS - 1], name), others[:OBJECTS]):
+                        told = [answer(searcher.posterior, own, catalogue, name) for own in enumerate(logits, 1)]
+                        yield Series(f"{recording.name} {name}", name in catalogue, told)
+
+
+def logits_of(searcher, codes, rows, count):
+    """Logit of each object after these grasps."""
+    found = searcher.shard.ask(Felt(codes.embeddings[rows], codes.halves[rows]), count, None, searcher.posterior)
+    return {one.photo.object_id: one.logit for one in found.best}
+
+
+def arrange(recording, photos, references, touches, catalogue):
+    """Fill a catalogue; returns the touches of each object that query."""
+    grasps = defaultdict(list)
+    for grasp in load_grasps(recording):
+        grasps[grasp.object_id].append(grasp)
+    queries = {}
+    for name, own in grasps.items():
+        if len(own) < photos + references + touches:
+            continue
+        (catalogue / name).mkdir(parents=True)
+        for number, grasp in enumerate(own[:photos]):
+            shutil.copyfile(grasp.photo, catalogue / name / f"{number}{grasp.photo.suffix}")
+        for number, grasp in enumerate(own[photos : photos + references]):
+            for finger, touch in zip("ab", grasp.touches, strict=True):
+                shutil.copyfile(touch, catalogue / name / f"touch_{number}_{finger}{touch.suffix}")
+        queries[name] = [[str(path) for path in grasp.touches] for grasp in own[-touches:]]
+    return queries
+
+
+def answer(posterior, numbered, catalogue, name):
+    """The answer from a catalogue of some objects, by their logits after so many grasps."""
+    grasps, logits = numbered
+    own = np.array([logits[one] for one in catalogue])
+    belief, best = posterior.believe(own, grasps), int(own.argmax())
+    match, if_present = bool(belief.objects[best] > belief.none), float(belief.objects_if_present[best])
+    more = None if match or not is_clear(if_present) else posterior.more_grasps(own[best], len(own), grasps)
+    return Answer(catalogue[best] == name, match, if_present, more)
+
+
+def verdicts(series):
+    """Rows by the number of grasps."""
+    yield "| grasps | R@1 | match, right | match, wrong | none, ranking right | none, ranking wrong | absent: match |"
+    yield "|---|---|---|---|---|---|---|"
+    for grasps in range(1, len(series[0].answers) + 1, 2):
+        here, gone = split(series, grasps)
+        cells = [
+            share(here, lambda one: one.right),
+            share(here, lambda one: one.match and one.right),
+            share(here, lambda one: one.match and not one.right),
+            share(here, lambda one: not one.match and one.right),
+            share(here, lambda one: not one.match and not one.right),
+            share(gone, lambda one: one.match),
+        ]
+        yield f"| {grasps} | " + " | ".join(cells) + " |"
+
+
+def split(series, grasps):
+    """(owner, answer) with the object in the catalogue, and without."""
+    every = [
+        [(one.owner, one.answers[grasps - 1]) for one in series if one.present is there] for there in (True, False)
+    ]
+    return every[0], every[1]
+
+
+def share(pairs, holds):
+    """The share for which it holds, with its interval over objects."""
+    owners = np.unique([owner for owner, _ in pairs], return_inverse=True)[1]
+    values = np.array([holds(one) for _, one in pairs], dtype=float)
+    value, low, high = interval(lambda rows: float(values[rows].mean()), np.arange(len(values)), list(redrawn(owners)))
+    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def calibration(series):
+    """P(object | present) of the first object against how often it is right, in bins; objects that are present."""
+    yield "| grasps | P(object given present) | all: answers, mean, right | none of these: answers, mean, right |"
+    yield "|---|---|---|---|"
+    for grasps in (1, 3):
+        here, _ = split(series, grasps)
+        for low, high in itertools.pairwise(BINS):
+            own = [one for _, one in here if low < one.if_present <= high]
+            cells = [counted(own), counted([one for one in own if not one.match])]
+            yield f"| {grasps} | {low} to {high} | " + " | ".join(cells) + " |"
+
+
+def counted(own):
+    """Number of answers, mean probability, share that is right."""
+    if not own:
+        return "0"
+    means = np.mean([(one.if_present, one.right) for one in own], axis=0)
+    return f"{len(own)}, {means[0]:.2f}, {means[1]:.2f}"
+
+
+def advised(series):
+    """What became of "none of these" after the grasps that the advice names; where it names none, after all grasps."""
+    yield "| grasps | advice | present: answers, ranking right, then match, match right | absent: answers, then match |"
+    yield "|---|---|---|---|"
+    for grasps in range(1, len(series[0].answers)):
+        for advice in ("another grasp would help", "more grasps hardly change it", "the ranking is not clear"):
+            cells = []
+            for present in (True, False):
+                own = [one for one in series if one.present is present and not one.answers[grasps - 1].match]
+                own = [one.answers for one in own if one.answers[grasps - 1].advice == advice]
+                own = [each for each in own if grasps + (each[grasps - 1].more or 0) <= len(each)]  # so many were made
+                later = [each[grasps + (each[grasps - 1].more or len(each) - grasps) - 1] for each in own]
+                then = sum(one.match for one in later)
+                right = sum(each[grasps - 1].right for each in own)
+                kept = sum(one.match and one.right for one in later)
+                cells.append(f"{len(own)}, {right}, {then}, {kept}" if present else f"{len(own)}, {then}")
+            yield f"| {grasps} | {advice} | " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

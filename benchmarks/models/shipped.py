@@ -1,0 +1,321 @@
+"""The checkpoint that comes with the package: how it was made, and how good it is on objects that it never saw.
+
+    python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
+        collect grasps, photos and presses of other objects each on the simulated rig, teach both towers relief, train
+        the matcher, and store it as float16 in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one for touches
+        of one gel image, of the same grasps
+    python -m benchmarks.models.shipped distil FOLDER
+        teach the pruner of the shipped checkpoint again, from the recording, pictures and features that `make` left in
+        FOLDER; with --fingers 1 that of the one for one finger
+    python -m benchmarks.models.shipped verdicts FOLDER
+        fit the posterior and the gel check of the shipped checkpoint again, on its validation objects and as many
+        training ones, collected into FOLDER/verdicts
+    python -m benchmarks.models.shipped references FOLDER
+        fit what reference touches are worth to the shipped checkpoint, on its validation objects, collected into
+        FOLDER/references; with --fingers 1 to the one for one finger
+    python -m benchmarks.models.shipped score FOLDER
+        collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
+        --fingers 1 that for one finger, in FOLDER/report-one-finger
+
+Simulated touches are no measure of what the method does on real sensors.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import robot.collect
+import robot.rig
+from retrieval.commands.main import main as run_command
+from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
+from retrieval.methods.base import Setting
+from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.config import load_config
+from retrieval.model.encode import default_device, one_thread
+from retrieval.model.references import fit_references
+from retrieval.model.stored import HALVES_OF
+from retrieval.search import defaults
+from retrieval.training import distil
+from retrieval.training.batches import FrozenFeatures, recorded_features
+from retrieval.training.features import Features, by_image, encode_recording
+from retrieval.training.judgement import asked_touches, with_verdicts
+from retrieval.training.train import labelled_pairs
+
+# Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
+SEED_TRAINED, SEED_SCORED = 10_000, 30_000
+SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
+RIG, TOUCH_RIG = (Path(__file__).with_name(name) for name in ("shipped_rig.toml", "shipped_touches.toml"))
+PRESET = "relief"
+VALIDATION = 100
+"""Objects that choose the checkpoint and calibrate it."""
+VERDICT_GRASPS, REFERENCE_GRASPS = 4, 8
+"""Of each object on which the posterior and the gel check are fitted, and what references are worth."""
+FOREIGN = 8000
+"""Pictures that are no gels, from which its check of touches learns: more than a training's own."""
+DISTIL_STEPS = 4000
+"""Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
+FITTED = 10
+"""Scored objects on which calibration and, as training objects, whatever else is fitted; the others are judged."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one of the jobs."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    jobs = parser.add_subparsers(dest="job", required=True)
+    make = jobs.add_parser("make", help="collect and train the checkpoint that comes with the package")
+    make.add_argument("folder", type=Path)
+    make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
+    make.add_argument("--objects", type=int, default=1380, help="felt and photographed")
+    make.add_argument("--grasps", type=int, default=4, help="of each of them")
+    make.add_argument("--photos", type=int, default=10_000, help="objects that are only photographed")
+    make.add_argument("--touches", type=int, default=9_361, help="objects that are only pressed")
+    make.add_argument("--steps", type=int, default=2500, help="of teaching each tower relief")
+    make.add_argument("--iterations", type=int, default=2500, help="of training the head")
+    pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
+    pruner.add_argument("folder", type=Path)
+    pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
+    verdicts = jobs.add_parser("verdicts", help="fit its posterior and its gel check again, and nothing else of it")
+    verdicts.add_argument("folder", type=Path)
+    worth = jobs.add_parser("references", help="fit what reference touches are worth, and nothing else of it")
+    worth.add_argument("folder", type=Path)
+    score = jobs.add_parser("score", help="judge it on other objects")
+    score.add_argument("folder", type=Path)
+    score.add_argument("--objects", type=int, default=120)
+    score.add_argument("--grasps", type=int, default=8)
+    score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
+    for job in (make, pruner, worth, score):
+        job.add_argument(
+            "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
+        )
+    for job in (make, verdicts, worth, score):
+        job.add_argument("--jobs", type=int, default=2)
+    arguments = parser.parse_args(argv)
+    run = {
+        "make": make_shipped,
+        "distil": distil_shipped,
+        "verdicts": judge_shipped,
+        "references": tell_shipped,
+        "score": score_shipped,
+    }
+    return run[arguments.job](arguments)
+
+
+def make_shipped(arguments: argparse.Namespace) -> int:
+    """Collect, encode and train; what is there already is gone on with."""
+    folder = arguments.folder
+    recording = folder / "recording"
+    code = collect(recording, arguments, SEED_TRAINED) or teach_towers(arguments)
+    if code:
+        return code
+    config = load_config(PRESET)
+    training = dataclasses.replace(
+        config.training.of_steps(arguments.iterations),
+        init=str(arguments.init),
+        init_photo=str(folder / "photo-tower.safetensors"),
+        init_touch=str(folder / "touch-tower.safetensors"),
+        photos=str(folder / "photos"),
+        touches=str(folder / "touches"),
+    )
+    matcher = dataclasses.replace(config.matcher, fingers=arguments.fingers)
+    config = dataclasses.replace(config, matcher=matcher, training=training)
+    grasps, towers = load_grasps(recording), frozen_matcher(config)
+    if arguments.fingers == 1:
+        grasps = [part for grasp in grasps for part in each_finger(grasp)]
+    features, pairs = (
+        encode_recording(part, towers, config, folder / "features") for part in (grasps, labelled_pairs(config))
+    )
+    split = draw_split(grasps, train=None, validation=VALIDATION)
+    train, validation = features.of_objects(split.train).joined(pairs), features.of_objects(split.validation)
+    trained = folder / f"{arguments.fingers}-fingers"
+    made = trained_checkpoint(Setting(config, folder=trained, quiet=False), train, validation)
+    about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
+    # The split names whom a recording may not be judged on; no recording holds the pairs.
+    made = dataclasses.replace(made, provenance=made.provenance | about, split=split)
+    made = taught(made, train, validation, DISTIL_STEPS)
+    store(judging(made, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
+    return 0
+
+
+def each_finger(grasp: Grasp) -> list[Grasp]:
+    """What each finger felt, as a grasp of its own."""
+    return [
+        dataclasses.replace(
+            grasp,
+            grasp_id=f"{grasp.grasp_id}-{finger}",
+            touches=grasp.touches[row : row + 1],
+            backgrounds=grasp.backgrounds[row : row + 1],
+        )
+        for row, finger in enumerate("ab")
+    ]
+
+
+def teach_towers(arguments: argparse.Namespace) -> int:
+    """Photograph and press objects of two other worlds, and teach each tower what it sees there."""
+    for side, pictures, seed, rig in (
+        ("photo", "photos", SEED_PHOTOS, "sim"),
+        ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
+    ):
+        folder, tower = arguments.folder / pictures, arguments.folder / f"{side}-tower.safetensors"
+        size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
+        code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
+        if not code and not tower.exists():
+            how = ("--config", PRESET, "--init", arguments.init, "--iterations", arguments.steps)
+            code = retrieve("train", folder, "--task", "relief", *how, "--out", tower)
+        if code:
+            return code
+    return 0
+
+
+def judge_shipped(arguments: argparse.Namespace) -> int:
+    """All weights stay; of the recording that `make` would collect only the objects that are looked at are made."""
+    shipped = load_checkpoint(defaults.shipped_model())
+    assert shipped.split is not None
+    names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
+    grasps = collect_of(arguments.folder / "verdicts", names, VERDICT_GRASPS, arguments.jobs)
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
+    return 0
+
+
+def tell_shipped(arguments: argparse.Namespace) -> int:
+    """All weights and the posterior stay."""
+    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
+    assert shipped.split is not None
+    names = shipped.split.validation
+    grasps = collect_of(arguments.folder / "references", names, REFERENCE_GRASPS, arguments.jobs)
+    if arguments.fingers == 1:
+        grasps = [each_finger(grasp)[0] for grasp in grasps]
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    device = default_device()
+    with FrozenFeatures(shipped.config, device, by_image(grasps, features, device)) as source:
+        found = recorded_features(shipped.matcher, source, grasps, what="references", quiet=False)
+    asked = asked_touches(shipped.matcher, grasps, *found)
+    assert asked is not None
+    made = same_codes(dataclasses.replace(shipped, references=fit_references(asked)), shipped)
+    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
+    return 0
+
+
+def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:
+    """Of the world that `make` collects, these objects."""
+    robot.collect.collect(
+        functools.partial(robot.rig.load_rig, str(RIG), seed=SEED_TRAINED),
+        recording,
+        objects=names,
+        seed=SEED_TRAINED,
+        settings=robot.collect.CollectSettings(grasps=grasps),
+        jobs=jobs,
+    )
+    return load_grasps(recording)
+
+
+def same_codes(made: Checkpoint, before: Checkpoint) -> Checkpoint:
+    """A checkpoint with the towers and the head of the one before: an index of that one keeps its halves."""
+    halves_of = [*before.provenance.get(HALVES_OF, []), before.digest]
+    return dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
+
+
+def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
+    """A checkpoint with its posterior and its gel check."""
+    assert made.split is not None
+    device = default_device()
+    with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
+        parts = (made.split.select(grasps, part) for part in ("train", "validation"))
+        return with_verdicts(made, source, *parts, foreign=FOREIGN)
+
+
+def distil_shipped(arguments: argparse.Namespace) -> int:
+    """Towers, head, calibration and split stay; the pruner reads the weights that are shipped, rounded as they are."""
+    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
+    grasps = load_grasps(arguments.folder / "recording")
+    if arguments.fingers == 1:
+        grasps = [part for grasp in grasps for part in each_finger(grasp)]
+    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
+    assert shipped.split is not None
+    train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
+    paths = {"photos": str(arguments.folder / "photos"), "touches": str(arguments.folder / "touches")}
+    training = dataclasses.replace(shipped.config.training, **paths)
+    pairs = labelled_pairs(dataclasses.replace(shipped.config, training=training))
+    train = train.joined(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
+    made = same_codes(taught(shipped, train, validation, arguments.steps), shipped)
+    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
+    return 0
+
+
+def taught(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
+    """A checkpoint with the preset's pruner."""
+    training = dataclasses.replace(made.config.training, distil_steps=steps)
+    config = dataclasses.replace(made.config.with_pruner_of(load_config(PRESET)), training=training)
+    with one_thread():  # as training on features that stand still
+        halves = (distil.feature_halves(made.matcher, part) for part in (train, validation))
+        return distil.with_pruner(made, config, *halves)
+
+
+def store(made: Checkpoint, out: Path) -> None:
+    """Write a checkpoint once more, as float16; where its first weights lay on this machine concerns nobody."""
+    training = dataclasses.replace(
+        made.config.training, init="imagenet", init_photo="", init_touch="", photos="", touches=""
+    )
+    made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
+    store_checkpoint(made, out, float16=True)
+
+
+def score_shipped(arguments: argparse.Namespace) -> int:
+    """The whole report on objects of another world, felt by other gels."""
+    recording = arguments.folder / "recording"
+    if code := collect(recording, arguments, SEED_SCORED):
+        return code
+    split = recording.with_name("split.json")
+    split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
+    model = arguments.model or defaults.shipped_model(arguments.fingers)
+    methods = "late_fusion,prune_rerank,chance"
+    out = arguments.folder / "report"
+    if arguments.fingers == 1:
+        recording, out = first_finger(recording), arguments.folder / "report-one-finger"
+    return retrieve("evaluate", recording, "--model", model, "--methods", methods, "--split", split, "--out", out)
+
+
+def first_finger(recording: Path) -> Path:
+    """A recording of the same grasps, of which one finger felt anything, beside `recording`; images are linked."""
+    out = recording.with_name(recording.name + "-one-finger")
+    out.mkdir(exist_ok=True)
+    if not (out / "images").exists():
+        (out / "images").symlink_to((recording / "images").resolve(), target_is_directory=True)
+    (out / "recording.json").write_bytes((recording / "recording.json").read_bytes())
+    lines = [json.loads(line) for line in (recording / "metadata.jsonl").read_text().splitlines()]
+    felt = [{name: value for name, value in line.items() if not name.startswith("touch_b_")} for line in lines]
+    (out / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in felt))
+    return out
+
+
+def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:
+    """So many objects to train and to validate on, the others to test; train None: all others train."""
+    names = sorted({grasp.object_id for grasp in grasps})
+    names = [str(name) for name in np.random.default_rng(0).permutation(names)]
+    held, others = names[:validation], names[validation:]
+    seen = others if train is None else others[:train]
+    return Split(0, tuple(sorted(seen)), tuple(sorted(held)), tuple(sorted(set(others) - set(seen))))
+
+
+def collect(recording: Path, arguments: argparse.Namespace, seed: int) -> int:
+    """`retrieve collect` on the simulated rig."""
+    size = ("--objects", arguments.objects, "--grasps", arguments.grasps, "--seed", seed, "--jobs", arguments.jobs)
+    return retrieve("collect", "--rig", RIG, *size, "--out", recording)
+
+
+def retrieve(*arguments: object) -> int:
+    """Say a command as a user would type it, and run it."""
+    words = [str(argument) for argument in arguments]
+    print("$ retrieve " + " ".join(words), file=sys.stderr, flush=True)
+    return run_command(words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,347 @@
+"""What "match", "none of these", "no contact" and "not a gel image" are worth, for the checkpoint that is shipped.
+
+    python -m benchmarks.models.verdicts FOLDER
+        writes FOLDER/verdicts.md, verdicts.json and risk.png; goes on where it stopped
+
+Objects of a world and gels that the checkpoint never saw: 120 of them felt (the recording of `python -m
+benchmarks.models.shipped score FOLDER`), 880 more only photographed, so that catalogues of up to 1,000 objects can be
+searched with the object in the hand and without it. Then inputs that are no touches. Pictures of real sensors and
+things are looked at where the variable TOUCH_DATA names a folder that has them. Simulated touches are no measure of
+what real sensors do.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from benchmarks.models import shipped
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import load_grasps
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import RgbImage
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import for_inference, photo_features, touch_batch
+from retrieval.model.fusion import judge_of
+from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.posterior import JudgedTouches, Questions
+from retrieval.search.defaults import shipped_model
+from retrieval.training.features import encode_recording
+from retrieval.training.foreign import draw_foreign
+from robot.collect import CollectSettings, collect
+from robot.rig import load_rig
+from robot.sim.objects.draw import draw_object
+
+FELT, PHOTOGRAPHED, GRASPS = 120, 1000, 8
+SIZES, SET_SIZES, SETS = (20, 100, 1000), (1, 2, 3, 5), 4
+INPUTS, DRAWS = 1000, 1000
+OTHER_OPTICS = "gelsight"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Make both tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--model", type=Path, default=shipped_model(), help="another checkpoint than the shipped one")
+    parser.add_argument("--jobs", type=int, default=2)
+    arguments = parser.parse_args(argv)
+    folder, made = arguments.folder, load_checkpoint(arguments.model)
+    if made.posterior is None or made.gel_check is None:
+        parser.error(f"{arguments.model} has no posterior or no check of touches; train it again")
+    collected = argparse.Namespace(objects=FELT, grasps=GRASPS, jobs=arguments.jobs)
+    if code := shipped.collect(folder / "recording", collected, shipped.SEED_SCORED):
+        return code
+    photograph(folder / "photographed")
+    catalogues, curves = judge_catalogues(made, folder)
+    inputs = list(judge_inputs(made, folder, arguments.jobs))
+    document = {"model": made.digest, "catalogues": catalogues, "inputs": inputs, "risk": curves}
+    (folder / "verdicts.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+    (folder / "verdicts.md").write_text("\n".join(as_markdown(document)) + "\n", "utf-8")
+    plot(curves, folder / "risk.png")
+    print((folder / "verdicts.md").read_text("utf-8"))
+    return 0
+
+
+def photograph(folder: Path) -> None:
+    """A photo of each object that is not felt."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with load_rig(str(shipped.RIG), seed=shipped.SEED_SCORED) as rig, Bar("photograph", PHOTOGRAPHED, "objects") as bar:
+        bar.advance(FELT)
+        for index in range(FELT, PHOTOGRAPHED):
+            name = draw_object(shipped.SEED_SCORED, index).object_id
+            if not (folder / f"{name}.png").is_file():
+                rig.prepare(name, 0)
+                cv2.imwrite(str(folder / f"{name}.part.png"), rig.camera.read(depth=False).colour[..., ::-1])
+                (folder / f"{name}.part.png").rename(folder / f"{name}.png")
+            bar.advance()
+
+
+# With the object and without it ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Log likelihood ratios (T, K) of catalogues with the object, which stands first, and without; whose (T,)."""
+
+    present: NDArray[np.float64]
+    absent: NDArray[np.float64]
+    owner: NDArray[np.int64]
+
+
+def judge_catalogues(made: Checkpoint, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """A row for each size of catalogue and number of grasps, and the curves of risk against coverage."""
+    judged = judge_photos(made, folder)
+    rows, curves = [], {}
+    for grasps in SET_SIZES:
+        for size, asked in questions(made, judged, grasps):
+            rows.append({"objects": size, "grasps": grasps, "questions": len(asked.owner)} | measured(asked))
+            curves[f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"] = risk_against_coverage(asked)
+    return rows, curves
+
+
+def judge_photos(made: Checkpoint, folder: Path) -> JudgedTouches:
+    """Match logits of the touches of the felt objects with photos of all."""
+    grasps = load_grasps(folder / "recording")
+    features = encode_recording(grasps, made.matcher, made.config, folder / "features")
+    files = sorted((folder / "photographed").glob("*.png"))
+    images: Iterator[RgbImage] = map(made.config.preprocessing.load_photo, files)
+    with torch.inference_mode():
+        photos = torch.cat([torch.from_numpy(features.photo), photo_features(made.matcher, images)])
+        touches = made.matcher.touch_code(torch.from_numpy(features.touch).flatten(1)).half.numpy()
+        halves = made.matcher.photo_code(photos).half.numpy()
+    judge = judge_of(made.matcher.head)
+    felt = features.owner
+    owner = np.concatenate([felt, felt.max() + 1 + np.arange(len(files))])
+    own = np.zeros((len(felt), len(owner)), dtype=bool)
+    own[np.arange(len(felt)), np.arange(len(felt))] = True
+    return JudgedTouches(np.stack([judge.logits(half[None], halves) for half in touches]), felt, owner, own)
+
+
+def questions(made: Checkpoint, judged: JudgedTouches, grasps: int) -> Iterator[tuple[int, Asked]]:
+    """Of sets of so many grasps, for every size of catalogue; rivals drawn by a seed."""
+    assert made.posterior is not None
+    rng = np.random.default_rng([7, grasps])
+    sets = []
+    for name in np.unique(judged.touch_owner):
+        mine = np.flatnonzero(judged.touch_owner == name)
+        if len(mine) > grasps:
+            sets += [[row] for row in mine] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(SETS)]
+    rows = np.array(sets)
+    ratios = Questions.of(judged, rows).log_ratios(made.posterior)
+    owner = judged.touch_owner[rows[:, 0]]
+    keys = rng.random(ratios.shape)
+    keys[np.arange(len(rows)), owner] = -1
+    ranked = np.take_along_axis(ratios, np.argsort(keys, axis=1), 1)
+    for size in SIZES:
+        count = min(size, ranked.shape[1] - 1)
+        yield size, Asked(ranked[:, :count], ranked[:, 1 : count + 1], owner)
+
+
+def measured(asked: Asked) -> dict[str, Any]:
+    """Shares, each with its 95 % interval over objects, drawn again with all their questions."""
+    present, absent = (beliefs(part) for part in (asked.present, asked.absent))
+    first_right = asked.present.argmax(1) == 0
+    accepted, accepted_absent = (part[:, 1:].max(1) > part[:, 0] for part in (present, absent))
+    known, unknown = -present[:, 0], -absent[:, 0]
+    found: dict[str, Callable[[NDArray[np.int64]], float]] = {
+        "first_guess": lambda rows: float(first_right[rows].mean()),
+        "match_and_right": lambda rows: float((accepted & first_right)[rows].mean()),
+        "match_and_wrong": lambda rows: float((accepted & ~first_right)[rows].mean()),
+        "none_though_there": lambda rows: float((~accepted)[rows].mean()),
+        "match_though_absent": lambda rows: float(accepted_absent[rows].mean()),
+        "auroc_of_none": lambda rows: auroc(known[rows], unknown[rows]),
+        "false_accepts_at_95": lambda rows: float((unknown[rows] >= np.quantile(known[rows], 0.05)).mean()),
+    }
+    draws = list(redrawn(asked.owner))
+    every = np.arange(len(asked.owner))
+    values = {name: interval(measure, every, draws) for name, measure in found.items()}
+    said = np.concatenate([present[:, 1:].max(1), absent[:, 1:].max(1)])
+    true = np.concatenate([first_right, np.zeros(len(absent), dtype=bool)])
+    return {**values, "calibration_error": calibration_error(said, true)}
+
+
+def beliefs(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(T, 1 + K) probabilities of "none of these" and of each object, at even odds: what `Posterior.believe` gives."""
+    terms = np.column_stack([np.zeros(len(ratios)), ratios - np.log(ratios.shape[1])])
+    shares = np.exp(terms - terms.max(1, keepdims=True))
+    return np.asarray(shares / shares.sum(1, keepdims=True))
+
+
+def redrawn(owner: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    rng, names = np.random.default_rng(11), np.unique(owner)
+    rows = [np.flatnonzero(owner == name) for name in names]
+    for _ in range(DRAWS):
+        yield np.concatenate([rows[place] for place in rng.integers(len(rows), size=len(rows))])
+
+
+def interval(
+    measure: Callable[[NDArray[np.int64]], float], every: NDArray[np.int64], draws: Sequence[NDArray[np.int64]]
+) -> list[float]:
+    values = [measure(rows) for rows in draws]
+    return [measure(every), *(float(bound) for bound in np.quantile(values, (0.025, 0.975)))]
+
+
+def auroc(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> float:
+    """Chance that a question with the object looks more like one than a question without; equals count half."""
+    ranks = rankdata(np.concatenate([known, unknown]))[: len(known)]
+    return float((ranks.sum() - len(known) * (len(known) + 1) / 2) / (len(known) * len(unknown)))
+
+
+def calibration_error(said: NDArray[np.float64], true: NDArray[np.bool_]) -> float:
+    """Mean distance of what was said from how often it came true, over 10 equal bins."""
+    bins = np.minimum((10 * said).astype(int), 9)
+    return float(np.abs(np.bincount(bins, weights=said - true, minlength=10)).sum() / len(said))
+
+
+def risk_against_coverage(asked: Asked) -> dict[str, list[float]]:
+    """Answers by the probability of their first guess: share answered, and share of these that is wrong; half of the
+    questions are without the object, and every answer to these is wrong."""
+    parts = [beliefs(part)[:, 1:] for part in (asked.present, asked.absent)]
+    said = np.concatenate([part.max(1) for part in parts])
+    wrong = np.concatenate([parts[0].argmax(1) != 0, np.ones(len(parts[1]), dtype=bool)])
+    order = np.argsort(-said, kind="stable")
+    counts = np.arange(1, len(order) + 1)
+    risk = np.cumsum(wrong[order]) / counts
+    shown = np.unique(np.linspace(len(order) // 100, len(order) - 1, 100).astype(int))
+    return {"coverage": (counts[shown] / len(order)).tolist(), "risk": risk[shown].tolist()}
+
+
+# What is no touch ------------------------------------------------------------------------------------------
+
+
+def judge_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
+    """A row for each kind of input: how many, and what they were called."""
+    assert made.gel_check is not None
+    fast = for_inference(made.matcher, ["touch_tower"])
+    for name, wanted, pictures in inputs(made, folder, jobs):
+        readings = []
+        for start in range(0, len(pictures), 16):
+            with torch.inference_mode():
+                features = fast.touch_features(touch_batch([read() for read in pictures[start : start + 16]]))
+                reading = fast.gel_readings(features)
+                assert reading is not None
+                readings.append(reading.numpy())
+        called = made.gel_check.judge(np.concatenate(readings))
+        right = called.count(wanted)
+        yield {
+            "input": name,
+            "count": len(called),
+            "wanted": wanted,
+            "called": {verdict: called.count(verdict) for verdict in (CONTACT, NO_CONTACT, NOT_A_GEL)},
+            "share": [right / len(called), *binomial_interval(right, len(called))],
+        }
+
+
+Reader = Callable[[], list[RgbImage]]
+
+
+def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str, list[Reader]]]:
+    """Name, what it should be called, and readers of touches (an image for each finger)."""
+    settings, fingers = made.config.preprocessing, made.config.matcher.fingers
+    grasps = load_grasps(folder / "recording")
+
+    def files(paths: Sequence[Path]) -> Reader:
+        return lambda: [settings.touch(read_rgb(path)) for path in paths]
+
+    def alike(picture: RgbImage) -> Reader:
+        return lambda: [settings.touch(picture)] * fingers
+
+    yield "touches", CONTACT, [files(grasp.touches) for grasp in grasps][:INPUTS]
+    yield "untouched gels", NO_CONTACT, [files(grasp.backgrounds) for grasp in grasps][:INPUTS]
+    photos = [read_rgb(path) for path in sorted((folder / "photographed").glob("*.png"))[:200]]
+    drawn: dict[str, list[RgbImage]] = {}
+    for name, picture in draw_foreign(INPUTS, 240, photos, [], seed=99):
+        drawn.setdefault(name, []).append(picture)
+    for name, level in (("black", 0.0), ("white", 1.0)):
+        yield name, NOT_A_GEL, [alike(np.full((240, 320, 3), level, dtype=np.float32))]
+    for name, pictures in drawn.items():
+        yield name, NOT_A_GEL, [alike(picture) for picture in pictures]
+    yield "photos, whole", NOT_A_GEL, [alike(photo) for photo in photos]
+    yield f"another sensor: simulated {OTHER_OPTICS} gels", NOT_A_GEL, other_optics(folder, jobs, files)
+    data = Path(os.environ.get("TOUCH_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+    for name, pattern, step in (
+        ("another sensor: real optical finger (VT60)", "vt60/touch/*/*/*.jpg", 50),
+        ("another sensor: real GelSight Mini (billets)", "billets/*/*_touch.png", 1),
+        ("real photos (VT60)", "vt60/vision/*/*/*.jpg", 15),
+        ("real photos (billets)", "billets/*/*_photo.jpg", 1),
+    ):
+        if paths := sorted(data.glob(pattern))[::step]:
+            yield name, NOT_A_GEL, [files([path] * fingers) for path in paths]
+
+
+def other_optics(folder: Path, jobs: int, files: Callable[[Sequence[Path]], Reader]) -> list[Reader]:
+    """Touches of the same objects by gels with the lamps of another sensor."""
+    rig = folder / "other_optics.toml"
+    rig.write_text(f'rig = "sim"\noptics = "{OTHER_OPTICS}"\n', "utf-8")
+    recording = folder / "other_optics"
+    make = partial(load_rig, str(rig), seed=shipped.SEED_SCORED)
+    collect(make, recording, objects=50, seed=shipped.SEED_SCORED, settings=CollectSettings(grasps=2), jobs=jobs)
+    return [files(grasp.touches) for grasp in load_grasps(recording)]
+
+
+# For people ------------------------------------------------------------------------------------------------
+
+
+def as_markdown(document: dict[str, Any]) -> Iterator[str]:
+    """Both tables."""
+    columns = {
+        "first_guess": "first guess",
+        "match_and_right": "match, right",
+        "match_and_wrong": "match, wrong",
+        "none_though_there": "none, though there",
+        "match_though_absent": "object absent: match",
+        "auroc_of_none": "AUROC",
+        "false_accepts_at_95": "false accepts at 95 %",
+    }
+    yield "| objects | grasps | " + " | ".join(columns.values()) + " | calibration error |"
+    yield "|---|---|" + "---|" * (len(columns) + 1)
+    for row in document["catalogues"]:
+        cells = [_with_interval(row[name]) for name in columns]
+        yield f"| {row['objects']:,} | {row['grasps']} | " + " | ".join(cells) + f" | {row['calibration_error']:.3f} |"
+    yield ""
+    yield "| input | number | should be called | is called so | contact / no contact / not a gel image |"
+    yield "|---|---|---|---|---|"
+    for row in document["inputs"]:
+        counts = " / ".join(str(count) for count in row["called"].values())
+        yield f"| {row['input']} | {row['count']} | {row['wanted']} | {_with_interval(row['share'])} | {counts} |"
+
+
+def _with_interval(values: Sequence[float]) -> str:
+    return f"{values[0]:.3f} [{values[1]:.3f}, {values[2]:.3f}]"
+
+
+def plot(curves: dict[str, Any], path: Path) -> None:
+    """Risk against coverage, a panel for each size of catalogue."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(SIZES), figsize=(12, 3.8), sharey=True, layout="constrained")
+    for size, panel in zip(SIZES, axes, strict=True):
+        for grasps in SET_SIZES:
+            name = f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"
+            panel.plot(curves[name]["coverage"], curves[name]["risk"], label=f"{grasps} grasp{'s' * (grasps > 1)}")
+        panel.axhline(1 - 0.5 / size, color="grey", linestyle=":", linewidth=1, label="chance")
+        panel.set(title=f"{size:,} objects", xlabel="share answered", xlim=(0, 1), ylim=(0, 1))
+    axes[0].set_ylabel("share of answers that are wrong")
+    axes[0].legend(loc="lower right", fontsize=8)
+    figure.suptitle("Half of the questions are of objects that the catalogue lacks", fontsize=10)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""`python -m benchmarks.needed [--sizes 1e3 1e4 1e5 1e6 1e7] [--recording R --features F] [--json]`: candidates.
+
+How many candidates hold the winners, against the number of photos. Catalogues are drawn as `benchmarks.scale`
+draws them, block by block, each the beginning of the next, and no block is kept: what grows is time alone. First every
+touch's winner is found, the photo that the classifier ranks first of all; then its place by the pruner. As there, half
+of the touches that the checkpoint keeps choose, `MARGIN` times as many candidates are taken as hold 99 % of their
+winners, and the other touches judge.
+
+All photos are judged in bfloat16, and in float32 whichever comes as near to the best so far as the two differ: `SAFE`
+times the most by which they did for any pair of the first block. So the winner is that of float32. A thousand touches
+of ten million photos take an hour and a half on one thread.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from benchmarks.scale import HELD_OUT, MARGIN, TARGET, Crowd, collected, crowd_of
+from retrieval.console.progress import Bar
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.judge import Judge
+from retrieval.search.defaults import shipped_model
+
+SAFE = 2.0
+
+
+class Coarse:
+    """The classifier's layers in bfloat16."""
+
+    def __init__(self, judge: Judge) -> None:
+        self._width = len(judge.out)
+        layers = (judge.second, judge.second_bias, judge.out)
+        self._second, self._bias, self._out = (torch.from_numpy(layer).bfloat16() for layer in layers)
+        self._constant = float(judge.out_bias[0])
+
+    @torch.inference_mode()
+    def logits(self, touches: NDArray[np.float32], photos: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+        """(len(photos),) for each touch half."""
+        seen = torch.from_numpy(photos[:, : self._width]).bfloat16()
+        straight = touches[:, self._width :] @ photos[:, self._width :].T + self._constant
+        for touch, more in zip(touches, straight, strict=True):
+            hidden = (seen + torch.from_numpy(touch[: self._width]).bfloat16()).relu_()
+            second = torch.addmm(self._bias, hidden, self._second.T).relu_()
+            yield (second @ self._out).float().numpy() + more
+
+
+def winners(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int]) -> tuple[NDArray[Any], float]:
+    """The pruner's cosine (sizes, touches) of each touch with its winner among so many photos, and the share of pairs
+    that were judged in float32 too."""
+    coarse, judge, queries = Coarse(crowd.judge), crowd.judge, crowd.embeddings(touches, "touch")
+    best, cosines = np.full(len(touches), -np.inf, np.float32), np.empty(len(touches), np.float32)
+    margin, twice = np.inf, 0
+    found = []
+    for photos, embeddings, ends in _blocks(crowd, sizes, "winners"):
+        error = 0.0
+        for number, logits in enumerate(coarse.logits(touches, photos)):
+            near = np.flatnonzero(logits > best[number] - margin)
+            if not len(near):
+                continue
+            exact = judge.logits(touches[[number]], photos, near)
+            twice += len(near)
+            error = max(error, float(np.abs(exact - logits[near]).max()))
+            if exact.max() > best[number]:
+                best[number], row = exact.max(), near[exact.argmax()]
+                cosines[number] = queries[number] @ embeddings[row]
+        margin = SAFE * error if np.isinf(margin) else margin
+        if ends:
+            found.append(cosines.copy())
+    return np.array(found), twice / (sizes[-1] * len(touches))
+
+
+def places(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int], cosines: NDArray[Any]) -> NDArray[Any]:
+    """At which place, from 1, the pruner puts each winner: (sizes, touches)."""
+    queries, before = crowd.embeddings(touches, "touch"), np.zeros(cosines.shape, np.int64)
+    at = 0
+    for _, embeddings, ends in _blocks(crowd, sizes, "places"):
+        scores = queries @ embeddings.T
+        for size in range(at, len(sizes)):
+            before[size] += (scores > cosines[size, :, None] + 1e-6).sum(1)
+        at += ends
+    return before + 1
+
+
+def _blocks(crowd: Crowd, sizes: Sequence[int], name: str) -> Iterator[tuple[Any, Any, bool]]:
+    """Halves and embeddings of photos in blocks, and whether one of the sizes ends with the block."""
+    start = 0
+    with Bar(name, sizes[-1], "photos") as bar:
+        for size in sizes:
+            for block in crowd.blocks(start, size, 0):
+                start += len(block.rows)
+                yield block.arrays["halves"].astype(np.float32), block.embeddings, start == size
+                bar.advance(len(block.rows))
+
+
+def lines(sizes: Sequence[int], found: NDArray[Any], asked: int) -> Iterator[dict[str, float]]:
+    """What each size needed. The first `asked` touches choose, the others judge."""
+    for size, order in zip(sizes, found, strict=True):
+        needed = [_needed(some) for some in (order[:asked], order)]
+        taken = min(MARGIN * needed[0], size)
+        judged = order[asked:]
+        held = int((judged <= taken).sum())
+        low, high = binomial_interval(held, len(judged))
+        shares = {"taken": taken, "touches": len(judged), "found": held / len(judged), "low": low, "high": high}
+        yield {"photos": size, "needed": needed[1], "needed_by_chosen": needed[0], "worst": int(order.max()), **shares}
+
+
+def _needed(order: NDArray[Any]) -> int:
+    return int(np.sort(order)[int(np.ceil(TARGET * len(order))) - 1])
+
+
+def main() -> None:
+    """Print a line for each size, then how candidates grow."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.needed", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--sizes", nargs="+", type=float, default=[1e3, 1e4, 1e5, 1e6])
+    parser.add_argument("--held-out", type=int, default=HELD_OUT, help="touches that judge")
+    parser.add_argument("--model", type=Path, default=shipped_model())
+    parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
+    parser.add_argument("--features", type=Path, help="where encoded features are kept")
+    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    arguments = parser.parse_args()
+    sizes = sorted(int(size) for size in arguments.sizes)
+    with tempfile.TemporaryDirectory() as made:
+        crowd = crowd_of(arguments.model, arguments.recording or collected(Path(made)), arguments.features)
+    touches = np.concatenate([crowd.touches, crowd.held_out[: arguments.held_out]])
+    start = time.perf_counter()
+    cosines, twice = winners(crowd, touches, sizes)
+    table = list(lines(sizes, places(crowd, touches, sizes, cosines), len(crowd.touches)))
+    for line in table:
+        shown = {name: value if isinstance(value, int) else round(value, 4) for name, value in line.items()}
+        print(json.dumps(line) if arguments.json else "  ".join(f"{name} {value}" for name, value in shown.items()))
+    for name in ("needed", "taken"):
+        power = np.polyfit(np.log([line["photos"] for line in table]), np.log([line[name] for line in table]), 1)[0]
+        print(json.dumps({"slope": name, "value": power}) if arguments.json else f"N^{power:.2f}  {name}")
+    print(f"{time.perf_counter() - start:.0f} s; {twice:.2%} of pairs judged in float32 too")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,199 @@
+"""Fit gel optics to real presses and judge them on presses held out: `python -m benchmarks.optics.photometric --out
+FOLDER`.
+
+Everything is chosen on the fitting presses (benchmarks.optics.model_choice). A held-out press is predicted as the
+sensor's own unpressed picture and the change that the model sees, and compared over a crop of 200 x 200 pixels round
+the ball.
+
+    labels       centre and contact radius of the held-out press are its label's
+    aligned      these three numbers are found in its picture, the colours held fixed
+                 (benchmarks.optics.least_squares)
+    as shipped   aligned, and chosen so as to hold at other places and for other objects than the presses
+
+Taxim's published figures (L1 5.565, SSIM .882, PSNR 30.97; Si & Yuan, RA-L 2022) are for other objects than balls,
+crops of 400 x 400 and a manual alignment: they say how good the field's pictures are, not who wins here.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.optics.image_error import PictureError
+from benchmarks.optics.least_squares import Matrix
+from benchmarks.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, judged, select, to_optics
+from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses, taxim_change
+from robot.errors import BadRobotInput, RobotError
+from robot.sim.gel.fitted_optics import FORMAT, optics_to_json
+
+FIT_COUNT = {"gelsight": 36, "gelsight_mini": 18}
+SPLITS = 5
+DEGREES = (1, 2, 3, 4)
+THEIRS = "Taxim's shipped table (fitted on these presses)"
+PUBLISHED = "Taxim's table I (other objects, 400 x 400 crops, by hand aligned): L1 5.565, SSIM .882, PSNR 30.974"
+PROTOTYPE = "degree 4 of this project's prototype (200 x 200 crops, gelsight, labels): L1 5.18, SSIM .966, PSNR 31.40"
+SOURCE = (
+    "fitted to the ball presses in the Python package taxim 1.4.1 (MIT licence, T. Schneider; Si & Yuan, RA-L 2022)"
+)
+
+# Judging ---------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Scores:
+    """Errors of one way of predicting, by press: a press may be held out by several splits."""
+
+    by_press: dict[int, list[PictureError]] = field(default_factory=dict)
+
+    def add(self, index: int, error: PictureError) -> None:
+        """Note the error on one held-out press."""
+        self.by_press.setdefault(index, []).append(error)
+
+    def per_press(self) -> Matrix:
+        """(presses, 4): l1, mse, ssim, psnr of each press, the mean over its splits."""
+        return np.array([np.mean(errors, axis=0) for errors in self.by_press.values()])
+
+    def summary(self, seed: int = 0, draws: int = 2000) -> dict[str, dict[str, float]]:
+        """Mean and 95 % bootstrap interval over presses for each measure."""
+        table = self.per_press()
+        rng = np.random.default_rng([seed, 0xB007])
+        means = table[rng.integers(0, len(table), (draws, len(table)))].mean(axis=1)
+        low, high = np.percentile(means, [2.5, 97.5], axis=0)
+        keys = PictureError._fields
+        return {
+            key: {"mean": float(table[:, at].mean()), "low": float(low[at]), "high": float(high[at])}
+            for at, key in enumerate(keys)
+        }
+
+
+def splits(count: int, fit_count: int, number: int = SPLITS) -> Iterator[tuple[list[int], list[int]]]:
+    """Random (fitting, held-out) presses, by seeds 0, 1, ..."""
+    for seed in range(number):
+        order = [int(one) for one in np.random.default_rng([seed, 0x5B117]).permutation(count)]
+        yield sorted(order[:fit_count]), sorted(order[fit_count:])
+
+
+def evaluate(presses: Presses, *, number: int = SPLITS, taxim_table: Any = None) -> dict[str, Scores]:
+    """Held-out errors of every way of predicting, over `number` splits."""
+    out: dict[str, Scores] = {}
+    for chosen, held_out in splits(len(presses), FIT_COUNT[presses.name], number):
+        models = _models(presses, chosen)
+        for index in held_out:
+            out.setdefault("background only", Scores()).add(index, judged(presses, index, 0.0))
+            if taxim_table is not None:
+                change = taxim_change(presses, index, taxim_table)
+                out.setdefault(THEIRS, Scores()).add(index, judged(presses, index, change))
+            for name, model in models.items():
+                out.setdefault(name, Scores()).add(index, held_out_error(presses, index, model))
+    if groups := SAME_PLACE.get(presses.name):
+        out["as shipped, another place"] = _across_places(presses, groups)
+    return out
+
+
+def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
+    """The best model by labels and aligned, and those of the shipped kind of every degree."""
+    by_label = fit(presses, chosen, select(presses, chosen, align=False), align=False)
+    by_picture = fit(presses, chosen, select(presses, chosen, align=True), align=True)
+    setting = select(presses, chosen, align=True, ship=True)
+    shipped = {degree: replace(setting, degree=degree) for degree in DEGREES}
+    return {
+        "labels, unpressed picture as it is": replace(by_label, blur_px=0.0),
+        "labels": by_label,
+        "aligned": by_picture,
+        "as shipped (aligned)": fit(presses, chosen, setting, align=True),
+        **{by_degree(degree): fit(presses, chosen, one, align=True) for degree, one in shipped.items()},
+    }
+
+
+def by_degree(degree: int) -> str:
+    """The row of the shipped kind of model, of this degree."""
+    return f"as shipped, degree {degree}"
+
+
+def _across_places(presses: Presses, groups: Sequence[range]) -> Scores:
+    """Held-out errors where no fitted press was at the place of the one judged."""
+    scores = Scores()
+    for group in groups:
+        chosen = [one for one in range(len(presses)) if one not in group]
+        model = fit(presses, chosen, select(presses, chosen, align=True, ship=True), align=True)
+        for index in group:
+            scores.add(index, held_out_error(presses, index, model))
+    return scores
+
+
+# Command ---------------------------------------------------------------------------------------------------
+
+
+def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
+    """The content of a shipped file: source, the model fitted to every press, and its held-out figures."""
+    everything = range(len(presses))
+    setting = select(presses, everything, align=True, ship=True)
+    fitted = fit(presses, everything, setting, align=True)
+    figures = {name: one.summary() for name, one in scores.items()}
+    return {
+        "format": FORMAT,
+        "sensor": presses.name,
+        "source": SOURCE,
+        "setting": asdict(setting),
+        "blur_px": fitted.blur_px,
+        "held_out": {
+            name: {key: {part: round(number, 4) for part, number in value.items()} for key, value in one.items()}
+            for name, one in figures.items()
+        },
+        "model": optics_to_json(to_optics(presses, fitted)),
+    }
+
+
+def table(presses: Presses, scores: dict[str, Scores]) -> str:
+    """The held-out figures for a person: mean and 95 % interval over presses."""
+    fitted, held = FIT_COUNT[presses.name], len(presses) - FIT_COUNT[presses.name]
+    lines = [f"{presses.name}: fitted on {fitted}, judged on {held} other presses, {SPLITS} random splits", ""]
+    lines.append(f"{'':54}{'L1':>18}{'MSE':>22}{'SSIM':>21}{'PSNR dB':>21}")
+    for name, one in scores.items():
+        cells = [
+            f"{value['mean']:8.{digits}f} [{value['low']:.{digits}f}, {value['high']:.{digits}f}]"
+            for value, digits in zip(one.summary().values(), (2, 1, 3, 2), strict=True)
+        ]
+        lines.append(f"{name:54}" + "".join(f"{cell:>21}" for cell in cells))
+    return "\n".join([*lines, "", PROTOTYPE, PUBLISHED, ""])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fit, judge, print, and write <out>/<sensor>.json; 0, or the error's exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.optics.photometric", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("--data", type=Path, help="folder with <sensor>/dataPack.npz (default: the package taxim)")
+    parser.add_argument("--out", type=Path, required=True, help="folder for <sensor>.json")
+    parser.add_argument("--sensor", choices=sorted(BALLS_MM), action="append", help="default: all")
+    options = parser.parse_args(arguments)
+    try:
+        for name in options.sensor or BALLS_MM:
+            _run(options.data or find_presses(), name, options.out)
+    except RobotError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def _run(folder: Path, name: str, out: Path) -> None:
+    presses = read_presses(folder, name)
+    shipped = folder / name / "polycalib.npz"
+    theirs = dict(np.load(shipped, allow_pickle=False)) if shipped.is_file() else None
+    scores = evaluate(presses, number=SPLITS, taxim_table=theirs)
+    print(table(presses, scores), flush=True)
+    content = json.dumps(document(presses, scores), indent=1)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{name}.json").write_text(content + "\n")
+    except OSError as error:
+        raise BadRobotInput(f"{out} cannot be written: {error.strerror}; give another --out") from error
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

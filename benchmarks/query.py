@@ -1,0 +1,148 @@
+"""A query on an opened index, stage by stage, against the bare forward pass of the tactile tower on the same images."""
+
+import shutil
+import statistics
+import tempfile
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
+from indexes.store.folder import IndexStore
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.model.config import Config
+from retrieval.model.encode import TorchEncoder, touch_batch
+from retrieval.model.export import graph_of
+from retrieval.model.fusion import Matcher
+from retrieval.model.onnx_encoder import OnnxEncoder, sealed
+from retrieval.model.posterior import Posterior
+from retrieval.model.stored import fingerprint, read_judge
+from retrieval.model.touches import Encoder
+from retrieval.search.defaults import shipped_model
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import FolderShard
+
+PHOTOS, CANDIDATES = 10_000, 132
+"""As many candidates as benchmarks.scale finds needed for so many photos; build-index writes them down."""
+GEL_PX = (240, 320)
+STAGES = ("decode", "encode", "candidates", "rerank")
+
+
+def measure(config: Config, photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[Line]:
+    """One line for each backend that is installed, for a model with random weights."""
+    with tempfile.TemporaryDirectory() as name:
+        yield from _lines(Path(name), stored_checkpoint(Path(name), matcher_of(config), config), photos, repetitions)
+
+
+def measure_shipped(photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[Line]:
+    """The same for the shipped checkpoint, and the time that `Searcher.open` takes once everything is imported."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        checkpoint = load_checkpoint(Path(shutil.copy(shipped_model(), folder / "model.safetensors")))
+        yield from _lines(folder, checkpoint, photos, repetitions)
+        times = in_turns({"open": lambda: Searcher.open(folder / "index")}, repetitions)
+        yield Line(
+            "query",
+            checkpoint.config.matcher.tower,
+            f"an index of {photos} photos is opened and verified in {duration(times.median('open'))}",
+            {"photos": photos, "open_s": times.median("open")},
+        )
+
+
+def _lines(folder: Path, checkpoint: Checkpoint, photos: int, repetitions: int) -> Iterator[Line]:
+    write_index(folder / "index", checkpoint, photos)
+    touch = gel_images(folder, checkpoint.config.matcher.fingers)
+    for encoder in encoders(folder, checkpoint):
+        yield _line(folder / "index", checkpoint, encoder, touch, repetitions)
+
+
+def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Path], repetitions: int) -> Line:
+    searcher = searcher_of(index, checkpoint, encoder)
+    images = [checkpoint.config.preprocessing.load_touch(path) for path in touch]
+    told: list[dict[str, float]] = []
+    arms = {
+        "query": lambda: told.append(searcher.query([touch]).timing_ms),
+        "bare": _bare(checkpoint.matcher, encoder, images),
+    }
+    times = in_turns(arms, repetitions)
+    ratio = times.ratio("query", "bare")
+    stages = {stage: statistics.median(each[stage] for each in told) for stage in STAGES}
+    shown = ", ".join(f"{stage} {ms:.3g}" for stage, ms in stages.items())
+    return Line(
+        "query",
+        checkpoint.config.matcher.tower,
+        f"{encoder.name}, {searcher.described.photos} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
+        f"({shown} ms), {duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
+        {"photos": searcher.described.photos, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
+    )
+
+
+def searcher_of(index: Path, checkpoint: Checkpoint, encoder: Encoder) -> Searcher:
+    """One that encodes touches by this encoder."""
+    judge = read_judge(checkpoint.path)
+    shard = FolderShard(IndexStore(index).open(threads=1), judge, checkpoint.config.has_embeddings)
+    return Searcher(index, shard, checkpoint, encoder, judge)
+
+
+def _bare(matcher: Matcher, encoder: Encoder, images: list[np.ndarray]):
+    """The forward pass alone, of images that lie ready; in PyTorch folded as a query's is."""
+    if isinstance(encoder, OnnxEncoder):
+        return lambda: encoder.encode([images])
+    tower, batch = TorchEncoder(matcher)._fast.touch_tower, touch_batch([images]).flatten(0, 1)
+
+    @torch.inference_mode()
+    def forward() -> torch.Tensor:
+        return tower._encode((batch - tower.mean) / tower.std)
+
+    return forward
+
+
+def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[Encoder]:
+    """PyTorch, and ONNX Runtime where it is installed."""
+    yield TorchEncoder(checkpoint.matcher)
+    if find_spec("onnx") and find_spec("onnxruntime"):
+        path = folder / "exported.onnx"
+        path.write_bytes(sealed(graph_of(checkpoint)))
+        yield OnnxEncoder(path, checkpoint.digest)
+
+
+def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpoint:
+    """The matcher as a file, read again."""
+    about = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
+    path = folder / "model.safetensors"
+    save_checkpoint(path, matcher, config, split=None, provenance=about)
+    return load_checkpoint(path)
+
+
+def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
+    """An index of made-up photos, three of each object: random halves and unit embeddings."""
+    rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
+    halves = rng.normal(size=(photos, matcher.half)).astype(np.float16)
+    embeddings = rng.normal(size=(photos, matcher.embedding_dim)).astype(np.float32)
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    names = [f"object-{number // 3:06d}/{number % 3}.jpg" for number in range(photos)]
+    IndexStore(out).write(
+        [
+            {"id": name, "object_id": name.split("/")[0], "path": name, "digest": f"{number:064x}", "metadata": {}}
+            for number, name in enumerate(names)
+        ],
+        embeddings,
+        {"halves": halves},
+        {"calibration": Posterior().to_dict()},
+        fingerprint=fingerprint(checkpoint),
+        about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},
+    )
+
+
+def gel_images(folder: Path, fingers: int) -> list[Path]:
+    """One smooth picture for each finger, as large as those of the sensor and as a rig records them."""
+    rows, columns = (np.linspace(0, 9, size) for size in GEL_PX)
+    paths = [folder / f"{finger}.jpg" for finger in range(fingers)]
+    for number, path in enumerate(paths):
+        waves = [np.sin((k + 1) * rows + number)[:, None] * np.cos((k + 2) * columns)[None] for k in range(3)]
+        Image.fromarray((127 + 100 * np.stack(waves, axis=2)).astype(np.uint8)).save(path, quality=95)
+    return paths

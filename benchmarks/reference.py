@@ -1,0 +1,197 @@
+"""docs/reference.md, from the docstrings of the public names, docs/commands.md, from the commands' help, and
+docs/datasets.md, from the importers: `python -m benchmarks.reference` writes them anew."""
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import itertools
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+from typer.testing import CliRunner
+
+import indexes
+import retrieval
+import robot
+from retrieval.commands.main import app
+from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, title_of
+
+PACKAGES = (retrieval, robot, indexes)
+PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
+COMMANDS = PAGE.with_name("commands.md")
+DATA_SETS = PAGE.with_name("datasets.md")
+MADE_BY_HAND = (retrieval.Client, robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
+"""Classes that a user makes an object of; all others come out of a function."""
+HEAD = """# Reference
+
+The public names of the three packages, from their docstrings; `python -m benchmarks.reference` writes this page. Every
+example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `model.safetensors` and the gel
+images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported when it is used: `import retrieval` alone
+costs nothing.
+"""
+WIDTH = 98
+"""Of help in a terminal of 100 columns."""
+COMMANDS_HEAD = """# Commands
+
+Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input; `query` adds 3 to 5 for its
+[verdicts](answers.md). With `--json`, stdout holds one JSON document, and everything else goes to stderr. `python -m
+benchmarks.reference` writes this page from each command's `--help`.
+"""
+
+
+DATA_SETS_HEAD = """# Data sets
+
+```sh
+retrieve import                                             # what can be imported, and the options of each
+retrieve import billets billets/ --out billets-recording/
+retrieve import folder pictures/ --out my-recording/ --option sensor="GelSight Mini" touch='{object}/touch_{n}'
+retrieve check recording/                                   # before anything is trained on it
+```
+
+An importer reads a public data set as it is published, or pictures of your own, and writes a
+[recording](formats.md#recording), to train, evaluate and search with. It takes one grasp at a time, so memory does
+not grow with the pictures, but by names: 100,000 rows instead of 10,000 take 15 to 67 MB more, by importer (`python
+-m benchmarks.importers_memory`), and a line a grasp once the recording is read back. Run again it goes on where it
+stopped. What cannot be read is skipped, counted by reason and told; `recording.json` keeps the counts under
+`skipped`, licence and citation, and under `objects` what the data set says of them. Pictures that many grasps share,
+such as one no-contact frame, are kept once. A published split that parts objects stands in `splits/<name>.json`, for
+`--split`. Some importers need packages of the extra:
+`pip install 'touch-retrieval[importers]'`.
+
+The data sets are not ours: the licence is what their own pages say, and what you do with them is between you and them.
+Where parts of a layout are not verified, the importer was written from the authors' descriptions and from other
+people's readers, and says which parts when it is done.
+
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    page = HEAD + "".join(_package(package) for package in PACKAGES)
+    return re.sub(r"\n{3,}", "\n\n", page)
+
+
+def _package(package: Any) -> str:
+    parts = [f"\n## {package.__name__}\n", _text(inspect.getdoc(package))]
+    parts += [_public(package, name) for name in package.__all__]
+    return "\n".join(parts)
+
+
+def _public(package: Any, name: str) -> str:
+    thing, title = getattr(package, name), f"{package.__name__}.{name}"
+    if not callable(thing):
+        return f"\n### {title}\n\n{_text(_below(package, name))}"
+    parts = [_heading("###", title, thing), _text(inspect.getdoc(thing))]
+    if inspect.isclass(thing):
+        parts.append(_fields(thing))
+        parts += [_member(name, own, member) for own, member in vars(thing).items() if not own.startswith("_")]
+    return "\n".join(filter(None, parts))
+
+
+def _member(of: str, name: str, member: Any) -> str:
+    """A method or property of a class; nothing for what has no text, or is a public name itself."""
+    function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+    if not inspect.isfunction(function) or not function.__doc__ or getattr(retrieval.open, "__func__", 0) is function:
+        return ""
+    return "\n".join([_heading("####", f"{of}.{name}", member), _text(inspect.getdoc(function))])
+
+
+def _heading(level: str, title: str, thing: Any) -> str:
+    """The name, and below it a call with names and defaults of the arguments, types left out. No call of a property, or
+    of a class that is not made by hand."""
+    if isinstance(thing, property) or (inspect.isclass(thing) and thing not in MADE_BY_HAND):
+        return f"\n{level} {title}\n"
+    signature = inspect.signature(getattr(thing, "__func__", thing))
+    named = [item for item in signature.parameters.values() if item.name not in ("self", "cls")]
+    bare = [item.replace(annotation=item.empty) for item in named]
+    text = str(signature.replace(parameters=bare, return_annotation=signature.empty))
+    arguments = re.sub(r"<built-in function (\w+)>", r"\1", text)
+    if arguments == "()":
+        return f"\n{level} {title}()\n"
+    return f"\n{level} {title}\n\n```python\n{title}{arguments}\n```\n"
+
+
+def _fields(thing: type) -> str:
+    names = getattr(thing, "_fields", None) or [
+        field.name for field in (dataclasses.fields(thing) if dataclasses.is_dataclass(thing) else ())
+    ]
+    return f"\nFields: {', '.join(f'`{name}`' for name in names)}.\n" if names else ""
+
+
+def _below(package: Any, name: str) -> str:
+    """The text that stands below a constant."""
+    body = ast.parse(Path(package.__file__).read_text("utf-8")).body
+    for statement, after in itertools.pairwise(body):
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == name:
+            assert isinstance(after, ast.Expr)
+            assert isinstance(after.value, ast.Constant)
+            return inspect.cleandoc(str(after.value.value))
+    raise AssertionError(f"{name} has no text below it")
+
+
+def _text(docstring: str | None) -> str:
+    """A docstring as Markdown: examples, and what is laid out in columns, in blocks."""
+    assert docstring, "every public name has a docstring"
+    return "\n\n".join(_paragraph(part) for part in re.split(r"\n\n+", docstring.strip())) + "\n"
+
+
+def _paragraph(text: str) -> str:
+    if text.startswith(">>>"):
+        return f"```python\n{text}\n```"
+    columns = re.search(r"^\S.*\S {2,}\S", text, flags=re.MULTILINE) and not text.startswith("* ")
+    return f"```\n{text}\n```" if columns else text
+
+
+def commands() -> str:
+    """The whole page of the commands."""
+    return COMMANDS_HEAD + "".join(_help("retrieve", typer.main.get_command(app)))
+
+
+def _help(title: str, command: Any) -> Iterator[str]:
+    """Of a command, and of those below it."""
+    asked = CliRunner().invoke(app, [*title.split()[1:], "--help"], prog_name="retrieve", terminal_width=WIDTH)
+    yield f"\n## {title}\n\n```\n{asked.stdout.strip()}\n```\n"
+    for name, below in getattr(command, "commands", {}).items():
+        yield from _help(f"{title} {name}", below)
+
+
+def data_sets() -> str:
+    """The whole page of the importers. `python -m benchmarks.reference` writes it."""
+    columns = ("name", "it must hold", "sensor", "fingers", "no-contact frame", "licence", "layout")
+    rows = [columns, ("---",) * len(columns)]
+    for name in sorted(IMPORTERS):
+        facts = data_set_of(name)
+        verified = "parts are not verified" if facts.unverified else "verified on the data"
+        frame = facts.background if facts.background != "none" else ""
+        fingers = str(facts.fingers or "any")
+        rows.append((f"[`{name}`](#{name})", facts.expects, facts.sensor, fingers, frame, facts.licence, verified))
+    table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    return DATA_SETS_HEAD + table + "".join(map(_data_set, sorted(IMPORTERS)))
+
+
+def _data_set(name: str) -> str:
+    facts, options = data_set_of(name), options_of(load_importer(name))
+    below = inspect.cleandoc(sys.modules[load_importer(name).__module__].__doc__ or "").partition("\n")[2]
+    parts = [f"\n## {name}\n", f"{title_of(name)}. {facts.citation}.\n", below.strip("\n") + "\n"]
+    if options:
+        parts.append(f"Options: {', '.join(f'`{option}={default}`' for option, (_, default) in options.items())}.\n")
+    parts += [f"* {note[0].upper()}{note[1:].rstrip('.')}." for note in facts.notes()]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def main(arguments: list[str]) -> None:
+    """Write the pages."""
+    argparse.ArgumentParser(prog="python -m benchmarks.reference", description=__doc__).parse_args(arguments)
+    PAGE.parent.mkdir(exist_ok=True)
+    for page, text in ((PAGE, reference()), (COMMANDS, commands()), (DATA_SETS, data_sets())):
+        page.write_text(text, "utf-8")
+        print(page)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,384 @@
+"""`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
+
+Catalogues of N photos are drawn from the trained model's own distribution: halves of recorded photos, each blended of
+two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's pruner gives them (`--by
+contrastive`: with those whose cosine is in the halves). The touches are those of validation objects that the checkpoint
+keeps. The winner is the photo that the classifier ranks first of all. Settings, and how many candidates hold 99 % of
+the winners, are chosen with every other touch; `MARGIN` times as many are taken, for a hundred touches hardly tell the
+last percent, and the share of winners that is told is that of the touches between them.
+
+The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists of which p are visited:
+
+    stage        flops                  bytes read                    grows as
+    exhaustive   2 h^2 N                2 h N (float16 halves)        N
+    flat         2 d N                  4 d N                         N
+    ivf          2 d (L + p N / L)      4 d L + code p N / L          N^1/2 (p fixed), code = d (sq8), d / 8 (pq)
+    hnsw         2 d ef log N           4 d ef log N                  log N
+    rescoring    2 d k                  4 d k, in random places       k
+    rerank       2 h^2 k                2 h k, in random places       k
+    build        rows: constant each; lists: 2 d L 64 L training for each of 10 rounds + 2 d L N     N, N^3/2
+    add F        2 d N hashing of what is there, and N + F rows       N
+
+so with k = c N a share of all photos, and search by lists, the gain over exhaustive is at most 1 / c.
+
+Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1), as one query is answered: teams of threads that wait
+for each other make small products many times slower. A million photos take 1.2 GB on the disk, and 20 minutes.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.common import duration
+from indexes.errors import ParameterError
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.tables import Block
+from retrieval.commands.main import main as retrieve
+from retrieval.data.dataset import load_grasps
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.fusion import judge_of
+from retrieval.model.judge import Judge
+from retrieval.search.defaults import shipped_model
+from retrieval.training.features import encode_recording
+
+KINDS = ("flat", "ivf_sq8", "ivf_pq", "hnsw")
+BLOCK = 8192
+MOST_CANDIDATES = 16_000
+TARGET, MARGIN = 0.99, 4
+ADDED = 1000
+TIMED = 40
+QUERIES, HELD_OUT = 200, 1000
+"""Touches that choose how many candidates there are, and others that judge it."""
+JUDGED = 3e13
+"""Most flops to spend on finding winners: fewer touches are asked of larger catalogues, but never below 60."""
+
+PROBE = """
+import sys, time
+from indexes.store.folder import IndexStore
+import numpy as np
+def anonymous():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1])
+import faiss
+before, start = anonymous(), time.perf_counter()
+found = IndexStore(sys.argv[1]).open(verify=False, threads=1)
+opened = time.perf_counter() - start
+query = np.ascontiguousarray(found.embeddings[:1])
+found.search(query, 1000)
+print(opened, (anonymous() - before) / 1024)
+"""
+
+
+@dataclass
+class Size:
+    """Everything measured at one number of photos: seconds, bytes and counts by name."""
+
+    photos: int
+    queries: int = 0
+    held_out: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
+    kinds: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A model, halves (n, h) of recorded photos to blend catalogues from, halves (Q, h) of touches to choose candidates
+    with, and (J, h) of others.
+
+    by: which embeddings name the candidates, "pruner" or, where their cosine is in the halves, "contrastive".
+    """
+
+    checkpoint: Checkpoint
+    judge: Judge
+    photos: np.ndarray
+    touches: np.ndarray
+    held_out: np.ndarray
+    by: str = "pruner"
+
+    @torch.inference_mode()
+    def embeddings(self, halves: np.ndarray, what: str) -> np.ndarray:
+        """Unit embeddings (n, d) of "touch" or "photo" halves."""
+        if self.by == "contrastive":
+            scaled = halves[:, self.checkpoint.config.matcher.hidden :]
+            return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
+        return getattr(self.checkpoint.matcher.pruner, what)(torch.from_numpy(halves)).numpy()
+
+    def blocks(self, start: int, stop: int, seed: int) -> Iterator[Block]:
+        """Photos `start` to `stop` - 1 of a catalogue, block by block."""
+        rng = np.random.default_rng([seed, start])
+        for first in range(start, stop, BLOCK):
+            count = min(BLOCK, stop - first)
+            one, other = rng.integers(len(self.photos), size=(2, count))
+            share = rng.uniform(0.5, 1, size=(count, 1)).astype(np.float32)
+            halves = share * self.photos[one] + (1 - share) * self.photos[other]
+            rows = [_row(number) for number in range(first, first + count)]
+            yield Block(rows, self.embeddings(halves, "photo"), {"halves": halves.astype(np.float16)})
+
+
+def crowd_of(model: Path, recording: Path, features: Path | None, by: str = "pruner") -> Crowd:
+    """The crowd that a recording's photos make; `features` keeps what was encoded."""
+    checkpoint = load_checkpoint(model)
+    if checkpoint.queries is None or checkpoint.matcher.pruner is None:
+        raise SystemExit(f"{model} keeps no touches to ask with, or has no pruner; train it again")
+    if by == "contrastive" and not checkpoint.config.matcher.cosine:
+        raise SystemExit(f"the halves of {model} hold no contrastive embedding; its configuration has cosine = false")
+    found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
+    with torch.inference_mode():
+        photos = checkpoint.matcher.photo_code(torch.from_numpy(found.photo)).half.numpy()
+        felt = checkpoint.matcher.touch_code(torch.from_numpy(found.touch).flatten(1)).half.numpy()
+    rng, queries = np.random.default_rng(0), checkpoint.queries.astype(np.float32)
+    half = len(queries) // 2
+    held_out = rng.permutation(np.concatenate([queries[half:], felt]))
+    judge = judge_of(checkpoint.matcher.head)
+    return Crowd(checkpoint, judge, np.unique(photos, axis=0), queries[:half], held_out, by)
+
+
+def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
+    """Build, search and grow an index of so many photos of each kind in `folder`."""
+    most = max(60, int(JUDGED / (2 * crowd.photos.shape[1] ** 2 * photos)))
+    asked = min(queries, len(crowd.touches), most // 3)
+    judged = min(HELD_OUT, len(crowd.held_out), most - asked)
+    size, store = Size(photos, asked, judged), IndexStore(folder)
+    generation = _build(crowd, store, size)
+    halves = generation.arrays["halves"]
+    touches = np.concatenate([crowd.touches[:asked], crowd.held_out[:judged]])
+    winners, size.figures["exhaustive_s"] = _winners(crowd.judge, touches, halves)
+    for kind in kinds:
+        start = time.perf_counter()
+        how = {
+            "fingerprint": {},
+            "kind": kind,
+            "threads": torch.get_num_threads(),
+            "parent": generation,
+            "self_check": 64,
+        }
+        try:
+            made = store.write_blocks(rows_of(generation), **how)
+        except ParameterError as error:  # too few vectors for codes
+            size.kinds[kind] = {"refused": str(error)}
+            continue
+        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(made)
+        size.kinds[kind] = figures | _operating_point(crowd, made, touches, winners, asked)
+        size.kinds[kind] |= _growth(crowd, store, made, size.photos)
+        point = size.kinds[kind]
+        point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
+    return size
+
+
+def rows_of(generation: Generation) -> Iterator[Block]:
+    """The rows of a generation, for a new one to take over."""
+    return (Block(generation.rows[start : start + BLOCK]) for start in range(0, generation.count, BLOCK))
+
+
+def _row(number: int) -> dict[str, Any]:
+    name = f"o{number // 3:07d}"
+    path = f"{name}/{number % 3}.jpg"
+    return {"id": path, "object_id": name, "path": path, "digest": f"{number:064x}", "metadata": {}}
+
+
+def _build(crowd: Crowd, store: IndexStore, size: Size) -> Generation:
+    """Stream the catalogue to the disk; the time to make it up is not counted."""
+    made, most, before = 0.0, 0.0, anonymous_mb()
+
+    def blocks() -> Iterator[Block]:
+        nonlocal made, most
+        source = crowd.blocks(0, size.photos, 0)
+        while True:
+            begun = time.perf_counter()
+            block = next(source, None)
+            made += time.perf_counter() - begun
+            if block is None:
+                return
+            yield block
+            most = max(most, anonymous_mb() - before)
+
+    start = time.perf_counter()
+    generation = store.write_blocks(blocks(), fingerprint={}, kind="flat", self_check=64)
+    size.figures |= {"build_s": time.perf_counter() - start - made, "build_mb": most}
+    return generation
+
+
+def _winners(judge: Judge, touches: np.ndarray, halves: Any) -> tuple[np.ndarray, float]:
+    """The winner of each touch, and the median seconds that it takes to judge all photos."""
+    winners, seconds = [], []
+    for touch in touches:
+        start = time.perf_counter()
+        winners.append(int(judge.logits(touch[None], halves).argmax()))
+        seconds.append(time.perf_counter() - start)
+    return np.array(winners), float(np.median(seconds))
+
+
+def _operating_point(
+    crowd: Crowd, made: Generation, touches: np.ndarray, winners: np.ndarray, asked: int
+) -> dict[str, Any]:
+    """The fastest setting whose candidates hold the target share of winners; where none does, the most complete.
+
+    Chosen with the first `asked` touches, judged by the others.
+    """
+    queries, halves, points = crowd.embeddings(touches, "touch"), made.arrays["halves"], []
+    timed, built = range(min(TIMED, len(touches))), made.index
+    needed = _needed(made, queries, winners)
+    for index in built.along_ladder():
+        made.index = index
+        k = _candidates(made, queries[:asked], winners[:asked])
+        held = np.array(
+            [winner in made.search(query[None], k)[0][0] for query, winner in zip(queries, winners, strict=True)]
+        )
+        judged = held[asked:]
+        search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
+        found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
+        rerank = _median(lambda n, found=found: crowd.judge.logits(touches[n : n + 1], halves, found[n]), timed)
+        low, high = binomial_interval(int(judged.sum()), len(judged))
+        point = {"k": k, "recall": float(judged.mean()), "low": low, "high": high}
+        point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
+        points.append((float(held[:asked].mean()), point))
+    made.index = built
+    for _, point in points:
+        point["needed"] = needed
+    good = [point for chosen, point in points if chosen >= TARGET]
+    if good:
+        return min(good, key=lambda point: point["search_s"] + point["rerank_s"])
+    return max(points, key=lambda each: each[0])[1]
+
+
+def _candidates(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
+    """`MARGIN` times as many as these touches need."""
+    return min(MARGIN * _needed(made, queries, winners), MOST_CANDIDATES, made.count)
+
+
+def _needed(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
+    """The least number of candidates that hold the target share of winners, as far as the index names them at all."""
+    most = min(MOST_CANDIDATES, made.count)
+    found = (made.search(query[None], most)[0][0] for query in queries)
+    places = [np.flatnonzero(rows == winner) for rows, winner in zip(found, winners, strict=True)]
+    needed = np.sort([int(place[0]) + 1 if len(place) else most for place in places])
+    return int(needed[int(np.ceil(TARGET * len(needed))) - 1])
+
+
+def _growth(crowd: Crowd, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
+    """Seconds that it takes to add `ADDED` photos."""
+    fresh = list(crowd.blocks(photos, photos + ADDED, 1))
+    how = {
+        "fingerprint": {},
+        "kind": made.manifest.kind,
+        "threads": made.index.threads,
+        "parent": made,
+        "self_check": 64,
+    }
+    start = time.perf_counter()
+    store.write_blocks(chain(rows_of(made), fresh), **how)
+    return {"add_s": time.perf_counter() - start}
+
+
+def opened(folder: Path) -> dict[str, float]:
+    """Seconds to open the index in a process of its own, and the memory it then holds beside the mapped files."""
+    done = subprocess.run([sys.executable, "-c", PROBE, str(folder)], check=True, capture_output=True, text=True)
+    seconds, memory = map(float, done.stdout.split())
+    return {"open_s": seconds, "memory_mb": memory}
+
+
+def on_disk(made: Generation) -> dict[str, float]:
+    structure = made.manifest.files.get("vectors.faiss", {"bytes": 0})["bytes"]
+    return {
+        "disk_mb": sum(file["bytes"] for file in made.manifest.files.values()) / 2**20,
+        "structure_mb": structure / 2**20,
+    }
+
+
+def anonymous_mb() -> float:
+    with Path("/proc/self/status").open() as lines:
+        return int(next(line for line in lines if line.startswith("RssAnon")).split()[1]) / 1024
+
+
+def _median(work: Callable[[int], object], numbers: Sequence[int]) -> float:
+    seconds = []
+    for number in numbers:
+        start = time.perf_counter()
+        work(number)
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+def lines(size: Size) -> Iterator[str]:
+    """What was measured at one size, for people."""
+    f = size.figures
+    written, judged = duration(f["build_s"]), duration(f["exhaustive_s"])
+    yield (
+        f"{size.photos:,} photos: written in {written} with {f['build_mb']:.0f} MB of memory; judging all of them "
+        f"takes {judged} ({size.queries} touches choose, {size.held_out} judge)"
+    )
+    for kind, p in size.kinds.items():
+        if "refused" in p:
+            yield f"  {kind}: {p['refused']}"
+            continue
+        times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
+        yield (
+            f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than judging all, winner found {p['recall']:.1%} "
+            f"({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} hold 99 % of all); "
+            f"search {times['search_s']}, rerank {times['rerank_s']}; structure made in {times['structure_s']}, "
+            f"{p['structure_mb']:.0f} of {p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, "
+            f"opened in {times['open_s']}; "
+            f"{ADDED} more in {times['add_s']}"
+        )
+
+
+def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
+    """Name and d log t / d log N, fitted over all sizes at which it was measured; from 1e4 photos on."""
+    tables: dict[str, list[tuple[int, float]]] = {}
+    for size in sizes:
+        flat = size.figures | {f"{kind} {name}": value for kind, p in size.kinds.items() for name, value in p.items()}
+        for name, value in flat.items():
+            if name.endswith(("_s", "_mb", " k", " needed")) and size.photos >= 10_000 and value > 0:
+                tables.setdefault(name, []).append((size.photos, value))
+    for name, table in tables.items():
+        if len(table) > 1:
+            yield name, float(np.polyfit(*np.log(np.array(table, dtype=float)).T, 1)[0])
+
+
+def collected(folder: Path) -> Path:
+    """A small recording of the simulated rig."""
+    words = ["collect", "--rig", "sim", "--objects", "60", "--grasps", "2", "--seed", "20000", "--jobs", "2"]
+    if retrieve([*words, "--out", str(folder / "recording")]):
+        raise SystemExit("the recording could not be collected")
+    return folder / "recording"
+
+
+def main() -> None:
+    """Print every size as soon as it is measured, then the slopes."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--sizes", nargs="+", type=float, default=[1e3, 1e4, 1e5])
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
+    parser.add_argument("--model", type=Path, default=shipped_model())
+    parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
+    parser.add_argument("--features", type=Path, help="where encoded features are kept")
+    parser.add_argument("--queries", type=int, default=QUERIES)
+    parser.add_argument("--by", choices=("pruner", "contrastive"), default="pruner", help="embedding of the candidates")
+    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        crowd = crowd_of(arguments.model, arguments.recording or collected(folder), arguments.features, arguments.by)
+        sizes = []
+        for number in arguments.sizes:
+            sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index", arguments.queries))
+            shutil.rmtree(folder / "index")
+            print(json.dumps(vars(sizes[-1])) if arguments.json else "\n".join(lines(sizes[-1])), flush=True)
+        for name, slope in slopes(sizes):
+            print(json.dumps({"slope": name, "value": slope}) if arguments.json else f"N^{slope:.2f}  {name}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,269 @@
+"""`python -m benchmarks.shards [--sizes 1e4 1e5 1e6] [--shards 8] [--ray] [--json]`: one folder against shards.
+
+Catalogues are drawn as `benchmarks.scale` draws them, blended of the codes of made-up pictures; the touches are
+those that the checkpoint keeps. Each is written as one index folder and as a cluster, and both are asked in turns, in
+this process, by one thread: the same winners, how long a shard takes, what both hold in memory. Last, how long whoever
+asks takes to open the cluster, its manifest and the model, without a shard of its own: of all sizes, in turns. With
+--ray Ray Serve holds a cluster of one shard: the way there and back, against the folder.
+
+Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1). A million photos take 3 GB on the disk.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from benchmarks.scale import Crowd
+from indexes.store.cluster import (
+    ClusterManifest,
+    ShardEntry,
+    cluster_name,
+    entry_of,
+    open_shard,
+    read_cluster,
+    shard_folder,
+    shard_of,
+    write_cluster,
+)
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.tables import Block
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.fusion import judge_of
+from retrieval.model.stored import fingerprint, read_stored
+from retrieval.search.defaults import shipped_model
+from retrieval.search.embeddings import embed_photos
+from retrieval.search.opening import folder_shard, open_cluster
+from retrieval.search.shard import Felt, FolderShard, Shard
+from tests import synthetic
+
+TOUCHES, OPENINGS = 200, 21
+BLOCK = 10_000
+CANDIDATES = 5300
+"""Of a million photos, that hold 99 % of the winners; of others, as N^0.8 (docs/performance.md)."""
+OPENED = """
+import sys, time
+from pathlib import Path
+from indexes.store.cluster import read_cluster
+from retrieval.model.stored import read_stored
+from retrieval.search.opening import described_cluster
+start = time.process_time()
+manifest = read_cluster(Path(sys.argv[1]))
+described = described_cluster(manifest)
+read_stored(Path(sys.argv[2]))
+print(time.process_time() - start, described.photos)
+"""
+HELD = """
+import sys
+from pathlib import Path
+from retrieval.search.searcher import Searcher
+def anonymous():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1])
+searcher = Searcher.open(sys.argv[1], verify=False)
+searcher.encoder = searcher.reader = None
+import numpy as np, gc
+from retrieval.search.shard import Felt
+codes = np.load(sys.argv[2])
+before = anonymous()
+searcher.shard.ask(Felt(codes["embeddings"][:1], codes["halves"][:1]), 10, None, searcher.posterior)
+print(anonymous() / 1024, (anonymous() - before) / 1024)
+"""
+
+
+def candidates_of(photos: int) -> int:
+    """How many candidates so many photos need."""
+    return max(100, round(CANDIDATES * (photos / 1e6) ** 0.8))
+
+
+def drawn_crowd(checkpoint: Checkpoint, objects: int = 60) -> Crowd:
+    """Codes of pictures of made-up objects, to blend photos from."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = synthetic.write_catalogue(Path(name) / "catalog", synthetic.make_objects(objects))
+        codes = embed_photos(sorted(folder.rglob("*.jpg")), model=checkpoint)
+    touches = checkpoint.queries.astype(np.float32)
+    return Crowd(checkpoint, judge_of(checkpoint.matcher.head), codes.halves, touches, held_out=touches[:0])
+
+
+def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]:
+    """The drawn catalogue as one folder, `out`/index, and as a cluster, `out`/cluster; seconds and bytes."""
+    model = crowd.checkpoint
+    about = {"checkpoint": str(model.path.resolve()), "catalogue": "/drawn"}
+    calibration = {"calibration": model.posterior.to_dict()} if model.posterior else {}
+    said: dict[str, Any] = {"fingerprint": fingerprint(model), "self_check": 16, "threads": 1}
+    start = time.perf_counter()
+    measured = {"candidates": {"k": candidates_of(photos)}}
+    whole = IndexStore(out / "index").write_blocks(
+        crowd.blocks(0, photos, 0), calibration, about=about | measured, **said
+    )
+    folder_s = time.perf_counter() - start
+    measured = {"candidates": {"k": candidates_of(photos // shards)}}
+    entries, start = list[ShardEntry](), time.perf_counter()
+    places = np.array([shard_of(row["object_id"], shards) for row in whole.rows])
+    for number in range(shards):
+        name = shard_folder(number, shards)
+        blocks = _blocks_of(whole, np.flatnonzero(places == number))
+        made = IndexStore(out / "cluster" / name).write_blocks(blocks, calibration, about=about | measured, **said)
+        entries.append(entry_of(out / "cluster", name, made, len(np.unique(made.codes("object_id")))))
+    manifest = ClusterManifest(
+        cluster_name(1), "", "", "flat", fingerprint(model), about, calibration.get("calibration"), shards, entries
+    )
+    write_cluster(out / "cluster", manifest)
+    size = sum(file["bytes"] for file in whole.manifest.files.values())
+    return {"folder_s": folder_s, "shards_s": time.perf_counter() - start, "bytes_per_photo": size / photos}
+
+
+def _blocks_of(whole: Generation, rows: NDArray[np.int64]) -> Iterator[Block]:
+    for some in np.array_split(rows, -(-len(rows) // BLOCK)):
+        halves = whole.arrays["halves"][some]
+        yield Block([whole.rows[row] for row in some], whole.embeddings[whole.slots[some]], {"halves": halves})
+
+
+def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int, judged: int) -> dict[str, float]:
+    """Ask both in turns; how often the winners agree, with candidates and with all judged, and times."""
+    halves = crowd.touches[:touches]
+    embeddings = crowd.embeddings(halves, "touch")
+    posterior, photos = crowd.checkpoint.posterior, folder.described.photos
+    same = better = 0
+    times: dict[str, list[float]] = {"folder": [], "shards": [], "slowest": [], "search": [], "rerank": []}
+    for number in range(len(halves)):
+        felt, k = Felt(embeddings[number : number + 1], halves[number : number + 1]), candidates_of(photos)
+        start = time.thread_time()
+        one = folder.ask(felt, 10, k, posterior)
+        middle = time.thread_time()
+        many = cluster.ask(felt, 10, k, posterior)
+        times["folder"].append(middle - start)
+        times["shards"].append(time.thread_time() - middle)
+        single = cluster.shards[number % len(cluster.shards)]  # type: ignore[attr-defined]
+        start = time.thread_time()
+        alone = single.ask(felt, 10, None, posterior)
+        times["slowest"].append(time.thread_time() - start)
+        times["search"].append(alone.timing_ms["candidates"] / 1e3)
+        times["rerank"].append(alone.timing_ms["rerank"] / 1e3)
+        same += one.best[0].photo == many.best[0].photo
+        better += many.best[0].logit >= one.best[0].logit - 1e-5
+    exact, winners, error, whole_s = 0, 0, 0.0, list[list[float]]()
+    for number in range(judged):
+        felt = Felt(embeddings[number : number + 1], halves[number : number + 1])
+        start = time.thread_time()
+        one = folder.ask(felt, 10, photos, posterior)
+        middle = time.thread_time()
+        many = cluster.ask(felt, 10, photos, posterior)
+        whole_s.append([middle - start, time.thread_time() - middle])
+        winners += one.best[0].photo == many.best[0].photo
+        exact += [each.photo for each in one.best] == [each.photo for each in many.best]
+        error = max(error, *(abs(a.logit - b.logit) for a, b in zip(one.best, many.best, strict=True)))
+        if posterior is not None and one.mass is not None and many.mass is not None:
+            ours, theirs = (posterior.share([each.logit for each in some.best], some.mass) for some in (one, many))
+            error = max(error, float(np.abs(ours.objects - theirs.objects).max()), abs(ours.none - theirs.none))
+    found = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
+    found["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
+    shares = {"same_winner": same / len(halves), "winner_no_worse": better / len(halves)}
+    folder_s, shards_s = np.median(whole_s, axis=0)
+    return (
+        found
+        | shares
+        | {"all_judged": judged, "all_judged_winner": winners / judged, "all_judged_same": exact / judged}
+        | {"all_judged_error": error, "all_judged_folder_s": float(folder_s), "all_judged_shards_s": float(shards_s)}
+    )
+
+
+def measure(crowd: Crowd, photos: int, shards: int, touches: int, judged: int, out: Path) -> dict[str, float]:
+    """Everything at one number of photos. judged: touches for which all photos are."""
+    figures: dict[str, float] = {"photos": photos, "shards": shards} | write(crowd, photos, shards, out)
+    stored = read_stored(crowd.checkpoint.path)
+    start = time.perf_counter()
+    folder = folder_shard(IndexStore(out / "index").open(verify=False, threads=1), stored)
+    figures["folder_open_s"] = time.perf_counter() - start
+    manifest = read_cluster(out / "cluster")
+    cluster = open_cluster(out / "cluster", manifest, stored, verify=False)
+    figures |= compare(crowd, folder, cluster, touches, judged)
+    np.savez(out / "codes.npz", halves=crowd.touches, embeddings=crowd.embeddings(crowd.touches, "touch"))
+    figures["folder_mb"] = _probe(HELD, out / "index", out / "codes.npz")[0]
+    figures["shard_mb"] = _probe(HELD, out / "cluster" / manifest.shards[0].folder, out / "codes.npz")[0]
+    return figures
+
+
+def opened(places: dict[str, Path], model: Path) -> dict[str, float]:
+    """Processor time in which clusters are opened by whoever asks, in turns; {what it is called: seconds}."""
+    taken: dict[str, list[float]] = {name: [] for name in places}
+    for _ in range(OPENINGS):
+        for name, place in places.items():
+            taken[name].append(_probe(OPENED, place / "cluster", model)[0])
+    return {f"client_open_{name}_s": float(np.median(one)) for name, one in taken.items()}
+
+
+def _probe(program: str, *words: Any) -> list[float]:
+    line = [sys.executable, "-c", program, *map(str, words)]
+    done = subprocess.run(line, check=True, capture_output=True, text=True)
+    return [float(word) for word in done.stdout.split()]
+
+
+def on_ray(crowd: Crowd, photos: int, touches: int, out: Path) -> dict[str, float]:
+    """A cluster of one shard on Ray against the folder, in turns: seconds by the clock on the wall."""
+    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.session import connected
+
+    write(crowd, photos, 1, out)
+    stored = read_stored(crowd.checkpoint.path)
+    manifest = read_cluster(out / "cluster")
+    generation: Generation = open_shard(out / "cluster", manifest.shards[0], manifest.fingerprint, threads=1)
+    folder: FolderShard = folder_shard(generation, stored)
+    halves = crowd.touches[:touches]
+    embeddings, posterior = crowd.embeddings(halves, "touch"), crowd.checkpoint.posterior
+    times: dict[str, list[float]] = {"folder": [], "ray": []}
+    with connected(2) as ray, threadpool_limits(1, "blas"):  # as the service: its threads spin between two queries
+        far = Deployments(ray, Held(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
+        arms = {"folder": folder, "ray": far}
+        for turn in range(-5, len(halves)):
+            felt = Felt(embeddings[[turn]], halves[[turn]])
+            for name, shard in arms.items():
+                start = time.perf_counter()
+                shard.ask(felt, 10, None, posterior)
+                if turn >= 0:
+                    times[name].append(time.perf_counter() - start)
+    return {
+        "ray_photos": photos,
+        **{f"{name}_wall_p{at}_s": float(np.percentile(one, at)) for name, one in times.items() for at in (10, 50, 99)},
+    }
+
+
+def main() -> None:
+    """Print the figures of every size as soon as they are there."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.shards", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5, 1e6])
+    parser.add_argument("--shards", type=int, default=8)
+    parser.add_argument("--touches", type=int, default=TOUCHES)
+    parser.add_argument("--judged", type=int, default=3, help="touches for which all photos are judged")
+    parser.add_argument("--model", type=Path, default=shipped_model())
+    parser.add_argument("--ray", action="store_true", help="the way over Ray too, with the first of the sizes")
+    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    arguments = parser.parse_args()
+    crowd = drawn_crowd(load_checkpoint(arguments.model))
+    with tempfile.TemporaryDirectory() as name:
+        places = {f"{size:.0e}": Path(name) / str(int(size)) for size in arguments.sizes}
+        for size, place in zip(arguments.sizes, places.values(), strict=True):
+            asked = arguments.shards, arguments.touches, arguments.judged
+            _show(measure(crowd, int(size), *asked, place), arguments.json)
+        _show(opened(places, arguments.model), arguments.json)
+    if arguments.ray:
+        with tempfile.TemporaryDirectory() as name:
+            _show(on_ray(crowd, int(arguments.sizes[0]), arguments.touches, Path(name)), arguments.json)
+
+
+def _show(figures: dict[str, float], as_json: bool) -> None:
+    print(json.dumps(figures) if as_json else "  ".join(f"{name} {value:.4g}" for name, value in figures.items()))
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

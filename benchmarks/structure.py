@@ -1,0 +1,145 @@
+"""How the code hangs together: `python -m benchmarks.structure`.
+
+Files, lines and imports of every folder; then ways through the code, each followed as it runs: of a query's gel images
+(by an exported encoder, and by PyTorch), of a catalogue's photo into an index, and of a grasp's force to the gripper. A
+way's modules stand in the order in which it first enters them. "again": calls into a module where the way had been
+before. What every module may use (errors, speaking, progress) is left out.
+"""
+
+import ast
+import shutil
+import sys
+import tempfile
+import threading
+from collections import Counter
+from pathlib import Path
+from types import FrameType
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("indexes", "robot", "retrieval")
+EVERYWHERE = ("errors", "output", "progress", "interruption", "version", "__init__")
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def modules() -> dict[str, Path]:
+    return {module_name(path): path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))}
+
+
+def imported(path: Path, known: set[str]) -> set[str]:
+    """Modules of the project that a file imports, at its top or inside a function."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= ({f"{node.module}.{alias.name}" for alias in node.names} & known) or {node.module}
+    return found & known
+
+
+def folder_of(path: Path) -> str:
+    """Its package, with the first folder below it."""
+    return "/".join(path.relative_to(ROOT).parent.parts[:2])
+
+
+def folders() -> dict[str, Counter[str]]:
+    """Of each folder: files, lines, and imports inside it, from others and of others."""
+    paths, rows = modules(), {}
+    for path in paths.values():
+        row = rows.setdefault(folder_of(path), Counter())
+        row["files"] += 1
+        row["lines"] += len(path.read_text("utf-8").splitlines())
+    for name, path in paths.items():
+        for other in imported(path, set(paths)) - {name}:
+            here, there = folder_of(path), folder_of(paths[other])
+            rows[here]["inside" if here == there else "of others"] += 1
+            if here != there:
+                rows[there]["from others"] += 1
+    return dict(sorted(rows.items()))
+
+
+class Way:
+    """Modules that are called from another module, told by the interpreter while `with` lasts, on any thread."""
+
+    def __init__(self) -> None:
+        self.entered: list[str] = []
+        self._stacks: dict[int, list[str]] = {}
+
+    def __enter__(self) -> "Way":
+        threading.setprofile(self._told)
+        sys.setprofile(self._told)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        sys.setprofile(None)
+        threading.setprofile(None)
+
+    def _told(self, frame: FrameType, event: str, argument: object) -> None:
+        code = frame.f_code
+        ours = code.co_filename.startswith(tuple(f"{ROOT / package}/" for package in PACKAGES))
+        if event not in ("call", "return") or not ours or code.co_name == "<module>":
+            return
+        stack = self._stacks.setdefault(threading.get_ident(), [])
+        if event == "return":
+            del stack[-1:]
+            return
+        name = module_name(Path(code.co_filename))
+        if name.rpartition(".")[2] in EVERYWHERE:
+            name = stack[-1] if stack else name
+        elif not stack or stack[-1] != name:
+            self.entered.append(name)
+        stack.append(name)
+
+    def lines(self) -> list[str]:
+        order = list(dict.fromkeys(self.entered))
+        ours = sum(name.startswith("retrieval") for name in order)
+        return [
+            f"{len(order)} modules ({ours} of retrieval), {len(self.entered) - len(order)} times again:",
+            *(f"    {name}" for name in order),
+        ]
+
+
+def follow(folder: Path) -> dict[str, Way]:
+    """The ways, on things drawn into `folder`; what is set up once has been set up before."""
+    import retrieval
+    from retrieval.model.export import export
+    from tests import synthetic
+    from tests.wsg50_bench import bench
+
+    drawn = synthetic.make_objects(4, seed=1)
+    synthetic.write_catalogue(folder / "catalog", drawn)
+    touch = synthetic.write_queries(folder / "drawn", drawn, touches_per_object=1)[drawn[0].object_id][0]
+    model = Path(shutil.copy(retrieval.shipped_model(), folder / "model.safetensors"))
+    checkpoint = retrieval.load_checkpoint(model)
+    names = ("a catalogue's photo", "a query's images, PyTorch", "a query's images, exported", "a grasp's force")
+    ways = {name: Way() for name in names}
+    with ways["a catalogue's photo"]:
+        retrieval.build_index(folder / "catalog", checkpoint, folder / "index", quiet=True)
+    for encoder in ("PyTorch", "exported"):
+        if encoder == "exported":
+            export(checkpoint)
+        with retrieval.open(folder / "index") as searcher:
+            searcher.gel_check = None  # which would send drawn pictures back
+            searcher.query(touch)
+            with ways[f"a query's images, {encoder}"]:
+                searcher.query(touch)
+    with bench() as (gripper, _), ways["a grasp's force"]:
+        gripper.grasp(20.0)
+    return ways
+
+
+def main() -> None:
+    print(f"{'folder':24}{'files':>7}{'lines':>8}{'inside':>8}{'of others':>11}{'from others':>13}")
+    rows = folders()
+    rows["all"] = sum(rows.values(), Counter())
+    for name, row in rows.items():
+        print(f"{name:24}{row['files']:7}{row['lines']:8}{row['inside']:8}{row['of others']:11}{row['from others']:13}")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, way in follow(Path(folder)).items():
+            print(f"\n{name}: " + "\n".join(way.lines()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""Error against run time of every approximation of a search, measured with one model on one recording.
+
+A new approximation is one function from a `Sample` to a `Row`, one row of `APPROXIMATIONS`, one test parameter. The
+kernels' own, which need no recording of the user's, stand in `benchmarks/frontier/` of the repository.
+"""
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.frontier.points import Row
+    from retrieval.frontier.sample import Sample
+
+APPROXIMATIONS = {
+    "candidates": "retrieval.frontier.candidates:candidates",
+    "index_kinds": "retrieval.frontier.kinds:index_kinds",
+    "towers": "retrieval.frontier.formats:towers",
+    "training_formats": "retrieval.frontier.training:training_formats",
+    "halves": "retrieval.frontier.formats:halves",
+    "image_size": "retrieval.frontier.pixels:image_size",
+    "grasps": "retrieval.frontier.grasps:grasps",
+}
+"""Name -> the function that measures it, imported when it is used."""
+
+
+def load_approximation(name: str, table: Mapping[str, str] = APPROXIMATIONS) -> "Callable[[Sample], Row]":
+    """Return the function that measures `name`.
+
+    Args:
+        name: A key of `table`.
+        table: Name -> "module:function".
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+    if name not in table:
+        raise ConfigError(f"an approximation must be one of {', '.join(table)}; got {name!r}")
+    module, function = table[name].split(":")
+    measure: Callable[[Sample], Row] = getattr(import_module(module), function)
+    return measure

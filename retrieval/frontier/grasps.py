@@ -1,0 +1,58 @@
+"""How often the object is grasped before the answer: wrong first guesses against the time of the query."""
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.frontier.clock import timed
+from retrieval.frontier.pixels import SLACK, load_touch
+from retrieval.frontier.points import Panel, Row, missed
+from retrieval.frontier.sample import Array, Sample
+from retrieval.methods.selection import neighbours
+from retrieval.model.encode import encode_touches
+
+COUNTS = (1, 2, 3, 4, 5, 8)
+
+
+def grasps(sample: Sample) -> Row:
+    """Logits of several grasps add."""
+    owner = sample.owner[sample.touch_rows]
+    most = int(np.unique(owner, return_counts=True)[1].min())
+    codes = sample.touch_codes(sample.touch_rows)["half"]
+    table = np.array([sample.logits(half, sample.own["half"]) for half in codes])
+    counts = [count for count in COUNTS if count <= most]
+    points = [
+        missed(
+            "", f"{count} grasp{'s' * (count > 1)}", _wrong(sample, table, neighbours(owner, count), owner), count == 1
+        )
+        for count in counts
+    ]
+    points = list(timed(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
+    panel = Panel(
+        title="wrong first guesses by number of grasps",
+        time="decoding and encoding the touches and judging every photo, one thread",
+        unit="% of queries",
+        reference=f"the object in the hand, one of {len(np.unique(owner))}",
+        tolerance=round(min(point.error for point in points) + SLACK, 1),
+        points=tuple(points),
+        resolution=100 / len(owner),
+    )
+    return Row(
+        "Grasps of one object",
+        "Logits of several grasps of the object in the hand are added. Every touch starts one set with the next "
+        "touches of its object. The time is that of the computer; the arm's is longer.",
+        (panel,),
+    )
+
+
+def _wrong(sample: Sample, table: Array, sets: NDArray[np.int64], owner: NDArray[np.int64]) -> NDArray[np.bool_]:
+    photo_owner = sample.owner[sample.photo_rows]
+    summed = table[sets].sum(1, dtype=np.float64)
+    return np.asarray(photo_owner[summed.argmax(1)] != owner)
+
+
+def _query(sample: Sample, count: int) -> Array:
+    settings = sample.checkpoint.config.preprocessing
+    touches = [load_touch(settings, sample.grasps[row]) for row in sample.touch_rows[:count]]
+    return sample.logits(encode_touches(sample.checkpoint.matcher, touches).half.numpy(), sample.own["half"])

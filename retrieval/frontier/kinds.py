@@ -1,0 +1,108 @@
+"""Which structure finds the candidates: winners that it misses, nearest neighbours that it misses, and its time."""
+
+from collections.abc import Callable, Iterator
+from itertools import cycle
+
+import numpy as np
+
+from indexes import KINDS, load_kind
+from indexes.errors import ParameterError
+from indexes.kinds.base import VectorIndex
+from retrieval.console.progress import Bar
+from retrieval.frontier.candidates import default_k, is_used
+from retrieval.frontier.clock import timed
+from retrieval.frontier.points import Panel, Row, Tradeoff, missed, smallest
+from retrieval.frontier.sample import Array, Sample
+
+NEIGHBOURS = 10
+TOLERANCE = 1.0
+DEFAULT = "flat"
+"""What `build-index` takes unless it is given a budget that exact search breaks."""
+Measured = tuple[Tradeoff, Callable[[], object]]
+
+
+def index_kinds(sample: Sample) -> Row:
+    """Every kind and its ladder on the blended catalogue, by the embedding in use."""
+    used = [name for name in sample.catalogue.embeddings if is_used(sample, name)]
+    if not used:
+        return Row("Kind of index", "", skipped="this model has no trained embeddings")
+    embeddings, queries = sample.catalogue.embeddings[used[0]], sample.queries[used[0]]
+    k = min(default_k(sample), len(embeddings) // 4)
+    truth = load_kind("flat").build(embeddings, threads=1).search(queries, NEIGHBOURS)[0]
+    near, far = list[Measured](), list[Measured]()
+    made = list(_structures(sample, embeddings))
+    with Bar("kinds of index", len(made), "settings", quiet=sample.quiet) as bar:
+        for series, setting, index in made:
+            is_default = series == DEFAULT
+            if _matters(setting, k):
+                lost = ~(index.search(queries, k)[1] == sample.winners[:, None]).any(1)
+                far.append((missed(series, setting, lost, is_default), _asking(index, queries, k)))
+            lacking = 100 * float(np.mean(index.search(queries, NEIGHBOURS)[0] < truth[:, -1:]))
+            near.append(
+                (Tradeoff(series, setting, lacking, is_default=is_default), _asking(index, queries, NEIGHBOURS))
+            )
+            bar.advance()
+    of_winners, of_neighbours = (_timed(sample, each) for each in (far, near))
+    return Row(
+        "Kind of index",
+        f"Search over {len(embeddings):,} blended photos by the {used[0]}. What counts for an answer is whether the "
+        "classifier's winner is among the candidates; whether nearest neighbours are found is what such indexes are "
+        "usually judged by, and another thing. Exact search is used unless `build-index` is given a bound: it needs no "
+        "training, and what it finds does not hang on the catalogue.",
+        (
+            _panel(
+                f"missed winners among k = {k:,} candidates", k, "every photo judged", 100 / len(queries), of_winners
+            ),
+            _panel(f"missed nearest {NEIGHBOURS}", NEIGHBOURS, "exact search", smallest(of_neighbours), of_neighbours),
+        ),
+    )
+
+
+def _timed(sample: Sample, measured: list[Measured]) -> tuple[Tradeoff, ...]:
+    points, works = zip(*measured, strict=True)
+    return timed(points, works, sample.scale.repeats)
+
+
+def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[Tradeoff, ...]) -> Panel:
+    unit = "% of neighbours" if reference == "exact search" else "% of queries"
+    time = f"search of one query for k = {k:,}, one thread"
+    return Panel(title, time, unit, reference, TOLERANCE, points, resolution)
+
+
+def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, VectorIndex]]:
+    """(series, setting, index) of every kind; the ladder of one structure is searched, not built again."""
+    for kind in KINDS:
+        if kind == "exact":  # the oracle of the others
+            continue
+        for name, built in _built(kind, embeddings, sample.scale.quick):
+            ladder = list(built.along_ladder())
+            for index in ladder[::4] if sample.scale.quick else ladder:
+                tuned = built.search_ladder and built.search_ladder[0]
+                yield name, f"{tuned} = {index.settings()[tuned]}" if tuned else "", index
+
+
+def _built(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
+    """(series, index) of a kind, with each value of its `build_ladder` that these embeddings can have."""
+    made = load_kind(kind)
+    if made.build_ladder is None:
+        yield kind, made.build(embeddings)
+        return
+    setting, values = made.build_ladder
+    for value in values[:1] if quick else values:
+        try:
+            index = made.build(embeddings, made.parameters_from({setting: value}))
+        except ParameterError:  # bytes of a code that do not divide the vector
+            continue
+        yield f"{kind}, {setting} = {value}", index
+
+
+def _matters(setting: str, k: int) -> bool:
+    """A graph is searched with a breadth of k at least."""
+    name, _, value = setting.partition(" = ")
+    return name != "ef_search" or int(value) >= k
+
+
+def _asking(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:
+    """Search of one query after the other; a single one is searched on one thread."""
+    asked = cycle(queries)
+    return lambda: index.search(next(asked)[None], k)

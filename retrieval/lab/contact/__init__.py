@@ -1,1 +1,0 @@
-"""The contact solver beside what is known without a grid."""

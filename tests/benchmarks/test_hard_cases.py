@@ -1,0 +1,215 @@
+"""The hard inputs of every numerical kernel: ours holds, and the naive formula fails on the same input."""
+
+import json
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import hard_cases as command
+from benchmarks.hard_cases import KERNELS, hard_cases
+from benchmarks.optics.least_squares import solve
+from indexes.errors import RowError
+from retrieval.errors import BadInput
+from robot.errors import SceneError
+from tests.documents import ROOT
+from tests.hard_case import HardCase, refused
+from tests.retrieval.methods import hard_linear as linear
+from tests.retrieval.metrics import hard_probability as probability
+from tests.retrieval.metrics import hard_ranking as ranking
+from tests.retrieval.model import hard_losses as losses
+from tests.robot.sight.hard_sight import _exact_depth, _picture, _points, naive_circle
+from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
+
+OF_PACKAGE = {
+    "retrieval": (
+        "match loss",
+        "InfoNCE",
+        "listwise loss",
+        "sigmoid loss",
+        "pruner loss",
+        "tower statistics",
+        "cosine",
+        "pooling of grasps",
+        "logits",
+        "calibration",
+        "softmax",
+        "is it in the gallery",
+        "reliability",
+        "CCA",
+        "PLS",
+        "whitening",
+        "standardising",
+        "top k",
+        "halves",
+        "rank measures",
+        "bootstrap",
+        "intervals",
+        "permutation test",
+        "background",
+        "samples",
+        "resize",
+    ),
+    "indexes": ("unit vectors", "top k", "inner products", "recall", "halves"),
+    "robot": (
+        "layer kernel",
+        "contact solver",
+        "gripper closing",
+        "cylinder fit",
+        "table fit",
+        "depth",
+        "contact gate",
+        "photometric fit",
+        "gel picture",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def rows():
+    """Package -> its hard cases, run when they are first asked for."""
+    return cache(hard_cases)
+
+
+@pytest.mark.parametrize(("package", "kernel"), [(name, kernel) for name in KERNELS for kernel in OF_PACKAGE[name]])
+def test_what_must_hold_does_and_the_naive_formula_fails(rows, package, kernel):
+    of_kernel = [row for row in rows(package) if row.kernel == kernel]
+    assert of_kernel
+    assert [f"{row.case}: {row.ours}" for row in of_kernel if not row.holds] == []
+    assert [f"{row.case}: {row.naive}" for row in of_kernel if row.naive_holds] == []
+
+
+@pytest.mark.parametrize("package", KERNELS)
+def test_every_row_says_all_of_it_and_comes_once(rows, package):
+    assert {row.kernel for row in rows(package)} == set(OF_PACKAGE[package])
+    assert len({(row.kernel, row.case) for row in rows(package)}) == len(rows(package))
+    assert all(row.case and row.must_hold and row.naive and row.ours for row in rows(package))
+
+
+def test_a_kernel_that_no_longer_holds_is_shown_so(monkeypatch):
+    monkeypatch.setattr(losses, "match_loss", lambda z, y: -torch.log(torch.sigmoid(z)).mean())
+    row = losses._sure_and_wrong()
+    assert not row.holds
+    assert row.ours == row.naive == "inf, gradient nan"
+
+
+@pytest.mark.parametrize("kind", [BadInput, RowError, SceneError])
+def test_what_is_accepted_does_not_count_as_refused(kind):
+    def raising():
+        raise kind("row 7 is NaN")
+
+    assert refused(raising, "row 7") == ("refused: row 7 is NaN", True)
+    assert refused(raising, "row 8") == ("refused: row 7 is NaN", False)
+    assert refused(lambda: 3) == ("accepted: 3", False)
+    with pytest.raises(ZeroDivisionError):
+        refused(lambda: 1 / 0)
+
+
+# The naive formulae are right where nothing is hard: they fail by their arithmetic, not by a mistake ----------
+
+
+def test_the_naive_canonical_correlations_are_ours_on_plain_features():
+    touch, photo = linear._views(200, 4)
+    ours = linear._correlations(touch, photo).correlations
+    assert linear.naive_correlations(touch, photo) == pytest.approx(ours, abs=1e-9)
+    assert linear._by_eigenvectors(touch, photo) == pytest.approx(ours, abs=1e-5)
+
+
+def test_the_naive_fits_are_ours_where_pairs_overlap():
+    rng = np.random.default_rng([8])
+    logits, labels = np.append(rng.normal(1, 1, 20_000), rng.normal(-1, 1, 20_000)), np.repeat([1, 0], 20_000)
+    fitted = probability.fit_calibration(logits, labels)
+    # Platt's targets differ from 0 and 1 by 1 in 20,000.
+    assert probability.naive_fit(logits, labels) == pytest.approx((fitted.slope, fitted.intercept), rel=1e-3, abs=1e-3)
+    scores = rng.normal(0, 1, (5000, 5)) + 1.5 * np.eye(5)[0]
+    fitted = probability.fit_posterior(probability.judged_choices(scores))
+    assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)
+
+
+def test_the_naive_components_are_those_of_the_cross_covariance_where_there_are_as_many():
+    touch, photo = linear._views(300, 5)
+    first = np.linalg.svd((touch - touch.mean(0)).T @ (photo - photo.mean(0)))[0][:, 0]
+    assert abs(linear.naive_pls(touch, photo, 2)[:, 0] @ first) == pytest.approx(1, abs=1e-6)
+
+
+def test_the_naive_interval_is_the_t_interval_of_many_values():
+    values = np.random.default_rng([9]).normal(0.5, 0.1, 400)
+    low, high = ranking.naive_interval(values)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
+
+
+def test_the_can_is_drawn_where_it_stands():
+    points = _points(_picture(_exact_depth()))
+    assert points[:, 2].max() == pytest.approx(120, abs=1e-3)
+    side = points[points[:, 2] < 119]
+    # float32 depth of 800 mm is good to 6e-5 mm
+    assert np.hypot(side[:, 0], side[:, 1]) == pytest.approx(np.full(len(side), 33), abs=1e-3)
+    assert side[:, 1].max() < 0
+
+
+def test_the_naive_circle_is_right_on_a_whole_circle_without_noise():
+    angle = np.linspace(0, 2 * math.pi, 50)
+    plan = np.stack([3 + 7 * np.cos(angle), -2 + 7 * np.sin(angle)], axis=1)
+    assert naive_circle(plan) == pytest.approx((3, -2, 7))
+
+
+def test_the_naive_ridge_is_ours_on_features_of_one_size():
+    columns, wanted = _columns()
+    assert naive_ridge(columns, wanted) == pytest.approx(solve(_grams(columns, wanted), 1e-4), abs=1e-2)
+
+
+# The command ---------------------------------------------------------------------------------------------------
+
+GOOD = HardCase("top k", "a <NaN>", "is refused", "ranked first", "refused", True, False)
+BAD = HardCase("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
+
+
+@pytest.fixture
+def few_cases(monkeypatch):
+    """Packages that have no hard case but what a test gives the robot."""
+
+    def give(*cases):
+        monkeypatch.setattr(command, "hard_cases", lambda package: cases if package == "robot" else ())
+
+    return give
+
+
+def test_hard_cases_that_hold_are_printed_and_written_and_the_exit_code_is_0(few_cases, tmp_path, capsys):
+    few_cases(GOOD)
+    assert command.main(["--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "holds  top k, a <NaN>: must hold: is refused; naive ranked first; ours refused\n1 of 1 hold\n" in said
+    page = (tmp_path / "stability.html").read_text()
+    assert "a &lt;NaN&gt;" in page
+    assert "What must hold does" in page
+    assert json.loads((tmp_path / "stability.json").read_text())["failed"] == 0
+
+
+def test_a_hard_case_that_does_not_hold_is_exit_code_1(few_cases, tmp_path, capsys):
+    few_cases(GOOD, BAD)
+    assert command.main(["--out", str(tmp_path)]) == 1
+    assert "FAILS  losses, a logit of 1000: must hold: 1000; naive inf; ours inf" in capsys.readouterr().out
+    assert "DOES NOT HOLD" in (tmp_path / "stability.html").read_text()
+
+
+def test_without_a_folder_nothing_is_written(few_cases, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few_cases(GOOD)
+    assert command.main([]) == 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_cases_name_the_package_that_they_are_of(monkeypatch):
+    monkeypatch.setattr(command, "hard_cases", lambda package: {"robot": [BAD], "indexes": [GOOD]}.get(package, []))
+    made = command.run_hard_cases()
+    assert [case["package"] for case in made["cases"]] == ["indexes", "robot"]
+    assert made["failed"] == 1
+
+
+def test_the_page_of_performance_says_how_many_hold(rows):
+    found = [row for package in KERNELS for row in rows(package)]
+    said = " ".join((ROOT / "docs" / "performance.md").read_text("utf-8").split())
+    kernels = {(package, row.kernel) for package in KERNELS for row in rows(package)}
+    assert f"{len(found)} stiff, extreme or degenerate inputs of {len({name for _, name in kernels})} numerical" in said

@@ -1,0 +1,38 @@
+"""The rehearsal: what a rig of real drivers records is what any other command takes, unchanged."""
+
+import pytest
+
+from benchmarks.rehearsal import rehearse
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.defaults import shipped_model
+from retrieval.search.searcher import Searcher
+from robot.recording.folder import read_info, read_recording
+
+
+@pytest.mark.slow
+def test_what_the_emulated_gripper_and_replayed_sensors_collect_is_searched_like_what_they_replay(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    source, made = rehearse(tmp_path, objects=8, grasps=1)
+    replayed = {grasp.grasp_id: grasp for grasp in read_recording(source).grasps}
+    recorded = read_recording(made).grasps
+    info = read_info(made)
+    assert info["rig"] == "real"
+    assert info["devices"]["WSG-50"]["info"]["serial"] == 20260101
+    assert sum(bool(grasp.grasped) for grasp in recorded) == 8
+    build_index(tmp_path / "catalog", load_checkpoint(shipped_model()), tmp_path / "shipped-index")
+    searcher = Searcher.open(tmp_path / "shipped-index")
+    for grasp in recorded:
+        before = replayed[grasp.grasp_id]
+        assert (grasp.outcome == "held") == (before.outcome == "held")  # what slips is emulated as a miss
+        assert set(grasp.touches_after) == {"a", "b"}
+        if grasp.outcome != "held":
+            continue
+        assert abs(grasp.opening_mm - before.opening_mm) < 1.0
+        guesses = []
+        for folder, each in ((source, before), (made, grasp)):
+            touch = [folder / each.touches[finger] for finger in "ab"]
+            guesses.append(searcher.query([touch], top=1).results[0].object_id)
+        assert guesses[0] == guesses[1]

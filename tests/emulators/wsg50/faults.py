@@ -1,0 +1,63 @@
+"""Faults for the line of an emulated WSG-50: packets lost, doubled, damaged, late, in pieces, misnamed; the line cut.
+
+A line is a stream: what is late keeps everything behind it waiting, and nothing overtakes.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from robot.drivers.wsg50.codec import Packet, WireError, encode
+from tests.emulators.faults import Faults
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Bytes for the line, after a pause; None cuts it."""
+
+    data: bytes | None
+    pause_s: float = 0.0
+
+
+class LineFaults(Faults):
+    """Damages packets. delay_s: how late a delayed packet is, and the pause within a split one."""
+
+    KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")
+
+    def __init__(
+        self, rate: float = 0.0, kinds: Sequence[str] | None = None, *, seed: int = 0, delay_s: float = 0.05
+    ) -> None:
+        super().__init__(rate, kinds, seed=seed)
+        self.delay_s = delay_s
+
+    def on(self, packet: Packet) -> Iterator[Piece]:
+        """What becomes of a packet on the line."""
+        kind, data = self.draw(self.KINDS), encode(packet)
+        yield from self._damaged(kind, packet, data) if kind else [Piece(data)]
+
+    def _damaged(self, kind: str, packet: Packet, data: bytes) -> Iterator[Piece]:
+        if kind == "duplicated":
+            yield Piece(data + data)
+        elif kind == "corrupted":
+            damaged = bytearray(data)
+            damaged[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
+            yield Piece(bytes(damaged))
+        elif kind == "delayed":
+            yield Piece(data, self.delay_s)
+        elif kind == "split":
+            cut = self._random.randrange(1, len(data))
+            yield Piece(data[:cut])
+            yield Piece(data[cut:], self.delay_s)
+        elif kind == "wrong id":
+            yield Piece(self._misnamed(packet))
+        elif kind == "disconnect":
+            yield Piece(None)
+
+    def _misnamed(self, packet: Packet) -> bytes:
+        """The same packet with another id, and a check sum that fits."""
+        while True:
+            try:
+                other = Packet(self._random.randrange(256), packet.payload)
+            except WireError:
+                continue
+            if other.id != packet.id:
+                return encode(other)

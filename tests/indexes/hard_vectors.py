@@ -1,0 +1,207 @@
+"""Stiff and extreme inputs of vector search."""
+
+import math
+import tempfile
+from collections.abc import Iterator
+
+import numpy as np
+
+from indexes import load_kind
+from indexes.kinds.base import VectorIndex
+from indexes.kinds.exact import ExactIndex
+from indexes.kinds.measure import recall_against_exact
+from indexes.kinds.scores import Floats, grid_scores, on_grid
+from indexes.store.folder import IndexStore
+from tests.hard_case import HardCase, refused
+
+_SEARCH, _UNIT, _SCORES = "top k", "unit vectors", "inner products"
+
+
+def hard_cases() -> Iterator[HardCase]:
+    """Cases of vector search, in about a second."""
+    yield _nan_vector()
+    yield _nan_query()
+    yield _zero_vector()
+    yield _huge_vector()
+    yield _tiny_vector()
+    yield _ties_at_the_last_rank()
+    yield _more_than_there_are()
+    yield _removed_rows()
+    yield _another_order_of_the_sum()
+    yield _half_precision_scores()
+    yield _recall_among_equals()
+    yield _overflowing_half()
+
+
+def _axes(count: int = 3) -> Floats:
+    """(count, count) unit vectors at right angles."""
+    return np.eye(count, dtype=np.float32)
+
+
+def _spread(count: int, dim: int) -> Floats:
+    """(count, dim) unit vectors in random directions."""
+    drawn = np.random.default_rng([5]).normal(size=(count, dim))
+    return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True), np.float32)
+
+
+def _text(values: object) -> str:
+    return np.array2string(np.asarray(values), precision=3, separator=", ")
+
+
+# Vectors ---------------------------------------------------------------------------------------------------
+
+
+def _nan_vector() -> HardCase:
+    vectors = _axes()
+    vectors[1, 0] = np.nan
+    order = np.argsort(vectors @ _axes()[0])[::-1]
+    ours, holds = refused(lambda: ExactIndex.build(vectors, names=["mug", "cup", "jar"]), "'cup'", "NaN")
+    naive = f"argsort ranks photos {_text(order)}: the NaN is best"
+    return HardCase(_UNIT, "one of three photos is NaN", "refused, and named", naive, ours, holds, order[0] != 1)
+
+
+def _nan_query() -> HardCase:
+    from indexes.kinds.faiss_index import faiss
+
+    query = np.full((1, 3), np.nan, np.float32)
+    structure = faiss.IndexFlatIP(3)
+    structure.add(_axes())
+    found = structure.search(query, 2)[1][0]
+    ours, holds = refused(lambda: ExactIndex.build(_axes()).search(query, 2), "query '0'", "NaN")
+    naive = f"FAISS answers rows {_text(found)}, and row -1 of a list is its last photo"
+    return HardCase(_UNIT, "a query is NaN", "refused, and named", naive, ours, holds, bool((found >= 0).all()))
+
+
+def _zero_vector() -> HardCase:
+    vectors = _axes()
+    vectors[2] = 0.0
+    cosine = float((vectors[2] / np.linalg.norm(vectors[2])) @ _axes()[0])
+    ours, holds = refused(lambda: ExactIndex.build(vectors), "'2'", "zero")
+    return HardCase(
+        _UNIT, "one vector is zero", "refused, and named", f"cosine {cosine}", ours, holds, math.isfinite(cosine)
+    )
+
+
+def _huge_vector() -> HardCase:
+    """Its cosine with itself is 1, and float32 squares end at 3e38."""
+    vector = np.full((1, 4), 1e30, np.float32)
+    unit = vector / np.sqrt((vector * vector).sum())
+    ours, holds = refused(lambda: ExactIndex.build(vector), "'0'", "2e+30")
+    wanted = "refused, its norm of 2e30 named"
+    cosine = float((unit @ unit.T)[0, 0])
+    return HardCase(
+        _UNIT, "components of 1e30", wanted, f"normalised to a cosine of {cosine} with itself", ours, holds, cosine == 1
+    )
+
+
+def _tiny_vector() -> HardCase:
+    """float32 squares end at 1e-45."""
+    vector = np.full((1, 4), 1e-30, np.float32)
+    norm = float(np.sqrt((vector * vector).sum()))
+    ours, holds = refused(lambda: ExactIndex.build(vector), "'0'", "2e-30")
+    wanted = "refused, its norm of 2e-30 named"
+    return HardCase(_UNIT, "components of 1e-30", wanted, f"a norm of {norm}", ours, holds, norm > 0)
+
+
+# Top k -----------------------------------------------------------------------------------------------------
+
+
+def _ties_at_the_last_rank() -> HardCase:
+    """Forty of 41 photos score the same; the first six of the order (-score, slot) are asked for."""
+    vectors = np.repeat(_axes(8)[:1], 41, axis=0)
+    vectors[40] = _axes(8)[1]
+    query = np.asarray(_axes(8)[1:2] * 0.6 + _axes(8)[:1] * 0.8, np.float32)
+    must = [0, 1, 2, 3, 4, 5]
+    naive = np.argsort(query @ vectors.T)[0, ::-1][:6].tolist()
+    kinds: list[type[VectorIndex]] = [load_kind(name) for name in ("exact", "flat")]
+    ours = [kind.build(vectors).search(query, 6)[1][0].tolist() for kind in kinds]
+    holds = all(found == must for found in ours)
+    wanted = f"slots {must}"
+    return HardCase(_SEARCH, "40 equal photos, 6 asked for", wanted, str(naive), str(ours), holds, naive == must)
+
+
+def _more_than_there_are() -> HardCase:
+    from indexes.kinds.faiss_index import faiss
+
+    structure = faiss.IndexFlatIP(3)
+    structure.add(_axes())
+    naive = structure.search(_axes()[:1], 5)[1][0].tolist()
+    ours = load_kind("flat").build(_axes()).search(_axes()[:1], 5)[1][0].tolist()
+    wanted = "the three there are, none twice"
+    return HardCase(
+        _SEARCH,
+        "5 asked for of 3",
+        wanted,
+        f"FAISS pads with -1: {naive}",
+        str(ours),
+        ours == [0, 1, 2],
+        -1 not in naive,
+    )
+
+
+def _removed_rows() -> HardCase:
+    """Every score is below 0, and a removed photo must not come up for all that."""
+    vectors, query, live = -_axes(), np.full((1, 3), 3**-0.5, np.float32), np.array([True, False, True])
+    naive = int(np.argmax((query @ vectors.T)[0] * live))
+    ours = [load_kind(name).build(vectors).search(query, 3, live)[1][0].tolist() for name in ("exact", "flat")]
+    holds = all(found == [0, 2] for found in ours)
+    wanted = "photos 0 and 2, never 1"
+    multiplied = f"scores x live: photo {naive} first"
+    return HardCase(_SEARCH, "a removed photo among bad matches", wanted, multiplied, str(ours), holds, naive != 1)
+
+
+# Inner products --------------------------------------------------------------------------------------------
+
+
+def _another_order_of_the_sum() -> HardCase:
+    """Equal vectors are ties only where their sums are equal, whatever adds them up."""
+    query, vectors = _spread(300, 256)[:1], _spread(300, 256)[1:]
+    turned = np.random.default_rng([6]).permutation(256)
+    ways = (np.arange(256), turned)
+    naive = [np.cumsum(query[:, way] * vectors[:, way], axis=1)[:, -1] for way in ways]
+    ours = [grid_scores(on_grid(query[:, way]), on_grid(vectors[:, way])) for way in ways]
+    differ = [int((one != other).sum()) for one, other in (naive, ours)]
+    before, after = (f"{count} of 299 scores differ" for count in differ)
+    wanted = "the same bits"
+    return HardCase(
+        _SCORES, "components summed in another order", wanted, before, after, differ[1] == 0, differ[0] == 0
+    )
+
+
+def _half_precision_scores() -> HardCase:
+    """Scores rounded to float16 make ties that are none."""
+    query, vectors = _spread(4001, 64)[:1], _spread(4001, 64)[1:]
+    naive = np.sort((query @ vectors.T).astype(np.float16)[0])[::-1][:100]
+    ours = ExactIndex.build(vectors).search(query, 100)[0][0]
+    distinct = [len(np.unique(scores)) for scores in (naive, ours)]
+    naive_words, words = (f"{count} distinct" for count in distinct)
+    wanted = "100 distinct scores among the best 100"
+    return HardCase(
+        _SCORES, "4000 photos, scores in float16", wanted, naive_words, words, distinct[1] == 100, distinct[0] == 100
+    )
+
+
+def _recall_among_equals() -> HardCase:
+    """All photos are the same: every answer is as good as the exact one."""
+    vectors = np.repeat(_axes(8)[:1], 50, axis=0)
+    index = load_kind("flat").build(vectors)
+    exact = set(np.argsort(index.vectors @ vectors[0])[::-1][:10].tolist())
+    naive = len(exact & set(index.search(vectors[:1], 10)[1][0].tolist())) / 10
+    ours = recall_against_exact(index, vectors[:1], 10)
+    return HardCase(
+        "recall", "50 equal photos", "recall 1", f"{naive} by shared rows", f"{ours}", ours == 1, naive == 1
+    )
+
+
+def _overflowing_half() -> HardCase:
+    """float16 ends at 65504; what lies beyond is infinite in it, and infinity less infinity is NaN."""
+    halves = np.array([[1.0], [7e4]], np.float32).astype(np.float16)
+    naive = float(halves[1, 0] - halves[1, 0])
+    rows = [{"id": "mug"}, {"id": "cup"}]
+    with tempfile.TemporaryDirectory() as folder:
+        store = IndexStore(folder)
+        ours, holds = refused(
+            lambda: store.write(rows, _axes(2), {"halves": halves}, fingerprint={}, kind="exact"), "'cup'"
+        )
+    words = f"a half of {halves[1, 0]}, and {naive} in the next sum"
+    return HardCase("halves", "7e4 in float16", "refused, and named", words, ours, holds, math.isfinite(naive))

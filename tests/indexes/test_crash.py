@@ -1,0 +1,310 @@
+"""Writers that die or collide: readers always find a whole index, the old one or the new one."""
+
+import errno
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from indexes.errors import LockedIndex, NoIndex, WriteFailed
+from indexes.store import files, locking
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit
+from tests.waiting import first_line, running
+
+STEPS = ("fsync", "rename", "replace", "mkdir", "unlink", "rmdir")
+
+KILLED_AT_EVERY_STEP = """
+import json, os, shutil, signal, sys
+from pathlib import Path
+import numpy as np
+from indexes.store.folder import IndexStore
+
+STEPS = json.loads(sys.argv[2])
+base, work = Path(sys.argv[1]) / "base", Path(sys.argv[1]) / "work"
+NAMES = [f"{number:02d}" for number in range(40)]
+OLD, NEW = json.loads(sys.argv[3])
+
+def write(path, ids, parent=None):
+    # The vectors of rows that the parent has come from there.
+    known = parent.reusable(dict.fromkeys(ids, "1")) if parent else {}
+    vectors = np.eye(40, dtype=np.float32)[[NAMES.index(name) for name in ids if name not in known]].reshape(-1, 40)
+    rows = [{"id": name, "digest": "1"} for name in ids]
+    more = {"fingerprint": {}, "kind": "exact", "parent": parent}
+    IndexStore(path).write(rows, vectors, {"halves": vectors}, {"calibration": {}}, **more)
+
+def killed(path, number):
+    steps = 0
+    def wrapped(step):
+        def call(*args, **options):
+            nonlocal steps
+            steps += 1
+            if steps == number:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return step(*args, **options)
+        return call
+    for name in STEPS:
+        setattr(os, name, wrapped(getattr(os, name)))
+    write(path, NEW, parent)
+    os._exit(0)
+
+for _ in range(3):
+    write(base, OLD)
+(base / "gen-000009.tmp-1").mkdir()
+seen, number, alive = [], 0, False
+while not alive:
+    number += 1
+    shutil.rmtree(work, ignore_errors=True)
+    shutil.copytree(base, work)
+    parent = IndexStore(work).open() if sys.argv[4] == "grown" else None
+    child = os.fork()
+    if child == 0:
+        killed(work, number)
+    alive = os.waitpid(child, 0)[1] == 0
+    store = IndexStore(work)
+    found = store.open()
+    found.self_check()
+    assert np.array_equal(found.arrays["halves"], np.eye(40)[[NAMES.index(row["id"]) for row in found.rows]])
+    ids = [row["id"] for row in found.rows]
+    seen.append("old" if ids == OLD else "new" if ids == NEW else "broken")
+    write(work, NEW)
+    assert [row["id"] for row in store.open().rows] == NEW
+    left = sorted(path.name for path in work.iterdir())
+    assert len(left) == 5 and left[0] == "CURRENT" and left[1] == "LOCK", left
+print(json.dumps(seen))
+"""
+
+
+def run(program: str, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        check=True,
+        timeout=120,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )
+    return done.stdout
+
+
+NAMES = [f"{number:02d}" for number in range(40)]
+CHANGES = {
+    "fresh": (["00", "01", "02"], ["01", "03"]),
+    "grown": (NAMES[:30], NAMES[2:33]),  # rows are removed and added, slots stay
+    "renumbered": (NAMES[:30], NAMES[9:31]),
+}
+
+
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=() if how == "grown" else pytest.mark.slow) for how in CHANGES]
+)
+def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_whole(tmp_path, how):
+    states, parent = json.dumps(CHANGES[how]), "fresh" if how == "fresh" else "grown"
+    seen = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS), states, parent))
+    assert set(seen) == {"old", "new"}
+    assert seen == sorted(seen, reverse=True)  # the switch happens once: old up to it, new after it
+    assert len(seen) > 15
+
+
+WRITING_FOREVER = """
+import sys
+import numpy as np
+from indexes.store.folder import IndexStore
+turn = 0
+while True:
+    turn += 1
+    rows = [{"id": f"{turn}-{number}"} for number in range(200)]
+    vectors = np.random.default_rng(turn).normal(size=(200, 16))
+    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    more = {"fingerprint": {}, "kind": sys.argv[2], "threads": 1}
+    IndexStore(sys.argv[1]).write(rows, vectors, {"halves": vectors}, **more)
+    print(turn, flush=True)
+"""
+
+
+@pytest.mark.parametrize("kind", ["exact", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flat", "hnsw"))])
+def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
+    store, rng = IndexStore(tmp_path), np.random.default_rng(0)
+    for _ in range(3):
+        with running([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
+            first_line(writer)
+            time.sleep(float(rng.uniform(0, 0.05)))
+            found = store.open()  # reading while it writes
+            writer.kill()
+        for generation in (found, store.open()):
+            turns = {row["id"].split("-")[0] for row in generation.rows}
+            assert len(turns) == 1
+            assert generation.count == 200
+            generation.self_check(200)
+
+
+class Steps:
+    """Counts the calls that change the disk, and lets one of them fail."""
+
+    def __init__(self, monkeypatch, fails_at: int | None, error: BaseException | None = None) -> None:
+        self.calls: list[tuple[str, str]] = []
+        for name in STEPS:
+            monkeypatch.setattr(os, name, self._wrapped(name, getattr(os, name), fails_at, error))
+
+    def _wrapped(self, name, step, fails_at, error):
+        def call(target, *more, **options):
+            where = os.readlink(f"/proc/self/fd/{target}") if name == "fsync" else str(target)
+            self.calls.append((name, os.path.basename(where)))
+            if len(self.calls) == fails_at:
+                raise error
+            return step(target, *more, **options)
+
+        return call
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="names of open files are read from /proc")
+def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
+    filled(tmp_path)
+    steps = Steps(monkeypatch, None)
+    filled(tmp_path, kind="hnsw", arrays={"halves": np.ones((20, 2))}, documents={"calibration": {}})
+    suffix = f".tmp-{os.getpid()}"
+    calls = [(step, re.sub(r"^\.CURRENT\..*", "beside", name)) for step, name in steps.calls if step != "mkdir"]
+    assert calls == [
+        *(("fsync", name) for name in ("rows.jsonl", "embeddings.npy", "halves.npy", "table.npy")),
+        *(("fsync", name) for name in ("calibration.json", "vectors.faiss")),
+        ("fsync", "manifest.json"),
+        ("fsync", f"gen-000002{suffix}"),
+        ("rename", f"gen-000002{suffix}"),
+        ("fsync", tmp_path.name),
+        ("fsync", "beside"),
+        ("replace", "beside"),
+        ("unlink", "beside"),
+        ("fsync", tmp_path.name),
+    ]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="names of open files are read from /proc")
+def test_a_disk_that_refuses_any_step_is_one_error_and_a_whole_index(tmp_path, monkeypatch):
+    for number in range(1, 100):
+        path = tmp_path / str(number)
+        filled(path)
+        with monkeypatch.context() as patch:
+            steps = Steps(patch, number, OSError(errno.ENOSPC, "No space left on device"))
+            with suppress(WriteFailed):  # anything else fails the test
+                filled(path, 5)
+        assert IndexStore(path).open().count in (5, 20)
+        assert filled(path, 7).count == IndexStore(path).open().count == 7
+        assert not list(path.glob("*.tmp-*"))
+        if len(steps.calls) < number:
+            return
+    raise AssertionError("the steps never ended")
+
+
+def test_an_interrupted_writer_cleans_up_and_gives_the_lock_back(tmp_path, monkeypatch):
+    filled(tmp_path)
+
+    def interrupted(self, sample=256, seed=0, since=0):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Generation, "self_check", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            filled(tmp_path, 5)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
+    assert filled(tmp_path, 5).name == "gen-000002"
+
+
+def test_a_writer_killed_before_the_first_switch_leaves_no_index_and_no_obstacle(tmp_path, monkeypatch):
+    def killed(path, data):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write_atomically", killed)
+        with pytest.raises(KeyboardInterrupt):
+            filled(tmp_path)
+    with pytest.raises(NoIndex):
+        IndexStore(tmp_path).open()
+    assert filled(tmp_path).count == 20
+
+
+def test_two_writers_in_one_process_cannot_work_at_once(tmp_path):
+    store = IndexStore(tmp_path)
+    with store.lock():
+        with pytest.raises(LockedIndex, match=rf"process {os.getpid()} is writing") as caught:
+            filled(tmp_path)
+        assert caught.value.holder == os.getpid()
+        assert store.write(rows_of("a"), unit(1), fingerprint=FINGERPRINT).count == 1
+        with pytest.raises(LockedIndex):
+            filled(tmp_path)
+    assert filled(tmp_path).count == 20
+
+
+HOLDING = """
+import sys, time
+from indexes.store.folder import IndexStore
+with IndexStore(sys.argv[1]).lock():
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_writer_in_another_process_is_named_and_its_death_frees_the_lock(tmp_path):
+    filled(tmp_path)
+    with running([sys.executable, "-c", HOLDING, str(tmp_path)]) as holder:
+        first_line(holder)
+        with pytest.raises(LockedIndex, match=f"process {holder.pid} is writing"):
+            filled(tmp_path)
+        assert IndexStore(tmp_path).open().count == 20  # readers do not wait
+        holder.kill()
+    assert filled(tmp_path, 5).count == 5
+
+
+def test_a_lock_that_cannot_be_made_is_one_error(tmp_path):
+    (tmp_path / "index").write_text("a file")
+    with pytest.raises(WriteFailed, match="lock file cannot be opened"):
+        filled(tmp_path / "index")
+
+
+def test_a_disk_without_room_for_the_writers_number_is_locked_and_let_go_all_the_same(tmp_path, monkeypatch):
+    def full(descriptor, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(locking.os, "write", full)
+        with IndexStore(tmp_path).lock(), pytest.raises(LockedIndex, match="an unknown process is writing"):
+            filled(tmp_path)
+    assert filled(tmp_path).count == 20
+
+
+def test_a_disk_that_keeps_no_locks_is_not_taken_for_one_that_somebody_writes_to(tmp_path, monkeypatch):
+    def refused(descriptor, how):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    monkeypatch.setattr(locking.fcntl, "flock", refused)
+    with pytest.raises(WriteFailed, match=r"this disk keeps no locks \(Operation not supported\); build the index on"):
+        filled(tmp_path)
+
+
+def test_a_generation_replaced_while_it_is_being_opened_is_read_again(tmp_path, monkeypatch):
+    filled(tmp_path)
+    store, real, turns = IndexStore(tmp_path), IndexStore._read, []
+
+    def slow(self, name, verify, threads):
+        if not turns:
+            turns.append(name)
+            for _ in range(4):
+                filled(tmp_path, 6)  # by now the generation that was to be read is gone
+        return real(self, name, verify, threads)
+
+    monkeypatch.setattr(IndexStore, "_read", slow)
+    assert store.open().count == 6
+    assert turns == ["gen-000001"]
+
+
+def test_names_go_on_counting_past_a_generation_that_never_became_current(tmp_path):
+    filled(tmp_path)
+    (tmp_path / "gen-000005").mkdir()
+    assert filled(tmp_path).name == "gen-000006"
+    assert IndexStore(tmp_path).open().rows == rows_of(names(20))

@@ -1,0 +1,109 @@
+"""What builds note of files, rows that are taken over unparsed, and checks in time of what changed."""
+
+import random
+
+import numpy as np
+import pytest
+
+from indexes.errors import MismatchedIndex, RowError
+from indexes.kinds.base import VectorIndex
+from indexes.store.folder import IndexStore
+from indexes.store.rows import are_distinct, first_equal, keys_of
+from indexes.store.seen import Seen
+from indexes.store.tables import Block
+from tests.indexes.test_store import unit
+
+OF = {"checkpoint": "abc"}
+
+
+def rows(numbers):
+    return [{"id": f"{n:03d}", "object_id": f"o{n // 3}", "digest": f"d{n}", "metadata": {}} for n in numbers]
+
+
+@pytest.fixture
+def store(tmp_path):
+    """An index of 40 rows with an array."""
+    made = IndexStore(tmp_path / "index")
+    made.write(rows(range(40)), unit(40), {"halves": np.arange(80, dtype=np.float16).reshape(40, 2)}, fingerprint=OF)
+    return made
+
+
+def test_a_file_is_known_by_all_that_it_looks_like(tmp_path):
+    ids, digests = keys_of(["a", "b", "c"]), keys_of(["1", "2", "3"])
+    looks = np.arange(12, dtype=np.uint64).reshape(3, 4) + np.uint64(2**64 - 20)
+    Seen(tmp_path).write(ids, digests, looks)
+    seen = Seen(tmp_path)
+    np.testing.assert_array_equal(seen.digests(ids, looks), digests)
+    for column in range(4):
+        other = looks.copy()
+        other[1, column] += np.uint64(1)
+        assert (seen.digests(ids, other) == b"").tolist() == [False, True, False]
+    assert seen.digests(keys_of(["d"]), looks[:1]).tolist() == [b""]
+
+
+def test_keys_that_begin_alike_are_told_apart():
+    keys = np.array([b"8 bytes." + end for end in (b"a", b"b", b"c", b"b")] + [b"other", b""], "S16")
+    wanted = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
+    assert first_equal(keys, wanted).tolist() == [1, 2, -1, 4, 5, -1]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_keys_are_found_wherever_a_list_was_changed(seed):
+    draw = random.Random(seed)
+    names = [f"{number:04d}" for number in range(draw.choice([1, 2, 50, 300]))]
+    other = list(names)
+    for _ in range(draw.choice([0, 1, 5, 100])):
+        place = draw.randrange(len(other) + 1)
+        other[place : place + draw.randrange(3)] = draw.sample(["new", "0001", "0299"], draw.randrange(2))
+    place_of = {name: place for place, name in enumerate(names)}
+    found = first_equal(keys_of(names), keys_of(other))
+    assert found.tolist() == [place_of.get(name, -1) for name in other]
+
+
+def test_keys_are_distinct_though_they_begin_alike():
+    keys = np.array([b"8 bytes.a", b"8 bytes.b", b"other"], "S16")
+    assert are_distinct(keys)
+    assert not are_distinct(keys[[0, 1, 2, 1]])
+
+
+def test_rows_that_are_kept_are_those_that_would_have_been_written(store, tmp_path):
+    parent = store.open()
+    new = Block(rows([50]), unit(1, seed=5), {"halves": np.ones((1, 2), np.float16)})
+    kept = store.write_blocks([range(5), new, range(9, 40)], fingerprint=OF, parent=parent)
+    other = IndexStore(tmp_path / "other")
+    other.write(rows(range(40)), unit(40), {"halves": parent.arrays["halves"]}, fingerprint=OF)
+    written = other.write_blocks(
+        [Block(rows(range(5))), new, Block(rows(range(9, 40)))], fingerprint=OF, parent=other.open()
+    )
+    assert kept.rows.text.tobytes() == written.rows.text.tobytes()
+    np.testing.assert_array_equal(kept.rows.table, written.rows.table)
+    np.testing.assert_array_equal(kept.arrays["halves"], written.arrays["halves"])
+    np.testing.assert_array_equal(kept.embeddings, written.embeddings)
+    assert kept.manifest.parent == parent.name
+
+
+def test_rows_are_kept_of_a_parent_that_was_made_alike(store):
+    with pytest.raises(RowError, match="kept of a parent alone"):
+        store.write_blocks([range(3)], fingerprint=OF)
+    with pytest.raises(MismatchedIndex, match="same fingerprint"):
+        store.write_blocks([range(3)], fingerprint={"checkpoint": "other"}, parent=store.open())
+    with pytest.raises(RowError, match="comes twice"):
+        store.write_blocks([range(3), range(2, 5)], fingerprint=OF, parent=store.open())
+
+
+def test_what_a_parent_has_checked_is_checked_by_a_sample(store, monkeypatch):
+    searched = []
+    search = VectorIndex.search
+    monkeypatch.setattr(VectorIndex, "search", lambda self, q, *how: searched.append(len(q)) or search(self, q, *how))
+    new = Block(rows([50, 51]), unit(2, seed=5), {"halves": np.ones((2, 2), np.float16)})
+    store.write_blocks([range(40), new], fingerprint=OF, parent=store.open(), self_check=32)
+    assert searched == [2 + 32 // 16]
+    store.write_blocks([range(40)], fingerprint=OF, parent=store.open(), self_check=32, kind="hnsw")
+    assert searched[-1] == 32  # another structure
+
+
+def test_the_ends_of_lines_are_compared_unparsed(store):
+    found = store.open().rows
+    assert found.ending(b'"metadata": {}}').all()
+    assert found.ending(b'"d7", "metadata": {}}').nonzero()[0].tolist() == [7]
+    assert not found.ending(b"x" * 1000).any()

@@ -1,0 +1,180 @@
+"""What README and docs/ tell people to run does run; the notebooks have tests/project/test_notebooks.py."""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+
+import cv2
+import pytest
+import torch
+import typer
+
+from benchmarks.reference import COMMANDS
+from benchmarks.reference import commands as commands_page
+from retrieval.commands.main import main
+from retrieval.model.towers import build_tower
+from retrieval.search.answer import EXIT_CODES
+from robot.rig import load_rig
+from tests import real_data_sets, serving, synthetic
+from tests.documents import PAGES, README, ROOT, blocks, text_of
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.project.test_project import pins
+from tests.replay_rig import replay_file
+from tests.retrieval.commands.test_rig import POINTS
+
+SHORTER = {
+    "demo": ["--objects", "4", "--jobs", "1"],
+    "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
+    "rig": [],
+    "import": [],
+    "check": [],
+    "train": ["--iterations", "2"],
+    "adapt": [],
+    "build-index": [],
+    "query": [],
+    "export": [],
+    "export-recording": [],
+    "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
+    "frontier": ["--quick", "--only", "halves", "--recording", "recording"],
+    "serve": ["--port", "0"],
+    "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca_pca"],
+}
+"""The commands, and what makes each of them quick."""
+
+
+def commands(*pages):
+    """Lines of shell blocks as words, comments taken off."""
+    lines = [line for block in blocks("sh", *pages) for line in block.replace("\\\n", " ").splitlines()]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def of_program(name, *pages):
+    return [words for words in commands(*pages) if words[0] == name]
+
+
+@pytest.fixture
+def home(tmp_path, recording, catalogue, model, monkeypatch):
+    """Everything that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
+    model.safetensors, rig.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
+    shutil.copytree(recording, tmp_path / "recording")
+    shutil.copytree(catalogue, tmp_path / "catalog")
+    shutil.copy(model, tmp_path / "model.safetensors")
+    objects = synthetic.make_objects(1, seed=9)
+    pairs = synthetic.write_queries(tmp_path / "drawn", objects, touches_per_object=2)[objects[0].object_id]
+    for number, pair in enumerate(pairs):
+        for finger, path in zip("ab", pair, strict=True):
+            shutil.copy(path, tmp_path / f"{finger}{'' if number == 0 else number + 1}.png")
+    for place in ("welded1/01", "welded1/02"):
+        (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
+        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    for name in ("mug", "tin"):
+        (tmp_path / "pictures" / name).mkdir(parents=True)
+        shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
+        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
+    real_data_sets.write_billets(tmp_path / "data" / "billets")
+    (tmp_path / "benchmarks" / "models").mkdir(parents=True)
+    shutil.copy(ROOT / "benchmarks" / "models" / "shipped_rig.toml", tmp_path / "benchmarks" / "models")
+    (tmp_path / "points.csv").write_text(POINTS)
+    (tmp_path / "grey.toml").write_text(next(block for block in blocks("toml") if "grey" in block))
+    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
+    monkeypatch.chdir(tmp_path)
+    with replay_file(EmulatedWSG50(object_mm=40.0, speed_up=50.0, referenced=True)) as rig:
+        shutil.copy(rig, tmp_path)
+        yield tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if of_program("retrieve", page)], ids=lambda page: page.stem)
+def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
+    for line in of_program("retrieve", page):
+        if line[1] == "serve":  # until it is told to end
+            with serving.command(*line[2:], *SHORTER["serve"], cwd=home) as (process, _, _):
+                process.terminate()
+                assert process.wait(60) == 0
+            continue
+        # An export that is not the faster one on this machine is refused, with exit code 1.
+        accepted = {"export": {0, 1}, "query": set(EXIT_CODES.values())}.get(line[1], {0})
+        assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line
+
+
+def test_every_retrieve_command_stands_in_a_block_that_is_run():
+    assert {line[1] for line in of_program("retrieve")} == set(SHORTER)
+
+
+def test_nothing_stands_in_a_shell_block_that_no_test_runs():
+    assert {line[0] for line in commands()} == {"make", "retrieve", "python", "pip"}
+
+
+def test_the_settings_of_the_pages_make_a_rig(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "points.csv").write_text(POINTS)
+    assert main(["rig", "calibrate", "points.csv"]) == 0
+    kinds = []
+    for number, block in enumerate(blocks("toml")):
+        (tmp_path / f"{number}.toml").write_text(block)
+        rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)
+        assert len(rig.object_ids(1)) == 1
+        kinds.append(tomllib.loads(block)["rig"])
+    assert sorted(kinds) == ["real", "sim", "sim"]
+
+
+def test_the_make_commands_exist_and_the_first_lines_name_two_of_them():
+    for line in of_program("make"):
+        dry = subprocess.run(["make", "-n", *line[1:]], cwd=ROOT, capture_output=True, check=False)
+        assert dry.returncode == 0, line
+    assert [line[1] for line in of_program("make", README)][:2] == ["demo", "test"]
+
+
+@pytest.mark.slow
+def test_every_python_command_exists():
+    for line in of_program("python"):
+        module = line[line.index("-m") + 1]
+        asked = [sys.executable, "-m", module, "--help"]
+        assert subprocess.run(asked, cwd=ROOT, capture_output=True, check=False).returncode == 0, line
+
+
+@pytest.mark.skipif(typer.__version__ != pins("constraints.txt")["typer"], reason="typers lay help out differently")
+def test_the_help_of_every_command_stands_in_its_page(monkeypatch, capsys):
+    assert text_of(COMMANDS) == commands_page(), "run `python -m benchmarks.reference`"
+    monkeypatch.setenv("COLUMNS", "100")
+    for asked in re.findall("^## retrieve ?(.*)$", text_of(COMMANDS), re.M):
+        assert main([*asked.split(), "--help"]) == 0
+        assert capsys.readouterr().out.strip() in text_of(COMMANDS)
+    assert set(SHORTER) <= set(re.findall(r"^## retrieve (\S+)$", text_of(COMMANDS), re.M))
+
+
+class FakeGel:
+    """A camera that shows one picture, blue first."""
+
+    def __init__(self, device):
+        self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
+
+    def read(self):
+        return True, self.picture
+
+
+def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, model, monkeypatch, capsys):
+    """Two grasps, the next object, one grasp of it."""
+    (program,) = blocks("python", README)
+    assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
+    keys = iter(["", "", "n", "", "q"])
+    monkeypatch.setattr(cv2, "VideoCapture", FakeGel)
+    monkeypatch.setattr("builtins.input", lambda prompt: next(keys))
+    capsys.readouterr()
+    exec(compile(program, "README.md", "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    grasp = ["--gelsight", "a.png", "b.png"]
+    for grasps, line in zip((1, 2, 1), said, strict=True):
+        main(["query", *grasp * grasps, "--index", "demo/index", "--json"])
+        document = json.loads(capsys.readouterr().out)
+        best = document["results"][0]
+        assert line == f"{document['verdict']} {best['object_id']}, {best['probability']:.2f}"
+
+
+def test_programs_stand_in_the_readme_and_in_the_reference_whose_examples_run():
+    assert {page.stem for page in PAGES if blocks("python", page)} == {"README", "reference"}

@@ -1,0 +1,80 @@
+"""What README, docs/, CONTRIBUTING and the notebooks name and link to is there."""
+
+import pkgutil
+import re
+import tomllib
+
+import pytest
+
+from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, anchors, links, table_rows, text_of
+
+LINKED = (*PAGES, CONTRIBUTING, *NOTEBOOKS)
+LONGEST_README = 150
+OURS = r"(?:retrieval|robot|indexes|tests|benchmarks)"
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.stem)
+def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page):
+    for link in links(page):
+        if not link.startswith("http"):
+            name, _, anchor = link.partition("#")
+            target = (page.parent / name).resolve() if name else page
+            assert target.exists(), link
+            assert not anchor or anchor in anchors(target), link
+
+
+def test_pages_of_the_site_link_within_the_site():
+    for page in SITE:
+        assert not [link for link in links(page) if link.startswith("..")], page.name
+
+
+def test_every_page_and_every_picture_is_reached_from_the_readme_or_the_first_page():
+    reached = {(page.parent / link.partition("#")[0]).resolve() for page in LINKED for link in links(page)}
+    assert {*SITE, *(ROOT / "docs" / "images").iterdir()} - {ROOT / "docs" / "index.md"} <= reached
+
+
+def test_the_readme_is_short():
+    assert len(text_of(README).splitlines()) <= LONGEST_README
+
+
+def test_the_readmes_tables_are_parts_of_those_in_the_pages():
+    """Every row stands in a page with the same first cell, and its cells there in the same order."""
+    kept = [row for page in SITE for row in table_rows(page)]
+    shown = table_rows(README)
+    assert len(shown) > 15
+    for first, *cells in shown:
+        candidates = [iter(row[1:]) for row in kept if row[0] == first]
+        assert any(all(cell in rest for cell in cells) for rest in candidates), first
+
+
+def test_every_module_that_is_named_to_be_run_is_there():
+    folders = ("retrieval", "robot", "indexes", "tests", "benchmarks")
+    code = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    named = {
+        (path.name, module)
+        for path in (*LINKED, *code)
+        for module in re.findall(rf"python -m ({OURS}(?:\.\w+)*)", path.read_text("utf-8"))
+    }
+    assert len(named) > 20
+    for path, module in named:
+        place = ROOT / module.replace(".", "/")
+        assert place.with_suffix(".py").is_file() or (place / "__main__.py").is_file(), (path, module)
+
+
+def test_every_file_of_ours_that_a_page_names_is_there():
+    for page in (*PAGES, CONTRIBUTING):
+        for name in re.findall(rf"(?<![\w/]){OURS}/[\w./*-]*(?:\.\w+|/)", text_of(page)):
+            assert list(ROOT.glob(name.rstrip("/"))), (page.name, name)
+
+
+def test_every_module_and_name_of_ours_that_a_page_names_is_there():
+    for page in (*PAGES, CONTRIBUTING):
+        for name in re.findall(r"`((?:retrieval|robot|indexes)(?:\.[A-Za-z_]\w*)+)`", text_of(page)):
+            assert pkgutil.resolve_name(name), (page.name, name)
+
+
+def test_every_extra_that_a_page_names_can_be_installed():
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = [extra for page in PAGES for extra in re.findall(r"touch-retrieval\[([\w,]+)\]", text_of(page))]
+    assert named
+    assert {extra for extras in named for extra in extras.split(",")} <= set(known)

@@ -1,0 +1,221 @@
+"""Who may import whom, and what a command may load: by reading the imports, and by running with modules blocked."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.documents import CONTRIBUTING, table_rows
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("indexes", "robot", "retrieval")
+# Only these know the rigs: the reader of recordings, what shows a rig on the page, and the commands around a rig.
+MAY_TOUCH_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/")
+# In `retrieval` the layers run one way; a module may import those of its own layer and of layers before it.
+LAYERS = (
+    ("errors", "version", "console", "metrics"),
+    ("data",),
+    ("model",),
+    ("training", "search"),
+    ("cluster",),
+    ("methods",),
+    ("evaluation",),
+    ("report",),
+    ("adaptation", "frontier", "serve"),
+    ("commands",),
+    ("__main__",),
+)
+
+
+def modules(package):
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def imported(path):
+    """Names of the modules that a file imports anywhere, functions included."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def packages_of(path):
+    return {name.split(".")[0] for name in imported(path)}
+
+
+@pytest.mark.parametrize("package", ["indexes", "robot"])
+def test_indexes_and_robot_know_nothing_of_anyone(package):
+    others = set(PACKAGES) - {package} | {"tests", "benchmarks", "notebooks"}
+    for path in modules(package):
+        assert not packages_of(path) & others, path
+
+
+def test_retrieval_knows_neither_tests_nor_benchmarks():
+    for path in modules("retrieval"):
+        assert not packages_of(path) & {"tests", "benchmarks", "notebooks"}, path
+
+
+def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_images():
+    for path in modules("robot"):
+        assert not packages_of(path) & {"torch", "faiss"}, path
+    for path in modules("indexes"):
+        assert not packages_of(path) & {"torch", "cv2", "PIL"}, path
+
+
+def test_only_the_dataset_reader_the_rig_of_the_service_and_the_commands_touch_robot():
+    touching = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
+    assert not [path for path in touching if not path.startswith(MAY_TOUCH_ROBOT)]
+    assert "retrieval/data/dataset.py" in touching
+
+
+def test_the_layers_of_retrieval_run_one_way():
+    layer_of = {name: number for number, names in enumerate(LAYERS) for name in names}
+    for path in modules("retrieval"):
+        own = path.relative_to(ROOT / "retrieval").parts[0].removesuffix(".py")
+        if own == "__init__":
+            continue
+        assert own in layer_of, f"{path} has no layer: add it to LAYERS"
+        for name in imported(path):
+            parts = name.split(".")
+            if parts[0] == "retrieval" and len(parts) > 1 and parts[1] in layer_of:
+                assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
+
+
+def test_the_layers_are_as_contributing_and_the_package_say():
+    rows = table_rows(CONTRIBUTING)
+    first = next(number for number, row in enumerate(rows) if row[0] == "layers of `retrieval/`") + 2
+    told = [tuple(cell.strip("`") for cell in row[0].split(", ")) for row in rows[first : first + len(LAYERS) - 1]]
+    assert told == [*LAYERS[:-1]]  # but for __main__, which only starts the command line
+    in_package = ast.get_docstring(ast.parse((ROOT / "retrieval/__init__.py").read_text("utf-8")))
+    assert " -> ".join(", ".join(names) for names in told) in " ".join(in_package.split())
+    for place in MAY_TOUCH_ROBOT:
+        assert f"`{place}`" in CONTRIBUTING.read_text("utf-8")
+
+
+def run_blocked(code, blocked):
+    """Run code in a process where importing a blocked module fails."""
+    guard = (
+        "import sys\n"
+        "class Guard:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name.split('.')[0] in {set(blocked)!r}: raise ImportError('blocked: ' + name)\n"
+        "sys.meta_path.insert(0, Guard())\n"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", guard + code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "prometheus_client", "httpx")
+HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
+
+
+def test_robot_imports_without_torch():
+    code = "import robot, robot.recording.folder, robot.importers, robot.importers.billets, robot.collect, robot.rig"
+    done = run_blocked(code, ("torch", "faiss"))
+    assert done.returncode == 0, done.stderr
+
+
+OF_DEVICES = ("serial", "websockets", "pyrealsense2", "pylibfreenect2", "roslibpy", "trimesh", "torch", "faiss")
+
+
+def test_every_module_of_robot_imports_without_the_packages_of_devices():
+    names = [str(path.relative_to(ROOT).with_suffix("")).replace("/", ".") for path in modules("robot")]
+    plain = [name.removesuffix(".__init__") for name in names]
+    assert "robot.drivers.wsg50.driver" in plain
+    done = run_blocked("import " + ", ".join(plain), OF_DEVICES)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("role", "table", "said"),
+    [
+        ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install pyserial"),
+        (
+            "arm",
+            {"driver": "sawyer", "host": "127.0.0.1", "base_xyz_mm": [0, 0, 0], "tool_mm": 150.0},
+            "pip install 'touch-retrieval[sawyer]'",
+        ),
+        ("camera", {"driver": "realsense"}, "pip install 'touch-retrieval[realsense]'"),
+        ("camera", {"driver": "kinect2"}, "pylibfreenect2"),
+    ],
+)
+def test_a_driver_without_its_package_says_what_to_install(role, table, said):
+    code = f"""
+import numpy as np
+from robot.errors import DeviceError
+from robot.real_rig import load_driver
+from robot.readings import Region
+given = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
+device = load_driver({role!r}, {table!r}, "table", **given)
+try:
+    device.connect()
+except DeviceError as error:
+    print(error)
+"""
+    done = run_blocked(code, OF_DEVICES)
+    assert said in done.stdout, done.stderr
+    assert "missing" in done.stdout
+
+
+def test_the_collector_knows_the_contract_and_no_rig():
+    """A rig is imported when it is asked for by name."""
+    code = "import sys, robot.collect, robot.rig; print([name for name in sys.modules if name.startswith('robot.sim')])"
+    done = run_blocked(code, ("torch", "faiss", "scipy", "trimesh"))
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+def test_indexes_import_with_numpy_alone():
+    code = "import indexes, indexes.store.folder, indexes.kinds.exact, indexes.kinds.measure"
+    done = run_blocked(code, ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn"))
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [],
+        ["demo"],
+        ["collect"],
+        ["import"],
+        ["check"],
+        ["train"],
+        ["build-index"],
+        ["query"],
+        ["export"],
+        ["evaluate"],
+        ["frontier"],
+        ["serve"],
+        ["benchmark"],
+        ["benchmark", "real"],
+        ["rig"],
+        ["rig", "check"],
+        ["rig", "calibrate"],
+    ],
+)
+def test_help_loads_nothing_heavy(command):
+    code = f"import sys\nfrom retrieval.commands.main import main\nsys.exit(main({[*command, '--help']!r}))"
+    done = run_blocked(code, HEAVY)
+    assert done.returncode == 0, done.stderr
+    assert "Usage: retrieve" in done.stdout
+
+
+def test_the_guard_does_block():
+    assert "blocked: torch" in run_blocked("import torch", ("torch",)).stderr
+
+
+def test_robot_is_our_package_and_not_another_one_of_that_name():
+    """The PyPI package robotframework installs a top-level `robot` too; the two cannot share an environment."""
+    import robot
+
+    assert Path(robot.__file__).parent == ROOT / "robot"
+
+
+def test_no_file_outgrows_what_a_stranger_can_read():
+    long = [str(path) for package in PACKAGES for path in modules(package) if len(path.read_text().splitlines()) > 400]
+    assert not long

@@ -1,0 +1,157 @@
+"""The notebooks run from top to bottom on tiny data, and the outputs that they are committed with are whole."""
+
+import ast
+import json
+import re
+
+import pytest
+
+from benchmarks.notebooks import FOLDER, execute, kinds
+from retrieval.model.judge import CONTACT, GelCheck
+from tests import synthetic
+
+TINY = {
+    "comparing_baselines": {
+        "recording": "../demo/recording",
+        "out": "../build/comparing-baselines",
+        "preset": "tiny",
+        "iterations": 4,
+        "methods": ("late_fusion", "cca", "chance"),
+    },
+    "error_against_time": {
+        "out": "../build/error-against-time",
+        "demo": "../demo",
+        "photos": 700,
+        "queries": 6,
+        "repeats": 1,
+        "quick": True,
+        "preset": "tiny",
+        "iterations": 4,
+    },
+    "one_query": {
+        "demo": "../demo",
+        "out": "../build/one-query",
+        "which": 0,
+        "grasps": 2,
+        "candidates": 4,
+        "top": 2,
+    },
+    "simulated_data": {
+        "out": "../build/simulated-data",
+        "seed": 0,
+        "index": 2,
+        "objects": 1,
+        "grasps": 1,
+        "gallery": 2,
+    },
+    "your_own_data": {
+        "demo": "../demo/recording",
+        "catalogue": "../demo/catalog",
+        "out": "../build/your-own-data",
+        "preset": "tiny",
+        "iterations": 2,
+        "top": 2,
+    },
+}
+LARGEST_BYTES = 400_000
+LONGEST_CELL = 14
+
+every_notebook = pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.ipynb")))
+
+
+def notebook(name):
+    return json.loads((FOLDER / f"{name}.ipynb").read_text("utf-8"))
+
+
+def code_cells(name):
+    return [cell for cell in notebook(name)["cells"] if cell["cell_type"] == "code"]
+
+
+def committed(name):
+    return [cell["outputs"] for cell in code_cells(name)]
+
+
+@pytest.fixture
+def beside(tmp_path, monkeypatch):
+    """What notebooks find beside their folder: a recording and a catalogue in the demo's sizes, and nothing else."""
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    synthetic.write_recording(tmp_path / "demo" / "recording", synthetic.make_objects(24), 3)
+    synthetic.write_catalogue(tmp_path / "demo" / "catalog", synthetic.make_objects(4), photos_per_object=2)
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path / "notebooks")
+
+
+@pytest.mark.slow
+@every_notebook
+def test_a_notebook_runs_from_top_to_bottom_and_was_committed_with_what_every_cell_shows(name, beside, monkeypatch):
+    # Drawn pictures stand for the demo's touches; the shipped checkpoint would say that they are no gel images.
+    monkeypatch.setattr(GelCheck, "judge", lambda self, readings, levels=None: [CONTACT] * len(readings))
+    tiny = "\n".join(f"{key} = {value!r}" for key, value in TINY[name].items())
+    shown = [kinds(outputs) for outputs in execute(notebook(name), parameters=tiny)]
+    assert shown == [kinds(outputs) for outputs in committed(name)]
+    assert any("picture" in kind for kind in shown)
+
+
+@every_notebook
+def test_the_first_code_cell_holds_the_parameters_and_nothing_else(name):
+    first, *others = code_cells(name)
+    assert first["metadata"] == {"tags": ["parameters"]}
+    assert not any(cell["metadata"] for cell in others)
+    found = {}
+    for statement in ast.parse("".join(first["source"])).body:
+        assert isinstance(statement, ast.Assign)
+        found[statement.targets[0].id] = ast.literal_eval(statement.value)
+    assert found.keys() == TINY[name].keys()
+    assert not any(str(value).startswith(("/", "~")) for value in found.values())
+
+
+@every_notebook
+def test_committed_outputs_are_small_without_errors_and_name_no_folder_of_a_machine(name):
+    outputs = [output for outputs in committed(name) for output in outputs]
+    assert {output["output_type"] for output in outputs} <= {"stream", "execute_result", "display_data"}
+    assert not any(output.get("name") == "stderr" for output in outputs)
+    told = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
+    assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users|var|mnt)\b|[A-Z]:\\\\", told)
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < LARGEST_BYTES
+
+
+@every_notebook
+def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
+    document = notebook(name)
+    headings = [cell["source"][0] for cell in document["cells"] if cell["cell_type"] == "markdown"]
+    assert document["cells"][0]["source"][0] == headings[0]
+    assert headings[0].startswith("# ")
+    assert not any(heading.startswith("# ") for heading in headings[1:])
+    for cell in code_cells(name)[2:]:  # after parameters and imports
+        lines = "".join(cell["source"]).splitlines()
+        assert len(lines) <= LONGEST_CELL, lines[0]
+        built = [type(node) for node in ast.walk(ast.parse("\n".join(lines)))]
+        assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(built)
+    assert not set(document["metadata"]) - {"kernelspec", "language_info"}
+
+
+def test_a_cell_shows_what_it_prints_its_last_line_and_its_figures(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    cells = [
+        "a = 2",
+        "print('b')\na",
+        "import matplotlib.pyplot as plt\nfor _ in range(2):\n    plt.figure(figsize=(1, 1))",
+        "from PIL import Image\nImage.new('RGB', (4, 4))",
+        "None",
+    ]
+    document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in cells]}
+    outputs = list(execute(document))
+    assert [kinds(each) for each in outputs] == [set(), {"text", "value"}, {"picture"}, {"picture"}, set()]
+    assert outputs[1][0]["text"] == ["b\n"]
+    assert outputs[1][1]["data"] == {"text/plain": ["2"]}
+    assert len(outputs[2]) == 2
+
+
+def test_given_parameters_stand_in_for_the_first_cell_and_a_failing_cell_is_named():
+    document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in ("a = 2", "a", "1 / 0")]}
+    outputs = execute(document, parameters="a = 3")
+    assert next(outputs) == []
+    assert next(outputs)[0]["data"] == {"text/plain": ["3"]}
+    with pytest.raises(ZeroDivisionError) as raised:
+        next(outputs)
+    assert "code cell 3" in raised.value.__notes__[0]

@@ -1,0 +1,56 @@
+"""The project's own files: dependencies, the oldest versions, and what `make` promises."""
+
+import re
+import tomllib
+from itertools import chain
+from pathlib import Path
+
+import tests
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def bounds():
+    """Lower bound of every requirement, extras included."""
+    listed = [*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())]
+    return {re.split(r"[<>=\[]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
+
+
+def test_what_a_query_needs_is_bounded_as_it_is_for_everything_else():
+    listed = {*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())}
+    assert set(PROJECT["dependency-groups"]["query"]) <= listed
+
+
+def pins(name):
+    lines = (ROOT / ".ci" / name).read_text().splitlines()
+    return dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))
+
+
+def test_the_oldest_versions_that_are_tested_are_the_lower_bounds():
+    lowest = pins("lowest.txt")
+    assert set(lowest) == set(bounds())
+    for name, bound in bounds().items():
+        assert lowest[name].startswith(bound), name
+
+
+def test_everything_is_pinned_for_the_tests():
+    assert set(pins("constraints.txt")) == set(bounds())
+
+
+def test_only_our_packages_are_installed():
+    assert PROJECT["tool"]["setuptools"]["packages"]["find"]["include"] == ["retrieval*", "robot*", "indexes*"]
+    assert {path.name for path in ROOT.iterdir() if path.is_dir() and (path / "__init__.py").exists()} == {
+        "retrieval",
+        "robot",
+        "indexes",
+        "tests",
+        "benchmarks",
+    }
+
+
+def test_what_stands_beside_the_tests_is_told():
+    there = {
+        path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert {name for name in there if not name.startswith(("test_", "__"))} <= set(re.findall(r"\w+", tests.__doc__))

@@ -1,0 +1,111 @@
+"""The public names: what they cost, that their examples run, and that the reference page is theirs."""
+
+import doctest
+import inspect
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import retrieval
+import robot
+from benchmarks import reference
+from benchmarks.reference import PACKAGES, PAGE
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from tests import synthetic
+from tests.project.test_imports import HEAVY, run_blocked
+
+
+@pytest.fixture(scope="module")
+def folder(catalogue, touch, model, tmp_path_factory):
+    """What the examples name, of two objects. The examples write into it."""
+    root = tmp_path_factory.mktemp("examples")
+    objects = synthetic.make_objects(2, seed=9)
+    photos = sorted(catalogue.rglob("*.jpg"))
+    for name, own in (("mug", photos[:2]), ("tin", photos[3:5])):
+        (root / "catalog" / name).mkdir(parents=True)
+        for number, photo in enumerate(own, start=1):
+            shutil.copy(photo, root / "catalog" / name / f"{number}.jpg")
+    for number, grasp in enumerate(synthetic.write_queries(root / "drawn", objects[:1], 2)[objects[0].object_id]):
+        for finger, path in zip("ab", grasp, strict=True):
+            shutil.copy(path, root / f"{finger}{'' if number == 0 else 2}.png")
+    with robot.RecordingWriter(root / "recording", {"source": "drawn", "sensor": "none"}) as writer:
+        for number, name in enumerate(("mug", "mug", "tin", "tin")):
+            images = {"photo": root / "catalog" / name / "1.jpg", "touch_a": root / "a.png", "touch_b": root / "b.png"}
+            writer.append(f"{number:06d}", name, images)
+    shutil.copy(model, root / "model.safetensors")
+    build_index(root / "catalog", load_checkpoint(root / "model.safetensors"), root / "index", quiet=True)
+    return root
+
+
+def examples():
+    """(name, what carries the docstring) of every public function and class, and of the packages."""
+    named = [(package.__name__, package) for package in PACKAGES]
+    for package in PACKAGES:
+        things = [(name, getattr(package, name)) for name in package.__all__]
+        named += [(f"{package.__name__}.{name}", thing) for name, thing in things if callable(thing)]
+    return named
+
+
+def test_every_public_name_has_an_example_that_runs(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    for name, thing in examples():
+        known = {package.__name__: package for package in PACKAGES}
+        found = doctest.DocTestParser().get_doctest(inspect.getdoc(thing), known, name, None, None)
+        assert found.examples, f"{name} has no example"
+        runner.run(found, clear_globs=True)
+    assert runner.summarize(verbose=False).failed == 0, capsys.readouterr().out
+
+
+def test_the_reference_page_is_up_to_date():
+    assert PAGE.read_text("utf-8") == reference.reference(), "run `python -m benchmarks.reference`"
+
+
+def test_importing_the_packages_and_naming_what_they_have_imports_nothing_heavy():
+    code = "import retrieval, robot, indexes\nprint(dir(retrieval), dir(robot), dir(indexes), indexes.load_kind)"
+    done = run_blocked(code, HEAVY)
+    assert done.returncode == 0, done.stderr
+    for name in ("open", "embed_photos", "read_recording", "IndexStore", "__getattr__"):
+        assert f"'{name}'" in done.stdout
+
+
+def test_all_names_what_there_is_and_nothing_else_is_got():
+    for package in PACKAGES:
+        assert len(set(package.__all__)) == len(package.__all__)
+        assert set(package.__all__) <= set(dir(package))
+        assert all(getattr(package, name) is not None for name in package.__all__)
+        with pytest.raises(AttributeError, match=f"module '{package.__name__}' has no attribute 'absent'"):
+            _ = package.absent
+
+
+def test_a_public_name_is_no_module_of_its_package():
+    """`import robot.collect` would put the module in the name's place."""
+    for package in PACKAGES:
+        modules = {path.stem for path in Path(package.__file__).parent.iterdir()}
+        assert not modules & set(package.__all__), package
+
+
+@pytest.mark.slow
+def test_type_checkers_see_the_public_names_and_no_others(tmp_path):
+    lines = [f"import {package.__name__}" for package in PACKAGES]
+    lines += [f"reveal_type({package.__name__}.{name})" for package in PACKAGES for name in package.__all__]
+    program = tmp_path / "program.py"
+    program.write_text("\n".join([*lines, "retrieval.absent"]))
+    command = [sys.executable, "-m", "mypy", "--config-file", str(PAGE.parents[1] / "pyproject.toml"), str(program)]
+    done = subprocess.run(command, cwd=PAGE.parents[1], capture_output=True, text=True, timeout=600, check=False)
+    assert 'Module has no attribute "absent"' in done.stdout, done.stdout + done.stderr
+    assert done.stdout.count("Revealed type") == sum(len(package.__all__) for package in PACKAGES)
+    assert 'Revealed type is "Any"' not in done.stdout
+
+
+def test_every_package_says_that_it_is_typed():
+    for package in PACKAGES:
+        assert (Path(package.__file__).parent / "py.typed").is_file()
+
+
+def test_opening_is_the_searchers_own():
+    assert retrieval.open == retrieval.Searcher.open

@@ -1,0 +1,91 @@
+"""HEIC and AVIF pictures: read like any other, or refused with what to install."""
+
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image, features
+
+from retrieval.data import images
+from retrieval.data.images import decode_rgb
+from retrieval.errors import ImageError
+from tests.retrieval.data.test_images import exif, noise, saved
+
+pillow_heif = pytest.importorskip("pillow_heif")
+
+KINDS = ["HEIF", "AVIF"]
+
+
+@pytest.fixture(autouse=True)
+def _registered():
+    pillow_heif.register_heif_opener()  # to write such files
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_colours_are_those_of_the_pixels(kind):
+    rgb = decode_rgb(saved(Image.new("RGB", (16, 8), (200, 100, 50)), kind, quality=95), "x")
+    assert (rgb.shape, rgb.dtype) == ((8, 16, 3), np.float32)
+    np.testing.assert_allclose(rgb * 255, np.broadcast_to([200, 100, 50], (8, 16, 3)), atol=4)  # colour rounding
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_transparency_is_laid_on_white(kind):
+    rgb = decode_rgb(saved(Image.new("RGBA", (16, 16), (255, 0, 0, 51)), kind, quality=100), "x")
+    np.testing.assert_allclose(rgb, np.broadcast_to([1, 0.8, 0.8], (16, 16, 3)), atol=0.02)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_is_upright_as_the_same_jpeg_is(kind, orientation):
+    """A HEIC file turns its pixels itself and an AVIF file says how: applied twice or never, corners change places."""
+    quarters = np.kron(np.array([[40, 100], [160, 220]], np.uint8), np.ones((16, 24), np.uint8))
+    image = Image.fromarray(quarters).convert("RGB")
+    ours, jpeg = (decode_rgb(saved(image, one, exif=exif(orientation), quality=95), one) for one in (kind, "JPEG"))
+    assert ours.shape == jpeg.shape
+    np.testing.assert_allclose(ours[4:-4:8, 4:-4:8], jpeg[4:-4:8, 4:-4:8], atol=0.05)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_colour_profile_is_not_applied_as_in_a_jpeg(kind):
+    from PIL import ImageCms
+
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+    image = Image.new("RGB", (16, 16), (200, 100, 50))
+    plain, tagged = (decode_rgb(saved(image, kind, **how), "x") for how in ({}, {"icc_profile": profile}))
+    np.testing.assert_allclose(tagged, plain, atol=0.02)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_cut_at_any_length_is_refused(kind):
+    data = saved(Image.fromarray(noise(24, 16)), kind)
+    for length in range(0, len(data), 7):
+        with pytest.raises(ImageError):
+            decode_rgb(data[:length], "x")
+
+
+def test_a_heic_picture_without_its_package_names_the_extra(monkeypatch):
+    data = saved(Image.new("RGB", (16, 16)), "HEIF")
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
+        decode_rgb(data, "photo.heic")
+
+
+def test_an_avif_picture_where_pillow_was_built_without_says_so(monkeypatch):
+    data = saved(Image.new("RGB", (16, 16)), "AVIF")
+    monkeypatch.setattr(features, "check", lambda name: False)
+    with pytest.raises(ImageError, match=r"this Pillow was built without AVIF"):
+        decode_rgb(data, "photo.avif")
+
+
+def test_a_film_is_no_picture():
+    film = b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(100)
+    with pytest.raises(ImageError, match="not a PNG, JPEG"):
+        decode_rgb(film, "x")
+
+
+def test_a_header_that_asks_for_too_many_pixels_is_refused_before_they_are_decoded(monkeypatch):
+    data = {kind: saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS}
+    monkeypatch.setattr(images, "MAX_PIXELS", 64 * 64 - 1)
+    for kind in KINDS:
+        with pytest.raises(ImageError, match="4096 pixels; at most 4095 are decoded"):
+            decode_rgb(data[kind], kind)

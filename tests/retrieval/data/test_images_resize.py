@@ -1,0 +1,261 @@
+"""Resizing, background and the settings of both. Expected values by hand or by two plain loops."""
+
+import hashlib
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from retrieval.data import images, preprocessing
+from retrieval.data import resize as resizing
+from retrieval.data.images import to_float
+from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing, subtract_background
+from retrieval.data.resize import resize
+from retrieval.errors import BadInput, ConfigError, NumericalError
+from tests.retrieval.data.test_images import sample_files, saved
+
+ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1
+
+
+# Resizing --------------------------------------------------------------------------------------------------
+
+
+def area_by_loops(line, new):
+    """Mean of `line` over each of `new` equal parts, by two plain loops over fractions of samples."""
+    scale = len(line) / new
+    out = []
+    for target in range(new):
+        total = 0.0
+        for source in range(len(line)):
+            overlap = min((target + 1) * scale, source + 1) - max(target * scale, source)
+            total += max(overlap, 0.0) * float(line[source])
+        out.append(total / scale)
+    return out
+
+
+def linear_by_loops(line, new):
+    out = []
+    for target in range(new):
+        position = min(max((target + 0.5) * len(line) / new - 0.5, 0.0), len(line) - 1.0)
+        left = int(position)
+        right = min(left + 1, len(line) - 1)
+        out.append(float(line[left]) * (1 - (position - left)) + float(line[right]) * (position - left))
+    return out
+
+
+def line_image(line, axis):
+    pixels = np.asarray(line, np.float32)
+    return np.repeat(pixels[:, None, None] if axis == 0 else pixels[None, :, None], 3, axis=2)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("old", "new"), [(7, 3), (7, 6), (128, 127), (320, 128), (10, 1), (2, 1), (9, 3)])
+def test_an_axis_that_shrinks_is_averaged_over_exact_areas(old, new, axis):
+    line = np.random.default_rng(old).random(old).astype(np.float32)
+    size = (new, 1) if axis == 0 else (1, new)
+    out = resize(line_image(line, axis), size)
+    np.testing.assert_allclose(out[..., 1].ravel(), area_by_loops(line, new), atol=ATOL)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("old", "new"), [(1, 4), (2, 3), (3, 7), (127, 128), (5, 128)])
+def test_an_axis_that_grows_is_interpolated_between_pixel_centres(old, new, axis):
+    line = np.random.default_rng(old).random(old).astype(np.float32)
+    size = (new, 1) if axis == 0 else (1, new)
+    out = resize(line_image(line, axis), size)
+    np.testing.assert_allclose(out[..., 1].ravel(), linear_by_loops(line, new), atol=ATOL)
+
+
+def test_resizing_values_worked_out_by_hand():
+    np.testing.assert_allclose(resize(line_image([0, 0.3, 0.9], 1), (1, 2))[0, :, 0], [0.1, 0.7], atol=ATOL)
+    np.testing.assert_allclose(resize(line_image([0, 1], 1), (1, 4))[0, :, 0], [0, 0.25, 0.75, 1], atol=ATOL)
+
+
+def test_one_axis_may_shrink_while_the_other_grows():
+    image = np.random.default_rng(1).random((9, 2, 3)).astype(np.float32)
+    columns = np.array([[area_by_loops(image[:, x, c], 4) for c in range(3)] for x in range(2)])
+    expected = np.array([[linear_by_loops(columns[:, c, y], 5) for y in range(4)] for c in range(3)])
+    np.testing.assert_allclose(resize(image, (4, 5)), expected.transpose(1, 2, 0), atol=ATOL)
+
+
+def test_an_equal_size_is_the_same_picture():
+    image = np.random.default_rng(1).random((5, 6, 3)).astype(np.float32)
+    assert resize(image, (5, 6)) is image
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4000), (4000, 1), (3, 5000)])
+def test_thin_pictures_resize_and_a_constant_stays_constant(shape):
+    out = resize(np.full((*shape, 3), 0.7, np.float32), (64, 64))
+    assert out.shape == (64, 64, 3)
+    np.testing.assert_allclose(out, 0.7, atol=1e-5)  # sums of 5000 / 64 float32 samples
+
+
+def test_a_line_of_many_pixels_is_shrunk_before_it_is_grown():
+    assert resize(np.ones((1, 1_000_000, 3), np.float32), (256, 256)).shape == (256, 256, 3)  # else 3 GB
+
+
+def test_a_checkerboard_becomes_grey_where_linear_sampling_aliases():
+    rows, columns = np.indices((300, 300))
+    board = np.repeat(((rows + columns) % 2).astype(np.float32)[..., None], 3, axis=2)
+    assert abs(resize(board, (100, 100)) - 0.5).max() < 0.06  # a 3 x 3 cell holds 4 or 5 white squares
+    naive = cv2.resize(board, (100, 100), interpolation=cv2.INTER_LINEAR)
+    assert abs(naive - 0.5).max() == 0.5
+
+
+def test_a_constant_stays_constant_where_the_area_mode_of_opencv_drops_small_overlaps():
+    ones = np.ones((5000, 1, 3), np.float32)
+    np.testing.assert_allclose(resize(ones, (4999, 1)), 1, atol=1e-6)
+    assert cv2.resize(ones, (1, 4999), interpolation=cv2.INTER_AREA).min() < 0.9995
+
+
+@pytest.mark.parametrize(
+    ("image", "size"),
+    [
+        (np.zeros((4, 4), np.float32), (2, 2)),
+        (np.zeros((4, 4, 4), np.float32), (2, 2)),
+        (np.zeros((0, 4, 3), np.float32), (2, 2)),
+        (np.zeros((4, 4, 3), np.uint8), (2, 2)),
+        (np.zeros((4, 4, 3), np.float32), (0, 2)),
+    ],
+)
+def test_what_cannot_be_resized_is_refused(image, size):
+    with pytest.raises(BadInput, match=r"must be (H x W x 3 float32|at least 1 x 1)"):
+        resize(image, size)
+
+
+# Background ------------------------------------------------------------------------------------------------
+
+
+def grey(level):
+    return to_float(np.full((4, 4, 3), level, np.uint8))
+
+
+def test_a_frame_one_level_darker_than_its_background_is_one_level_dark_everywhere():
+    np.testing.assert_allclose(subtract_background(grey(99), grey(100), "difference"), -1 / 255, atol=1e-7)
+    naive = np.full((4, 4, 3), 99, np.uint8) - np.full((4, 4, 3), 100, np.uint8)
+    assert (naive == 255).all()
+
+
+def test_every_policy_by_hand():
+    touch, reference = grey(51), grey(204)
+    expected = {"none": 0.2, "difference": -0.6, "difference+0.5": 0.0, "abs": 0.6}
+    assert set(expected) == set(BACKGROUNDS)
+    for policy, value in expected.items():
+        np.testing.assert_allclose(subtract_background(touch, reference, policy), value, atol=1e-6)
+    np.testing.assert_allclose(subtract_background(grey(204), grey(102), "difference+0.5"), 0.9, atol=1e-6)
+    np.testing.assert_allclose(subtract_background(grey(255), grey(0), "difference+0.5"), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("policy", [policy for policy in BACKGROUNDS if policy != "none"])
+def test_a_missing_reference_says_what_to_give(policy, tmp_path):
+    with pytest.raises(ConfigError, match='give a reference, or set background = "none"'):
+        subtract_background(grey(1), None, policy)
+    with pytest.raises(ConfigError, match="untouched gel"):
+        Preprocessing(background=policy).touch(grey(1))
+    with pytest.raises(ConfigError, match="untouched gel"):  # before the file is looked for
+        Preprocessing(background=policy).load_touch(tmp_path / "none.png")
+
+
+def test_unknown_policies_and_other_shapes_are_refused():
+    with pytest.raises(ConfigError, match=r"background must be one of none, difference, difference\+0\.5, abs"):
+        subtract_background(grey(1), None, "minus")
+    with pytest.raises(BadInput, match="one shape"):
+        subtract_background(grey(1), np.zeros((2, 4, 3), np.float32), "abs")
+    with pytest.raises(BadInput, match="uint8"):
+        subtract_background(np.zeros((2, 2, 3), np.uint8), None, "none")
+
+
+@pytest.mark.parametrize(("policy", "reads"), [("none", 1), ("difference", 2), ("abs", 2)])
+def test_the_reference_is_read_only_by_a_policy_that_needs_it(tmp_path, monkeypatch, policy, reads):
+    (tmp_path / "t.png").write_bytes(sample_files()["png"])
+    calls, read_bytes = [], images.read_bytes
+    monkeypatch.setattr(images, "read_bytes", lambda path: calls.append(path) or read_bytes(path))
+    Preprocessing(background=policy).load_touch(tmp_path / "t.png", tmp_path / "t.png")
+    assert len(calls) == reads
+
+
+def test_no_reference_is_resized_under_policy_none(monkeypatch):
+    calls = []
+    monkeypatch.setattr(resizing, "_resize_axis", lambda image, axis, length: calls.append(axis) or image)
+    Preprocessing(touch_px=2).touch(grey(1), grey(2))
+    assert len(calls) == 2
+
+
+# Preprocessing ---------------------------------------------------------------------------------------------
+
+
+def test_photo_and_touch_have_the_sizes_of_the_paper_and_are_not_cropped(tmp_path):
+    wide = np.zeros((240, 320, 3), np.uint8)
+    wide[:, 300:] = 255  # a centre crop to a square would lose it
+    (tmp_path / "w.png").write_bytes(saved(Image.fromarray(wide), "PNG"))
+    photo = Preprocessing().load_photo(tmp_path / "w.png")
+    touch = Preprocessing().load_touch(tmp_path / "w.png")
+    assert photo.shape == (256, 256, 3)
+    assert touch.shape == (128, 128, 3)
+    np.testing.assert_allclose(touch.mean(), 20 / 320, atol=1e-5)
+
+
+def test_the_reference_may_have_another_size_for_it_is_taken_off_after_resizing():
+    settings_ = Preprocessing(touch_px=2, background="difference")
+    reference = to_float(np.full((8, 10, 3), 51, np.uint8))
+    np.testing.assert_allclose(settings_.touch(grey(102), reference), 0.2, atol=1e-6)
+
+
+def test_noise_is_averaged_away_before_its_sign_is_dropped():
+    sign = np.where(np.indices((4, 4)).sum(axis=0) % 2, 1, -1)[..., None]
+    noisy = (0.5 + 0.1 * sign * np.ones((4, 4, 3))).astype(np.float32)
+    flat = np.full((4, 4, 3), 0.5, np.float32)
+    np.testing.assert_allclose(Preprocessing(touch_px=2, background="abs").touch(noisy, flat), 0, atol=1e-6)
+    naive = resize(np.abs(noisy - flat), (2, 2))
+    np.testing.assert_allclose(naive, 0.1, atol=1e-6)
+
+
+def test_a_nan_does_not_pass():
+    broken = np.full((4, 4, 3), 0.5, np.float32)
+    broken[1, 1, 1] = np.nan
+    with pytest.raises(NumericalError, match="photo holds a NaN"):
+        Preprocessing(photo_px=2).photo(broken)
+    with pytest.raises(NumericalError, match="touch holds a NaN"):
+        Preprocessing(touch_px=4).touch(broken)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"touch_px": 0},
+        {"photo_px": 2.0},
+        {"photo_px": True},
+        {"photo_px": 5000},
+        {"background": "x"},
+        {"background": None},
+    ],
+)
+def test_a_setting_out_of_range_is_refused_by_name(change):
+    with pytest.raises(ConfigError, match=next(iter(change))):
+        Preprocessing(**change)
+
+
+def test_settings_survive_a_dictionary_and_unknown_ones_are_refused():
+    chosen = Preprocessing(64, 96, "abs")
+    assert Preprocessing.from_dict(chosen.to_dict()) == chosen
+    assert Preprocessing.from_dict({}) == Preprocessing()
+    with pytest.raises(ConfigError, match="'crop'; known: touch_px, photo_px, background"):
+        Preprocessing.from_dict({"crop": 1})
+
+
+def test_the_digest_is_of_the_settings_and_the_version():
+    text = '{"background": "none", "photo_px": 256, "touch_px": 128, "version": 2}'
+    assert Preprocessing().digest() == hashlib.sha256(text.encode()).hexdigest()
+    others = {
+        Preprocessing(touch_px=64).digest(),
+        Preprocessing(photo_px=64).digest(),
+        Preprocessing(background="abs").digest(),
+    }
+    assert len(others | {Preprocessing().digest()}) == 4
+
+
+def test_another_version_is_another_digest(monkeypatch):
+    before = Preprocessing().digest()
+    monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", 1)
+    assert Preprocessing().digest() != before

@@ -1,0 +1,145 @@
+"""Text that UTF-8 cannot hold is refused where it enters, or shown as U+FFFD."""
+
+import io
+import json
+import shutil
+import tarfile
+
+import pytest
+
+from retrieval.data.catalogue import list_catalogue
+from retrieval.data.sources import list_photos
+from retrieval.data.text import is_utf8, utf8_of
+from retrieval.errors import DatasetError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build import build_index
+from retrieval.search.objects import listed_photo
+from retrieval.serve.errors import Problem
+from robot.errors import RecordingError
+from robot.recording.folder import RecordingWriter, read_recording
+from tests.retrieval.serve.test_history import INFO, ask, say
+from tests.serving import service
+
+HALF = "\ud83d"  # the first half of an emoji
+NAME = "mug\udcff"  # the byte ff in a file name
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (r'{"object_id": "mug", "note": "nice \ud83d"}', "lone surrogate"),
+        (r'{"object_id": "mug", "\ude00": 1}', "lone surrogate"),
+        (r'{"object_id": "mug\ud83d", "note": 1}', "lone surrogate"),
+        (r'{"object_id": "mug", "deep": [{"a": ["\udfff"]}]}', "lone surrogate"),
+    ],
+)
+def test_half_of_a_character_in_the_metadata_of_a_catalogue_is_refused_with_its_line(own, line, told):
+    (own / "metadata.jsonl").write_text('{"object_id": "a", "note": "\\ud83d\\ude00"}\n' + line + "\n")
+    with pytest.raises(DatasetError, match=rf"metadata.jsonl, line 2: it holds half of a character .*{told}") as raised:
+        list_catalogue(own)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_whole_character_of_two_escapes_is_taken(own):
+    name = sorted(path.name for path in own.iterdir())[0]
+    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": "\U0001f600"}) + "\n")
+    assert list_catalogue(own).photos[0].metadata == {"note": "\U0001f600"}
+
+
+def test_half_of_a_character_in_an_archive_is_refused_with_its_member(tmp_path):
+    with tarfile.open(tmp_path / "photos.tar", "w") as archive:
+        for name, data in (("1.jpg", b"x"), ("1.json", rb'{"object_id": "mug\ud83d"}')):
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+    with pytest.raises(DatasetError, match=r"photos.tar, 1.json: it holds half of a character"):
+        list_photos(str(tmp_path / "photos.tar"))
+
+
+def test_members_of_an_archive_whose_names_are_not_utf8_are_left_out(tmp_path):
+    with tarfile.open(tmp_path / "photos.tar", "w") as archive:
+        for name in (f"{NAME}/1.jpg", "cup/1.jpg"):
+            archive.addfile(tarfile.TarInfo(name))
+    found = list_photos(str(tmp_path / "photos.tar"))
+    assert found.photos.paths == ("cup/1.jpg",)
+    assert [(one.path, one.reason) for one in found.skipped] == [
+        (r"mug\xff/1.jpg", "the name is not valid UTF-8; rename it")
+    ]
+
+
+def test_half_of_a_character_in_a_recording_is_refused_with_its_line(recording, tmp_path):
+    (tmp_path / "recording.json").write_bytes((recording / "recording.json").read_bytes())
+    line = (recording / "metadata.jsonl").read_text().splitlines()[0]
+    row = {**json.loads(line), "object_id": f"mug{HALF}"}
+    (tmp_path / "metadata.jsonl").write_text(f"{line}\n{json.dumps({**row, 'grasp_id': 'other'})}\n")
+    with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: object_id must be a non-empty printable string"):
+        read_recording(tmp_path)
+
+
+def test_rows_of_an_older_index_are_shown_with_a_mark_in_place_of_what_utf8_cannot_hold():
+    row = {"id": "a", "object_id": f"mug{HALF}", "path": "mug/1.jpg", "metadata": {"note": [HALF, "\U0001f600"]}}
+    found = listed_photo(row)
+    assert (found.object_id, found.metadata) == ("mug\ufffd", {"note": ["\ufffd", "\U0001f600"]})
+
+
+def test_text_that_utf8_can_hold_stays_the_same_object():
+    document = {"a": ["é", "\U0001f600", 1.5, None]}
+    assert utf8_of(document) is document
+    assert not is_utf8({HALF: 1})
+
+
+def test_a_problem_that_names_a_file_of_unknown_coding_is_a_document():
+    body = Problem("unknown", f"{NAME}.jpg is gone").response().body
+    assert json.loads(body)["detail"] == "mug\ufffd.jpg is gone"
+
+
+def test_no_answer_over_an_older_index_with_half_a_character_fails(own, touch, model, tmp_path, monkeypatch):
+    name = sorted(path.name for path in own.iterdir())[0]
+    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": HALF}) + "\n")
+    monkeypatch.setattr("retrieval.data.catalogue.require_utf8", lambda row: None)  # as older versions did
+    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
+    folder = tmp_path / "history"
+    with (
+        RecordingWriter(folder / "recording", INFO) as writer,
+        service(tmp_path / "index", None, writer, history=folder) as client,
+    ):
+        query, answer = ask(client, [[path.read_bytes() for path in touch]], top=8)
+        notes = [one["metadata"] for one in answer["results"] if one["object_id"] == name]
+        assert notes == [{"note": "\ufffd"}]
+        items = client.get("/v1/catalogue", params={"object": name}).json()["items"]
+        assert [item["metadata"] for item in items] == [{"note": "\ufffd"}] * 3
+        assert client.get(f"/v1/history/{query}").json()["answer"] == answer
+        assert client.get("/v1/history").json()["items"][0]["id"] == query
+        assert say(client, query, "object", name).status_code == 201
+
+
+def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served(catalogue, touch, model, tmp_path):
+    folder = tmp_path / NAME
+    shutil.copytree(catalogue, folder / "catalog")
+    build_index(folder / "catalog", load_checkpoint(model), folder / "index", quiet=True)
+    with service(folder / "index") as client:
+        names = {"gelsight": [(path.name, path.read_bytes()) for path in touch]}
+        files = [("gelsight", file) for file in names["gelsight"]]
+        assert client.post("/v1/query", files=files).status_code == 200
+        assert client.get("/v1/index").status_code == 200
+        assert client.get("/v1/catalogue").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/v1/feedback", rb'{"query": "x", "said": "object", "object_id": "mug\ud83d"}'),
+        ("/v1/feedback", rb'{"query": "\ud83d", "said": "none"}'),
+        ("/v1/trials", rb'{"who": "\ud83d"}'),
+        ("/v1/session", rb'{"token": "\ud83d"}'),
+        ("/v1/query", rb'{"touches": [["\ud83d"]], "\ud83d": 1}'),
+    ],
+)
+def test_half_of_a_character_in_a_body_is_refused(index, tmp_path, path, body):
+    with (
+        RecordingWriter(tmp_path / "recording", INFO) as writer,
+        service(index, None, writer, history=tmp_path) as client,
+    ):
+        response = client.post(path, content=body, headers={"content-type": "application/json"})
+        assert response.status_code in (400, 422), response.text
+        assert client.get("/v1/catalogue", params={"object": "mug\ufffd"}).status_code == 200

@@ -1,0 +1,337 @@
+"""Error against run time: what a panel recommends, what every row measures, that defaults are what the code uses."""
+
+import dataclasses
+import json
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from retrieval.errors import ConfigError, DatasetError
+from retrieval.frontier import APPROXIMATIONS, load_approximation, run
+from retrieval.frontier.candidates import default_k, ranks
+from retrieval.frontier.clock import timed
+from retrieval.frontier.formats import FORMATS, encoders
+from retrieval.frontier.pixels import load_touch
+from retrieval.frontier.points import Panel, Row, Tradeoff, duration, missed, number
+from retrieval.frontier.sample import Sample, Scale, blend
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.encode import encode_touches
+from retrieval.search.measuring import WinnerBench
+from retrieval.search.operating import Asked, settle
+from tests import synthetic
+
+TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
+
+
+def panel(*points, tolerance=1.0):
+    made = tuple(Tradeoff("", f"s{place}", error, seconds=seconds) for place, (seconds, error) in enumerate(points))
+    return Panel("errors", "one go", "%", "the truth", tolerance, made, 0.1)
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory):
+    """A recording of eight objects that no model was trained on, four grasps each."""
+    folder = tmp_path_factory.mktemp("unseen") / "recording"
+    return synthetic.write_recording(folder, synthetic.make_objects(8, seed=77), 4)
+
+
+@pytest.fixture(scope="module")
+def sample(unseen, model, tmp_path_factory):
+    return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def rows(sample):
+    """Every row, measured once."""
+    return {name: load_approximation(name)(sample) for name in APPROXIMATIONS}
+
+
+# Points ----------------------------------------------------------------------------------------------------
+
+
+def test_the_front_holds_the_points_that_nothing_beats_in_both():
+    made = panel((1, 5), (2, 6), (2, 3), (3, 3), (4, 1))
+    assert [point.setting for point in made.pareto()] == ["s0", "s2", "s4"]
+
+
+def test_the_cheapest_within_the_tolerance_is_recommended():
+    made = panel((1, 5), (3, 0.5), (2, 1.0), (4, 0.0))
+    assert made.recommended.setting == "s2"
+    assert "cheapest within 1: s2: 1 %, 2 s" in made.line()
+
+
+def test_where_nothing_is_within_the_tolerance_the_least_error_is_and_the_line_says_so():
+    made = panel((1, 5), (3, 2), (2, 2))
+    assert made.recommended.setting == "s2"
+    assert "none within 1, nearest: s2" in made.line()
+
+
+def test_a_line_says_whether_the_default_is_the_recommended():
+    made = panel((1, 0.5), (2, 0))
+    assert made.line().endswith("no default: the caller says")
+    used = dataclasses.replace(made.points[0], is_default=True)
+    assert dataclasses.replace(made, points=(used, made.points[1])).line().endswith("which is the default")
+    used = dataclasses.replace(made.points[1], is_default=True)
+    assert dataclasses.replace(made, points=(made.points[0], used)).line().endswith("default s1: 0 %, 2 s")
+
+
+def test_a_share_comes_in_percent_with_its_exact_interval():
+    point = missed("a", "b", [True, False, False, False])
+    low, high = binomial_interval(1, 4)
+    assert (point.error, point.low, point.high) == (25.0, 100 * low, 100 * high)
+
+
+def test_a_row_survives_json():
+    row = Row("title", "text", (panel((1, 5), (2, 0.5)),), None)
+    assert Row.from_dict(json.loads(json.dumps(row.to_dict()))) == row
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0, "0"), (0.5, "0.5"), (1.2345, "1.23"), (1234.0, "1.23e+03"), (1e-7, "1.0e-07")]
+)
+def test_numbers_are_short(value, text):
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(2.0, "2 s"), (0.0123, "12.3 ms"), (4.5e-5, "45 us")])
+def test_times_have_the_unit_that_reads_best(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_works_take_turns_so_that_a_busy_moment_slows_all_of_them():
+    calls = []
+    points = panel((0, 1), (0, 2)).points
+    made = timed(
+        points, [lambda: (calls.append("a"), time.sleep(0.006)), lambda: (calls.append("b"), time.sleep(0.006))], 3
+    )
+    assert calls == ["a", "b"] * 4
+    assert [point.setting for point in made] == ["s0", "s1"]
+    assert all(point.seconds >= 0.005 for point in made)
+
+
+# Rows ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
+def test_every_row_measures_points_and_names_its_reference(name, rows):
+    row = rows[name]
+    assert row.title
+    assert row.text
+    assert row.skipped is None
+    assert row.panels
+    for one in row.panels:
+        assert one.reference
+        assert one.time
+        assert one.points
+        assert one.recommended in one.points
+        for point in one.points:
+            assert point.seconds > 0
+            assert np.isfinite(point.error)
+            assert point.error >= 0
+        assert len({(point.series, point.setting) for point in one.points}) == len(one.points)
+
+
+@pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
+def test_every_panel_of_ours_marks_one_default(name, rows):
+    for one in rows[name].panels:
+        assert sum(point.is_default for point in one.points) == 1, one.title
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(ConfigError, match=r"candidates, index_kinds, .*; got 'nothing'"):
+        load_approximation("nothing")
+
+
+# Defaults are what the code uses ---------------------------------------------------------------------------
+
+
+class WithQueries:
+    """A checkpoint of a sample, as `build-index` sees it: touches of its own to measure with."""
+
+    def __init__(self, sample):
+        self.matcher, self.config = sample.checkpoint.matcher, sample.checkpoint.config
+        self.queries = sample.queries["half"].astype(np.float16)
+
+
+def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pruning_sample):
+    photos = pruning_sample.catalogue
+    slots = np.arange(len(photos.halves))
+    bench = WinnerBench(WithQueries(pruning_sample), photos.embeddings["pruner"], slots, photos.halves)
+    settled = settle(bench, Asked())
+    assert default_k(pruning_sample) == settled.candidates["k"]
+    kinds = load_approximation("index_kinds")(pruning_sample)
+    assert all(one.default.series == settled.kind for one in kinds.panels)
+
+
+@pytest.fixture(scope="module")
+def pruning_sample(sample):
+    """The sample with a pruner that knows nothing."""
+    import torch
+
+    from retrieval.model.pruner import Pruner
+
+    matcher = load_checkpoint(sample.model).matcher
+    torch.manual_seed(0)
+    config = dataclasses.replace(sample.checkpoint.config, matcher=dataclasses.replace(matcher.config, pruner_width=8))
+    matcher.pruner = Pruner(matcher.config.half, 8, matcher.config.embedding_dim).eval()
+    other = dataclasses.replace(sample)
+    other.__dict__["checkpoint"] = dataclasses.replace(sample.checkpoint, matcher=matcher, config=config)
+    return other
+
+
+def test_touches_are_encoded_by_the_default_of_the_towers(sample):
+    settings, matcher = sample.checkpoint.config.preprocessing, sample.checkpoint.matcher
+    images = [load_touch(settings, sample.grasps[sample.touch_rows[0]])]
+    default = next(encode for _, encode, is_default in encoders(sample.checkpoint) if is_default)
+    assert np.array_equal(default(images), encode_touches(matcher, images).half.numpy())
+
+
+def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
+    assert rows["towers"]
+    assert not any(module.training for module in sample.checkpoint.matcher.modules())
+
+
+def test_an_index_keeps_halves_in_the_default_format(catalogue, model, tmp_path):
+    from indexes.store.folder import IndexStore
+    from retrieval.search.build import build_index
+
+    build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
+    kept = IndexStore(tmp_path / "index").open().arrays["halves"]
+    assert [name for name, _, _, is_default in FORMATS if is_default] == [str(np.asarray(kept[:1]).dtype)]
+
+
+def test_images_have_the_default_size_in_a_query(rows, sample):
+    settings = sample.checkpoint.config.preprocessing
+    assert [one.default.setting for one in rows["image_size"].panels] == [
+        f"{settings.touch_px} px",
+        f"{settings.photo_px} px",
+    ]
+
+
+# Sample ----------------------------------------------------------------------------------------------------
+
+
+def test_no_grasp_gives_both_a_photo_and_a_touch_and_every_object_gives_both(sample):
+    photos, touches = set(sample.photo_rows.tolist()), set(sample.touch_rows.tolist())
+    assert not photos & touches
+    assert photos | touches == set(range(len(sample.grasps)))
+    assert len(np.unique(sample.owner[sample.photo_rows])) == len(np.unique(sample.owner[sample.touch_rows])) == 8
+
+
+def test_objects_that_the_model_was_trained_on_are_left_out(model, recording, tmp_path):
+    split = load_checkpoint(model).split
+    own = Sample(model, lambda: recording, tmp_path, TINY, quiet=True)
+    assert {grasp.object_id for grasp in own.grasps} == set(split.test)
+
+
+def test_a_recording_of_trained_objects_only_is_refused(model, tmp_path):
+    split = load_checkpoint(model).split
+    few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
+    own = Sample(model, lambda: few, tmp_path, TINY, quiet=True)
+    assert split is not None
+    with pytest.raises(DatasetError, match="two objects or more that the model was not trained on"):
+        _ = own.grasps
+
+
+def test_blends_lie_between_two_rows_nearer_to_the_first():
+    rows = np.eye(3, dtype=np.float32)
+    for row in blend(rows, 50, np.random.default_rng(0)):
+        assert row.sum() == pytest.approx(1.0)
+        assert row.max() >= 0.5
+        assert np.count_nonzero(row) <= 2
+
+
+def test_ranks_count_the_photos_that_are_nearer_than_the_winner():
+    embeddings = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float32)
+    queries = np.array([[1, 0], [0, 1]], np.float32)
+    assert ranks(queries, embeddings, np.array([0, 0])).tolist() == [0, 2]
+    assert ranks(queries, embeddings, np.array([2, 2])).tolist() == [1, 1]
+
+
+def test_winners_are_the_photos_of_the_highest_logit_and_are_found_once(sample, monkeypatch):
+    halves = sample.catalogue.halves.astype(np.float32)
+    table = np.array([sample.logits(half, halves) for half in sample.queries["half"]])
+    assert sample.winners.tolist() == table.argmax(1).tolist()
+    again = dataclasses.replace(sample)
+    monkeypatch.setattr(Sample, "_find_winners", nobody)
+    assert again.winners.tolist() == sample.winners.tolist()
+
+
+# Run -------------------------------------------------------------------------------------------------------
+
+
+TABLE = {"one": "nowhere:one", "other": "nowhere:other"}
+measure = partial(run.measure, table=TABLE, need_no_model=TABLE)
+
+
+def nobody():
+    raise AssertionError("no recording is needed")
+
+
+@pytest.fixture
+def bare(model, tmp_path, monkeypatch):
+    """A sample without a recording; and the names of the rows that were measured, each of one point."""
+    calls = []
+
+    def measuring(name, table):
+        if name not in TABLE:
+            return load_approximation(name, table)
+        return lambda sample: calls.append(name) or Row(name, "text", (panel((1e-3, 2)),))
+
+    monkeypatch.setattr(run, "load_approximation", measuring)
+    return Sample(model, nobody, tmp_path / "features", TINY, quiet=True), calls
+
+
+def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
+    made, calls = bare
+    document = measure(made, tmp_path, ["one", "other"])
+    assert calls == ["one", "other"]
+    assert list(document["rows"]) == ["one", "other"]
+    assert json.loads((tmp_path / "frontier.json").read_text()) == document
+    point = document["rows"]["one"]["panels"][0]["points"][0]
+    assert (point["setting"], point["error"], point["seconds"]) == ("s0", 2, 1e-3)
+    assert (point["recommended"], point["pareto"], point["is_default"]) == (True, True, False)
+
+
+def test_a_second_run_measures_nothing_again_unless_what_made_it_changed(bare, tmp_path):
+    made, calls = bare
+    first = measure(made, tmp_path, ["one"])
+    assert measure(made, tmp_path, ["one"]) == first
+    assert calls == ["one"]
+    measure(dataclasses.replace(made, scale=dataclasses.replace(TINY, repeats=2)), tmp_path, ["one"])
+    assert calls == ["one"] * 2
+
+
+def test_a_damaged_part_is_measured_again(bare, tmp_path):
+    made, calls = bare
+    measure(made, tmp_path, ["one"])
+    (tmp_path / "parts" / "one.json").write_text("[")
+    measure(made, tmp_path, ["one"])
+    assert calls == ["one"] * 2
+
+
+def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, monkeypatch):
+    made, calls = bare
+    measuring = run.load_approximation
+
+    def stop(sample):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopping:
+        stopping.setattr(
+            run, "load_approximation", lambda name, table: stop if name == "other" else measuring(name, table)
+        )
+        with pytest.raises(KeyboardInterrupt):
+            measure(made, tmp_path, ["one", "other"])
+    measure(made, tmp_path, ["one", "other"])
+    assert calls == ["one", "other"]
+
+
+def test_an_unknown_row_is_refused_before_anything_is_measured(bare, tmp_path):
+    made, calls = bare
+    with pytest.raises(ConfigError):
+        measure(made, tmp_path, ["one", "nothing"])
+    assert not calls

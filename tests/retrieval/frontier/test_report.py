@@ -1,0 +1,87 @@
+"""`retrieve frontier` as users meet it: plots, a page, exit codes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.frontier import APPROXIMATIONS as KERNELS
+from retrieval.commands.frontier import _recording as collected
+from retrieval.commands.main import main
+from retrieval.frontier import APPROXIMATIONS
+from retrieval.frontier.points import Panel, Row, Tradeoff
+from retrieval.frontier.report import figure, write_frontier
+
+
+def document(*panels, skipped=None):
+    row = Row("Candidates", "What is measured.", panels, skipped)
+    return {
+        "software": "1",
+        "machine": {"processor": "a <fast> one", "cores": 2, "system": "Linux"},
+        "model": "0" * 64,
+        "scale": {"quick": True},
+        "rows": {"candidates": row.to_dict()},
+    }
+
+
+def points(errors):
+    return tuple(
+        Tradeoff("a", f"k = {k}", error, 0.0, error + 1, seconds=1e-3 * (k + 1)) for k, error in enumerate(errors)
+    )
+
+
+@pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "none seen", "one point"])
+def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
+    made = Panel("missed", "one query", "%", "every photo judged", 1.5, points(errors), 0.5)
+    page, plot = write_frontier(tmp_path, document(made))
+    text = page.read_text()
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert text.count("data:image/png;base64,") == 1
+    assert "every photo judged" in text
+    assert "a &lt;fast&gt; one" in text
+    assert "A quick run" in text
+    assert all(f"k = {k}" in text for k in range(len(errors)))
+
+
+def test_a_row_that_was_left_out_says_why_and_has_no_plot(tmp_path):
+    (page,) = write_frontier(tmp_path, document(skipped="nothing to measure"))
+    assert "Left out: nothing to measure." in page.read_text()
+
+
+def test_the_page_of_performance_says_how_many_approximations_there_are():
+    said = (Path(__file__).parents[3] / "docs" / "performance.md").read_text()
+    assert f"for {len(APPROXIMATIONS)} approximations of a search" in " ".join(said.split())
+    assert f"for {len(KERNELS)} approximations of our kernels" in " ".join(said.split())
+
+
+def test_labels_of_points_that_stand_together_stand_above_and_below():
+    near = (Tradeoff("a", "one", 1.0, seconds=1.0), Tradeoff("a", "other", 0.98, seconds=1.01))
+    far = Tradeoff("a", "third", 0.01, seconds=9.0)
+    (axes,) = figure([Panel("missed", "one query", "%", "all", 0.5, (*near, far), 0.01)]).axes
+    heights = {text.get_text(): text.xyann[1] for text in axes.texts}
+    assert heights["one"] > 0 > heights["other"]
+    assert heights["third"] > 0
+
+
+def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, recording, tmp_path, capsys):
+    command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording), "--quick"]
+    assert main([*command, "--only", "halves", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["rows"].keys() == {"halves"}
+    assert "halves: largest error of a match logit (against halves in float32)" in said.err
+    assert (tmp_path / "figures" / "halves.png").is_file()
+    assert (tmp_path / "frontier.html").is_file()
+    assert not (tmp_path / "recording").exists()
+
+
+def test_wrong_names_are_one_line_and_exit_code_2(model, tmp_path, capsys):
+    assert main(["frontier", "--out", str(tmp_path), "--model", str(model), "--only", "speed"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("retrieve frontier: an approximation must be one of")
+
+
+def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, capsys):
+    first = collected(None, tmp_path, quick=True)
+    lines = (first / "metadata.jsonl").read_bytes()
+    assert collected(None, tmp_path, quick=True) == first
+    assert (first / "metadata.jsonl").read_bytes() == lines
+    assert "of 6 simulated objects" in capsys.readouterr().err

@@ -1,0 +1,184 @@
+"""Rankings with NaN and with equal scores, halves at the ends of float16, and intervals of very few objects."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import special
+from torch import nn
+
+from retrieval.methods.selection import ranking_auc
+from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import guess_curve
+from retrieval.metrics.intervals import bootstrap_interval, sign_flip_p
+from retrieval.metrics.pairs import pair_auc
+from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.table import ScoreTable
+from retrieval.model.fusion import FusionHead, score_halves
+from tests.hard_case import HardCase, refused
+
+_TOP, _MEASURES, _HALVES, _INTERVALS = "top k", "rank measures", "halves", "intervals"
+
+
+def hard_cases() -> Iterator[HardCase]:
+    """Cases of rankings."""
+    yield _nan_half()
+    yield _nan_score()
+    yield _sum_of_halves()
+    yield _subnormal_halves()
+    yield _constant_scorer()
+    yield _constant_scorer_by_area()
+    yield _many_rivals()
+    yield _one_object()
+    yield _all_right()
+    yield _equal_differences()
+
+
+# Halves ----------------------------------------------------------------------------------------------------
+
+
+def _adding_head(hidden: int) -> FusionHead:
+    """A head whose logit is the sum over units of relu(touch half + photo half)."""
+    head = FusionHead(1, 1, hidden, 0.0)
+    with torch.no_grad():
+        nn.init.eye_(head.second.weight)
+        nn.init.ones_(head.out.weight)
+        for bias in (head.second.bias, head.out.bias):
+            nn.init.zeros_(bias)
+    return head.eval()
+
+
+def _nan_half() -> HardCase:
+    halves = np.array([[1.0], [np.nan], [2.0]], np.float16)
+    logits = np.maximum(halves[:, 0], 0)
+    naive = np.argsort(logits)[::-1]
+    ours, holds = refused(lambda: score_halves(_adding_head(1), torch.zeros(1, 1), halves), "photo row 1")
+    words = f"photos {', '.join(map(str, naive))}: the NaN is best"
+    return HardCase(_TOP, "one of three halves is NaN", "refused, the row named", words, ours, holds, naive[0] == 2)
+
+
+def _nan_score() -> HardCase:
+    scores = np.array([[0.2, np.nan, 0.9]], np.float32)
+    owners = np.array([2]), np.arange(3)
+    naive = torch.topk(torch.from_numpy(scores), 3).indices[0].tolist()
+    ours, holds = refused(lambda: ScoreTable(scores, *owners, np.zeros((1, 3), bool)), "row 0, column 1")
+    words = f"torch.topk: photos {', '.join(map(str, naive))}"
+    return HardCase(_TOP, "one score is NaN", "refused, and named", words, ours, holds, naive[0] == 2)
+
+
+def _sum_of_halves() -> HardCase:
+    """40000 + 40000 in float16 is infinite; stored so and added in float32 it is 80000."""
+    halves, touch = np.array([[4e4]], np.float16), torch.tensor([[4e4]])
+    naive = float((halves + touch.numpy().astype(np.float16))[0, 0])
+    ours = float(score_halves(_adding_head(1), touch, halves)[0])
+    return HardCase(_HALVES, "two halves of 40000", "logit 80000", f"{naive:g}", f"{ours:g}", ours == 8e4, naive == 8e4)
+
+
+def _subnormal_halves() -> HardCase:
+    """Halves of 1e-6 to 8e-6, below float16's normal numbers, beside a touch of 1: added in float16 all photos tie."""
+    halves, touch = (np.arange(1, 9)[:, None] * 2.0**-20).astype(np.float16), torch.ones(1, 1)
+    naive = (halves + np.float16(1))[:, 0]
+    ours = score_halves(_adding_head(1), touch, halves)
+    words, said = (f"{len(np.unique(scores))} distinct" for scores in (naive, ours))
+    holds, tied = ours.tolist() == [1 + row * 2.0**-20 for row in range(1, 9)], len(np.unique(naive)) < 8
+    wanted = "8 distinct logits, 1e-6 apart"
+    return HardCase(_HALVES, "8 photos 1e-6 apart", wanted, words, said, holds, not tied)
+
+
+# Measures --------------------------------------------------------------------------------------------------
+
+
+def _constant_scorer() -> HardCase:
+    """Who says the same of all of a hundred photos knows nothing; sorted, the true photo may just stand first."""
+    scores, relevant = np.zeros((1, 100)), np.arange(100)[None] == 0
+    shown = np.ones_like(relevant)
+    place = int(np.flatnonzero(np.argsort(-scores[0], kind="stable") == 0)[0])
+    first = first_relevant(scores, relevant, shown)
+    ours = [float(found[0]) for found in (recall_at(1, first), reciprocal_rank(first))]
+    ours.append(float(average_precision(scores, relevant, shown)[0]))
+    chance = [0.01, *2 * [float((1 / np.arange(1, 101)).mean())]]
+    holds = bool(np.allclose(ours, chance, rtol=1e-9))
+    naive = f"recall {1.0 * (place == 0)}, reciprocal rank {1 / (place + 1)}, precision {1 / (place + 1)}"
+    said = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}".format(*ours)
+    wanted = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}: chance".format(*chance)
+    return HardCase(_MEASURES, "all of 100 photos score the same", wanted, naive, said, holds, place != 0)
+
+
+def _constant_scorer_by_area() -> HardCase:
+    """Area under the ROC of a constant scorer: a half."""
+    labels = np.array([1, 0, 0, 0])
+    naive = float((np.zeros(1)[:, None] > np.zeros(3)).mean())
+    owners = np.array([0]), np.arange(4)
+    ours = pair_auc(np.zeros(4), labels), ranking_auc(np.zeros((1, 4)), *owners, np.zeros((1, 4), bool))
+    said = ", ".join(f"{value:g}" for value in ours)
+    return HardCase(
+        _MEASURES,
+        "area where all scores are equal",
+        "0.5",
+        f"{naive:g}, counting >",
+        said,
+        ours == (0.5, 0.5),
+        naive == 0.5,
+    )
+
+
+def _many_rivals() -> HardCase:
+    """Of 5000 photos two score higher; 999 rivals are drawn, in more ways than float64's 1e308."""
+    scores = np.repeat([1.0, -1.0], [2, 4998])
+    naive = float(special.comb(4998, 999) / special.comb(5000, 999))
+    ours = float(guess_curve(0.0, scores, 1000)[0])
+    must = 4001 * 4000 / (5000 * 4999)  # neither of the two is drawn
+    right = [abs(value - must) < 1e-12 for value in (naive, ours)]
+    said, wanted = f"{ours:.6g}", f"{must:.6g}"
+    return HardCase(_MEASURES, "first guess among 1000 of 5000", wanted, f"{naive}", said, right[1], right[0])
+
+
+# Intervals -------------------------------------------------------------------------------------------------
+
+
+def naive_interval(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Percentiles of the means of resampled values (n,)."""
+    drawn = np.random.default_rng(0).integers(len(values), size=(1000, len(values)))
+    low, high = np.percentile(values[drawn].mean(1), [2.5, 97.5])
+    return float(low), float(high)
+
+
+def _one_object() -> HardCase:
+    """Forty touches of one object, 30 of them right, say nothing of other objects."""
+    touches = np.repeat([1.0, 0.0], [30, 10])
+    naive = naive_interval(touches)
+    low, high = (float(end[0]) for end in bootstrap_interval(touches.mean(keepdims=True)[:, None]))
+    wanted = "an interval that holds 0 and 1"
+    return HardCase(
+        "bootstrap",
+        "one object, 40 touches",
+        wanted,
+        f"{naive[0]:.3g} to {naive[1]:.3g}, resampling touches",
+        f"{low} to {high}",
+        low <= 0 and high >= 1,
+        naive[0] <= 0 and naive[1] >= 1,
+    )
+
+
+def _all_right() -> HardCase:
+    """Twenty of twenty: the interval must not be a point."""
+    share, ours = 1.0, binomial_interval(20, 20)
+    wide = 1.96 * np.sqrt(share * (1 - share) / 20)
+    naive = f"{share - wide:.3g} to {share + wide:.3g} (p +- 1.96 s)"
+    must = 0.025 ** (1 / 20)  # all 20 right with probability 2.5 %
+    holds = abs(ours[0] - must) < 1e-9 and ours[1] == 1
+    wanted, said = f"{must:.4g} to 1", f"{ours[0]:.4g} to {ours[1]:.4g}"
+    return HardCase(_INTERVALS, "20 right of 20", wanted, naive, said, holds, bool(wide > 0))
+
+
+def _equal_differences() -> HardCase:
+    """Three objects on which one method leads by .1, .2 and .3: as far from 0 only with all signs turned, 2 of 8."""
+    differences = np.array([0.1, 0.2, 0.3])
+    signs = np.array(np.meshgrid(*3 * [[1, -1]])).reshape(3, -1).T
+    sums = np.array([(row * differences)[::-1].sum() for row in signs])
+    naive = float((np.abs(sums) >= differences.sum()).mean())
+    ours = sign_flip_p(differences)
+    return HardCase(
+        "permutation test", "differences .1, .2, .3", "p = 0.25", f"{naive}", f"{ours}", ours == 0.25, naive == 0.25
+    )

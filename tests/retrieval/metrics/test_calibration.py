@@ -1,0 +1,354 @@
+"""Calibration of match logits and the two pair metrics: by hand, by grids and loops, and where logits are extreme."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.pairs import SLOPE_BOUNDS, Calibration, fit_calibration, pair_accuracy, pair_auc
+
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
+def overlapping(count=200, offset=0.0, scale=1.0, seed=0):
+    """Half of the pairs true, their logits one deviation higher."""
+    labels = np.arange(count) % 2
+    return scale * (np.random.default_rng(seed).normal(size=count) + labels) + offset, labels
+
+
+def softplus(x):
+    """log(1 + e^x) without overflow."""
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+def smoothed_loss(logits, labels, slope, intercept, smooth=True):
+    """What the fit makes small, one pair at a time: each class weighs a half, targets are Platt's (or 1 and 0)."""
+    counts = {1: sum(labels), 0: len(labels) - sum(labels)}
+    target = {1: (counts[1] + 1) / (counts[1] + 2), 0: 1 / (counts[0] + 2)} if smooth else {1: 1.0, 0: 0.0}
+    total = 0.0
+    for logit, label in zip(logits, labels, strict=True):
+        x, t = slope * logit + intercept, target[label]
+        total += 0.5 / counts[label] * (t * softplus(-x) + (1 - t) * softplus(x))
+    return total
+
+
+# What must be given ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
+@pytest.mark.parametrize(
+    ("labels", "counts"),
+    [
+        ([1, 1, 1], "of 3, 3 are 1 and 0 0"),
+        ([0, 0, 0], "of 3, 0 are 1 and 3 0"),
+        ([0, 1, 2], "of 3, 1 are 1 and 1 0"),
+        ([0, 1, 0.5], "of 3, 1 are 1 and 1 0"),
+        ([0, 1, math.nan], "of 3, 1 are 1 and 1 0"),
+    ],
+)
+def test_both_classes_and_no_other_are_needed(function, labels, counts):
+    with pytest.raises(BadInput, match=f"pairs of both classes are needed, labelled 0 and 1; {counts}"):
+        function([0.1, 0.2, 0.3], labels)
+
+
+@pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
+def test_no_pairs_and_odd_shapes_are_refused(function):
+    with pytest.raises(BadInput, match="of 0, 0 are 1 and 0 0"):
+        function([], [])
+    with pytest.raises(BadInput, match=r"vectors of one length; got \(2,\) and \(3,\)"):
+        function([1.0, 2.0], [0, 1, 1])
+    with pytest.raises(BadInput, match="vectors of one length"):
+        function([[1.0, 2.0]], [[0, 1]])
+
+
+@pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e39])
+def test_a_logit_that_is_no_finite_float32_is_refused_and_named(function, bad):
+    with pytest.raises(NumericalError, match=r"must be a finite float32; pair 2 has "):
+        function([0.1, 0.2, bad, bad], [0, 1, 0, 1])
+
+
+# The fit ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("logits", "labels"),
+    [
+        ([-1.0, 0.5, 0.2, 2.0, -0.3, 1.0], [0, 0, 1, 1, 0, 1]),
+        ([3.0, 1.0, 2.0, 6.0], [0, 1, 0, 1]),
+        ([-2.0, -1.0, 0.0, 1.0, 5.0], [0, 0, 0, 0, 1]),
+        ([0.2, 0.4], [0, 1]),
+    ],
+)
+def test_no_point_of_a_fine_grid_has_a_smaller_loss(logits, labels):
+    fitted = fit_calibration(logits, labels)
+    best = smoothed_loss(logits, labels, fitted.slope, fitted.intercept)
+    grid = min(
+        smoothed_loss(logits, labels, slope, intercept)
+        for slope in np.geomspace(*SLOPE_BOUNDS, 61)
+        for intercept in np.linspace(-12, 12, 97)
+    )
+    nearby = min(
+        smoothed_loss(logits, labels, fitted.slope + a, fitted.intercept + b)
+        for a in (-1e-3, 0, 1e-3)
+        for b in (-1e-3, 0, 1e-3)
+    )
+    assert best <= grid
+    assert best <= nearby + 1e-15  # float64 rounding of a loss below 1
+
+
+def test_one_pair_of_each_class_gives_its_smoothed_targets():
+    """Two parameters meet two targets: (1 + 1) / (1 + 2) for the true pair, 1 / (1 + 2) for the false one."""
+    fitted = fit_calibration([-1.0, 3.0], [0, 1])
+    np.testing.assert_allclose(fitted.probability([-1.0, 3.0]), [1 / 3, 2 / 3], rtol=1e-9)
+    assert fitted.slope == pytest.approx(2 * math.log(2) / 4)
+    assert (fitted.positives, fitted.negatives) == (1, 1)
+
+
+def test_separable_logits_stay_finite_where_the_plain_likelihood_runs_away():
+    logits = np.concatenate([np.linspace(-9, -6, 50), np.linspace(6, 9, 50)])
+    labels = [0] * 50 + [1] * 50
+    plain = [smoothed_loss(logits, labels, slope, 0.0, smooth=False) for slope in (0.5, 1, 2, 4)]
+    assert plain == sorted(plain, reverse=True)  # naive: the steeper the better, without end
+    assert plain[-1] < 1e-9
+    fitted = fit_calibration(logits, labels)
+    assert SLOPE_BOUNDS[0] < fitted.slope < 1
+    assert abs(fitted.intercept) < 0.1
+    # 50 pairs without a mistake: the smoothed share, 51 / 52, lies between the least and the most certain of them.
+    assert fitted.probability(6.0) < 51 / 52 < fitted.probability(9.0) < 0.999
+
+
+def test_pairs_that_are_rarer_do_not_shift_the_probability_for_the_odds_are_even():
+    logits, labels = overlapping(400)
+    rare = np.concatenate([np.flatnonzero(labels == 0), np.flatnonzero(labels == 1)[:40]])
+    even, few = fit_calibration(logits, labels), fit_calibration(logits[rare], labels[rare])
+    assert (few.positives, few.negatives) == (40, 200)
+    # Naively, the log-odds at any logit would fall by log(5) = 1.6 with the share of true pairs.
+    assert abs(few.log_odds(0.5) - even.log_odds(0.5)) < 0.5
+
+
+def test_true_odds_are_found_again():
+    """Two normal distributions at distance 1, deviation 1: the log-odds of a logit z are z - 1/2."""
+    fitted = fit_calibration(*overlapping(100_000))
+    assert fitted.slope == pytest.approx(1.0, abs=0.03)  # the standard error is about 0.01
+    assert fitted.intercept == pytest.approx(-0.5, abs=0.03)
+    assert fitted.nll_after < fitted.nll_before
+    assert fitted.ece_after < 0.01 < fitted.ece_before
+
+
+# Extreme logits --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1.0, 1e3, 1e4, 1e30, FLOAT32_MAX / 10])
+@pytest.mark.parametrize("offset", [0.0, 3.0, -1e3])
+def test_the_fit_is_finite_within_bounds_and_keeps_the_order_at_any_scale(scale, offset, seed):
+    logits, labels = overlapping(offset=0.0, seed=seed)
+    logits = logits * scale + offset * min(scale, 1e30)
+    fitted = fit_calibration(logits, labels)
+    assert all(math.isfinite(value) for value in dataclasses.asdict(fitted).values())
+    assert SLOPE_BOUNDS[0] <= fitted.slope <= SLOPE_BOUNDS[1]
+    ranked = np.sort(logits)
+    assert (np.diff(fitted.log_odds(ranked)) >= 0).all()
+    assert (np.diff(fitted.probability(ranked)) >= 0).all()
+    json.dumps(fitted.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("offset", [1e3, -1e5, 1e6])
+def test_an_offset_of_all_logits_changes_the_intercept_alone(offset):
+    """A quasi-Newton fit of both at once gave slope 0.89 for 1.21 at an offset of 1000."""
+    (logits, labels), plain = overlapping(), fit_calibration(*overlapping())
+    fitted = fit_calibration(logits + offset, labels)
+    assert fitted.slope == pytest.approx(plain.slope, rel=1e-6)
+    np.testing.assert_allclose(fitted.log_odds(logits + offset), plain.log_odds(logits), atol=1e-6)  # 1e6 * 2^-52 * 1e3
+
+
+@pytest.mark.parametrize("scale", [0.05, 7.0, 60.0])
+def test_scaling_all_logits_scales_the_slope_and_leaves_the_probabilities(scale):
+    (logits, labels), plain = overlapping(), fit_calibration(*overlapping())
+    fitted = fit_calibration(scale * logits, labels)
+    assert fitted.slope == pytest.approx(plain.slope / scale, rel=1e-6)
+    np.testing.assert_allclose(fitted.probability(scale * logits), plain.probability(logits), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "bound"), [(1e-3, 1), (1e3, 0), (1e30, 0)])
+def test_a_slope_beyond_its_bounds_stops_at_them_exactly(scale, bound):
+    logits, labels = overlapping(scale=scale)
+    assert fit_calibration(logits, labels).slope == SLOPE_BOUNDS[bound]
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0, -1e4, 1e30])
+def test_constant_logits_say_nothing_so_both_answers_are_as_likely(value):
+    fitted = fit_calibration([value] * 6, [0, 1, 0, 1, 1, 0])
+    assert fitted.slope == SLOPE_BOUNDS[0]
+    assert fitted.probability(value) == 0.5
+    assert fitted.nll_after == pytest.approx(math.log(2))
+
+
+def test_logits_that_say_the_opposite_get_the_smallest_slope_and_never_a_negative_one():
+    logits, labels = overlapping()
+    fitted = fit_calibration(-logits, labels)
+    assert fitted.slope == SLOPE_BOUNDS[0]
+    assert fitted.probability(0.0) == pytest.approx(0.5, abs=0.01)
+
+
+def test_one_wild_logit_flattens_the_slope_and_leaves_the_others_undecided():
+    """A smoothed target is never certain, so that even a false pair that lies rightly far below costs by its slope."""
+    logits, labels = overlapping()
+    logits[0] = -1e30
+    fitted = fit_calibration(logits, labels)
+    assert fitted.slope == SLOPE_BOUNDS[0]
+    assert np.abs(fitted.probability(logits[1:]) - 0.5).max() < 0.02
+    assert fitted.probability(-1e30) == 0.0
+
+
+finite_logits = st.floats(-FLOAT32_MAX, FLOAT32_MAX, width=32)
+pair_lists = st.lists(st.tuples(finite_logits, st.integers(0, 1)), min_size=1, max_size=20)
+
+
+@settings(max_examples=150)
+@given(pairs=pair_lists, one=finite_logits, two=finite_logits)
+def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
+    logits, labels = zip(*pairs, (one, 0), (two, 1), strict=True)
+    fitted = fit_calibration(logits, labels)
+    assert all(math.isfinite(value) for value in dataclasses.asdict(fitted).values())
+    assert SLOPE_BOUNDS[0] <= fitted.slope <= SLOPE_BOUNDS[1]
+    assert (np.diff(fitted.log_odds(np.sort(logits))) >= 0).all()
+    assert 0 <= fitted.ece_after <= 1
+
+
+# Use -------------------------------------------------------------------------------------------------------
+
+
+FITTED = Calibration(2.0, -0.5, 0.3, 10, 12, 0.7, 0.6, 0.2, 0.1)
+
+
+def test_log_odds_and_probability_are_what_the_formula_says():
+    assert FITTED.log_odds(1.25) == 2.0
+    assert FITTED.probability(1.25) == pytest.approx(1 / (1 + math.exp(-2)))
+    np.testing.assert_array_equal(FITTED.log_odds([0.0, 1.0]), [-0.5, 1.5])
+
+
+def test_probabilities_saturate_without_a_warning_and_log_odds_do_not():
+    np.testing.assert_array_equal(FITTED.probability([-1e30, 1e30]), [0.0, 1.0])
+    logits = np.array([20.0, 21.0, 25.0])
+    assert len(np.unique(FITTED.probability(logits))) == 1  # ranking by these would tie
+    assert len(np.unique(FITTED.log_odds(logits))) == 3
+
+
+@pytest.mark.parametrize(
+    ("logits", "labels", "expected"),
+    [
+        ([-2.0, -1.0, 3.0, 4.0], [0, 0, 1, 1], 1.0),
+        ([0.0, 1.0, 2.0, 3.0], [0, 1, 0, 1], 0.75),
+        ([4.0, 3.0, 2.0, 1.0], [0, 0, 1, 1], 0.5),
+        ([1.0, 1.0, 1.0], [0, 1, 1], 0.5),
+        ([0.0, 1.0, 1.0, 2.0], [0, 0, 1, 1], 0.75),
+        ([1e16, 1e16 + 2], [0, 1], 1.0),
+        ([-1e30, 1e30], [0, 1], 1.0),
+    ],
+)
+def test_the_reject_threshold_has_the_largest_balanced_accuracy_of_all_thresholds(logits, labels, expected):
+    fitted = fit_calibration(logits, labels)
+    x, labels = fitted.log_odds(logits), np.array(labels)
+
+    def balanced_accuracy(threshold):
+        return (np.mean(x[labels == 1] >= threshold) + np.mean(x[labels == 0] < threshold)) / 2
+
+    best = max(map(balanced_accuracy, [*x, np.inf]))
+    assert balanced_accuracy(fitted.reject_log_odds) == best == expected
+
+
+def test_the_reject_threshold_lies_midway_between_what_it_parts():
+    fitted = fit_calibration([-2.0, -1.0, 3.0, 4.0], [0, 0, 1, 1])
+    assert fitted.reject_log_odds == pytest.approx(float(fitted.log_odds(1.0)))
+
+
+def test_expected_calibration_error_by_hand():
+    """Probabilities .1, .9, .95 in 15 bins: the first alone in bin 1; .9 in bin 13, .95 in bin 14."""
+    logits = np.log([0.1 / 0.9, 0.9 / 0.1, 0.95 / 0.05])
+    fitted = fit_calibration(logits, [0, 1, 0])
+    assert fitted.ece_before == pytest.approx((0.1 + 0.1 + 0.95) / 3)
+
+
+def test_within_a_bin_errors_cancel_and_between_bins_they_do_not():
+    """Probability 0.7 twice, one true of two: off by 0.2 on average; naively, pair by pair, it would be 0.5."""
+    logit = math.log(0.7 / 0.3)
+    assert fit_calibration([logit, logit], [0, 1]).ece_before == pytest.approx(0.2)
+
+
+def test_certain_and_right_is_an_error_of_zero_and_certain_and_wrong_of_one():
+    assert fit_calibration([-1e30, 1e30], [0, 1]).ece_before == 0.0
+    assert fit_calibration([1e30, -1e30], [0, 1]).ece_before == 1.0
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_logit_that_is_not_finite_has_no_odds(bad):
+    """Compared with a threshold, a NaN is never above it: it would be called "no match" without a word."""
+    assert not math.nan >= 0.0
+    for ask in (FITTED.log_odds, FITTED.probability):
+        with pytest.raises(NumericalError, match="every logit must be finite to be calibrated; got"):
+            ask([0.0, bad])
+
+
+# Metrics ---------------------------------------------------------------------------------------------------
+
+
+def auc_by_loops(logits, labels):
+    wins, total = 0.0, 0
+    for true, label in zip(logits, labels, strict=True):
+        for false, other in zip(logits, labels, strict=True):
+            if label == 1 and other == 0:
+                wins += 1.0 if true > false else 0.5 if true == false else 0.0
+                total += 1
+    return wins / total
+
+
+few_values = st.sampled_from([-1e30, -1.0, 0.0, 1e-30, 1.0, 2.0])
+
+
+@settings(max_examples=200)
+@given(
+    pairs=st.lists(st.tuples(few_values, st.integers(0, 1)), max_size=30),
+    one=few_values,
+    two=few_values,
+)
+def test_the_area_is_the_count_of_won_comparisons_with_ties_as_halves(pairs, one, two):
+    logits, labels = zip(*pairs, (one, 0), (two, 1), strict=True)
+    assert pair_auc(logits, labels) == pytest.approx(auc_by_loops(logits, labels), abs=1e-15)
+
+
+@pytest.mark.parametrize(("true", "false"), [(1, 1), (3, 7), (50, 1), (333, 1001)])
+def test_a_constant_scorer_has_exactly_half_the_area(true, false):
+    labels = [1] * true + [0] * false
+    assert pair_auc([2.5] * len(labels), labels) == 0.5
+    assert pair_auc([2.5] * len(labels), labels[::-1]) == 0.5
+    # Naively, from a sort of the pairs, the constant scorer's area is that of the order they came in.
+    order = np.argsort(np.full(len(labels), -2.5), kind="stable")
+    below = [sum(labels[j] == 0 for j in order[place + 1 :]) for place, i in enumerate(order) if labels[i] == 1]
+    assert sum(below) / (true * false) == 1.0
+
+
+def test_the_area_does_not_change_with_the_scale_where_probabilities_tie():
+    logits, labels = np.array([17.5, 18.0, 25.0, 40.0]) * 3, [0, 1, 0, 1]
+    assert pair_auc(logits, labels) == pair_auc(logits * 1e30, labels) == 0.75
+    assert pair_auc(expit(logits), labels) == 0.5  # naive: all are exactly 1
+
+
+def test_pair_accuracy_by_hand_with_a_coin_at_zero():
+    assert pair_accuracy([2.0, -1.0, 0.0, 3.0], [1, 1, 1, 0]) == (1 + 0 + 0.5 + 0) / 4
+    assert pair_accuracy([0.0] * 4, [0, 1, 1, 1]) == 0.5
+    assert pair_accuracy([-0.0, 1e-30, -1e-30, 1e30], [1, 1, 0, 1]) == 3.5 / 4
+
+
+def test_labels_may_be_booleans_and_logits_float32():
+    logits = np.array([-1.0, 2.0, 0.5], dtype=np.float32)
+    labels = np.array([False, True, True])
+    assert pair_auc(logits, labels) == 1.0
+    assert fit_calibration(logits, labels) == fit_calibration(logits.astype(float), labels.astype(int))

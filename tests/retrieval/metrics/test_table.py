@@ -1,0 +1,105 @@
+"""The table of scores that protocols take, what a measure is, and which photos stand for an object."""
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.measure import Measure
+from retrieval.metrics.table import ScoreTable, object_scores
+from tests.retrieval.metrics.test_protocols import mine_of, others_of, table_of, uneven
+
+# The table -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_score_that_is_not_finite_is_refused_where_naively_a_nan_would_be_the_best(bad):
+    scores = np.zeros((3, 3))
+    scores[1, 2] = bad
+    if math.isnan(bad):
+        assert np.argsort(-scores[1])[0] != 2
+        assert np.argsort(scores[1])[::-1][0] == 2
+    with pytest.raises(NumericalError, match="row 1, column 2"):
+        table_of(scores, [0, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("scores", "own"), [((2, 3), (3, 3)), ((3, 3), (3, 2)), ((3,), (3, 3))], ids=["scores", "own", "flat"]
+)
+def test_shapes_that_do_not_fit_are_refused(scores, own):
+    with pytest.raises(BadInput, match="a row for each of the 3 touches and a column for each of the 3 photos"):
+        table_of(np.zeros(scores), [0, 0, 1], own=np.zeros(own))
+
+
+def test_an_empty_table_and_an_own_photo_of_another_object_are_refused():
+    with pytest.raises(BadInput, match="one at least"):
+        table_of(np.zeros((0, 3)), [], [0, 0, 1])
+    with pytest.raises(BadInput, match="check the ids"):
+        table_of(np.zeros((2, 2)), [0, 1], own=[[0, 1], [0, 0]])
+
+
+def test_rows_and_columns_are_selected_with_all_that_belongs_to_them():
+    table = uneven()
+    rows, columns = np.array([5, 2]), np.arange(14) % 2 == 0
+    part = table.select(rows, columns)
+    np.testing.assert_array_equal(part.scores, table.scores[np.ix_(rows, columns)])
+    np.testing.assert_array_equal(part.own, table.own[np.ix_(rows, columns)])
+    np.testing.assert_array_equal(part.touch_owner, table.touch_owner[rows])
+    np.testing.assert_array_equal(part.photo_owner, table.photo_owner[columns])
+
+
+def test_a_measure_needs_a_finite_value_for_each_query():
+    with pytest.raises(BadInput, match=r"values of shape \(2, 1\)"):
+        Measure(np.zeros((3, 1)), np.array([0, 1]), np.array([0.5]), "")
+    with pytest.raises(NumericalError):
+        Measure(np.full((2, 1), np.nan), np.array([0, 1]), np.array([0.5]), "")
+
+
+# Which photos stand for an object --------------------------------------------------------------------------
+
+
+def test_an_object_is_shown_by_photos_of_its_own_without_replacement_and_never_by_the_row_s_own():
+    """Scores are powers of two, so the mean of three photos tells which three they were."""
+    owner = np.repeat([0, 1], 6)
+    table = table_of(np.tile(2.0 ** np.arange(12), (12, 1)), owner)
+    seen = np.rint(object_scores(table, 3, 40, seed=0) * 3).astype(int)
+    for row, name in product(range(12), (0, 1)):
+        sets = {int(value) for value in seen[:, row, name]}
+        assert all(value.bit_count() == 3 for value in sets)
+        assert all(6 * name <= bit < 6 * name + 6 for value in sets for bit in bits(value))
+        assert not any(value >> row & 1 for value in sets)
+        assert len(sets) > 5
+
+
+def bits(value):
+    return [bit for bit in range(value.bit_length()) if value >> bit & 1]
+
+
+def test_every_photo_is_shown_equally_often():
+    owner = np.repeat([0, 1], 4)
+    table = table_of(np.tile(2.0 ** np.arange(8), (8, 1)), owner)
+    seen = np.rint(object_scores(table, 2, 4000, seed=0) * 2).astype(int)
+    for row, name in product(range(8), (0, 1)):
+        allowed = [column for column in range(4 * name, 4 * name + 4) if column != row]
+        for column in allowed:
+            share = np.mean(seen[:, row, name] >> column & 1)
+            assert share == pytest.approx(2 / len(allowed), abs=0.05)  # six standard errors
+
+
+def test_an_object_with_fewer_photos_shows_all_it_has():
+    table = uneven()
+    found = object_scores(table, 100, 1, seed=0)[0]
+    for row in range(14):
+        for place, name in enumerate(table.objects):
+            columns = mine_of(table, row) if name == table.touch_owner[row] else others_of(table, row)[name]
+            assert found[row, place] == pytest.approx(np.mean(table.scores[row, columns], dtype=float), abs=1e-12)
+
+
+def test_what_is_drawn_hangs_on_the_seed_and_not_on_the_scores():
+    table = uneven()
+    doubled = ScoreTable(2 * table.scores, table.touch_owner, table.photo_owner, table.own)
+    first = object_scores(table, 1, 3, seed=4)
+    np.testing.assert_array_equal(object_scores(doubled, 1, 3, seed=4), 2 * first)
+    assert (object_scores(table, 1, 3, seed=5) != first).any()

@@ -1,0 +1,236 @@
+"""Settings: presets, what is refused and by which name, and the paper's numbers."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+import retrieval
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.errors import ConfigError
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.model.losses import LOSSES
+from retrieval.model.towers import OUTPUTS, TOGETHER, TOWERS
+
+TABLES = Config().to_dict()
+"""Tables of a configuration: settings and their defaults."""
+
+
+# Presets ---------------------------------------------------------------------------------------------------
+
+
+def test_the_presets_are_the_files_that_come_with_the_package():
+    folder = Path(retrieval.__file__).parent / "configs"
+    assert preset_names() == sorted(path.stem for path in folder.iterdir())
+    assert {"paper", "small"} <= set(preset_names())
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_loads_and_names_a_tower_that_exists(name):
+    config = load_config(name)
+    assert set(config.matcher.tower.split(TOGETHER)) <= set(TOWERS)
+    assert config.matcher.tower_output in OUTPUTS
+    assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_the_preset_paper_holds_the_papers_numbers():
+    config = load_config("paper")
+    matcher, training, preprocessing = config.matcher, config.training, config.preprocessing
+    assert matcher.tower == "resnet50"
+    assert matcher.tower_output == "classes"  # the 1000 outputs of each network are concatenated
+    assert matcher.fingers == 2
+    assert matcher.hidden == 1024
+    assert matcher.dropout > 0
+    assert not matcher.standardise
+    assert training.init == "imagenet"
+    assert training.iterations == 26_000
+    assert (training.positives_per_touch, training.negatives_per_touch) == (4, 4)
+    assert training.touches_per_batch * (4 + 4) == 48
+    assert (training.learning_rate, training.schedule) == (1e-4, "constant")
+    assert training.weights == {"contrastive": 0.0, "listwise": 0.0}
+    assert not training.freeze_batch_norm
+    assert not training.freeze_towers
+    assert round(98 * training.test_fraction) == 18
+    assert (preprocessing.touch_px, preprocessing.photo_px, preprocessing.background) == (128, 256, "none")
+
+
+def test_the_defaults_are_the_papers_which_has_no_pruner():
+    paper = load_config("paper")
+    assert paper.matcher.pruner_width > 0
+    assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, pruner_width=0))
+
+
+def test_paper_exact_sets_back_what_the_table_of_differences_says_can_be():
+    paper, exact = load_config("paper"), load_config("paper-exact")
+    training = dataclasses.replace(
+        paper.training, validation_fraction=0.0, negatives="dataset", precision="float32", distil_steps=600
+    )
+    assert exact == dataclasses.replace(paper.without_pruner(), training=training)
+    table = (Path(__file__).parents[3] / "docs" / "paper.md").read_text("utf-8")
+    for setting in ("validation_fraction = 0.0", 'negatives = "dataset"', 'precision = "float32"', "pruner_width = 0"):
+        assert f"`{setting}`" in table
+
+
+@pytest.mark.parametrize("name", [name for name in preset_names() if name != "paper-exact"])
+def test_every_preset_but_that_of_the_paper_alone_has_embeddings_to_search_candidates_by(name):
+    config = load_config(name)
+    assert config.has_embeddings
+    # What `adapt` makes judges by its embeddings, and what `benchmark real` fits is never searched.
+    assert (config.matcher.pruner_width > 0) == (name not in ("adapt", "real"))
+
+
+# Files -----------------------------------------------------------------------------------------------------
+
+
+def test_a_file_changes_what_it_names_and_leaves_the_rest(tmp_path):
+    (tmp_path / "mine.toml").write_text("[training]\nlearning_rate = 1\nseed = 3\n")
+    config = load_config(str(tmp_path / "mine.toml"))
+    assert config == Config(training=TrainingConfig(learning_rate=1.0, seed=3))
+    assert type(config.training.learning_rate) is float
+
+
+def test_an_empty_file_is_the_defaults(tmp_path):
+    (tmp_path / "empty.toml").touch()
+    assert load_config(str(tmp_path / "empty.toml")) == Config()
+
+
+@pytest.mark.parametrize("name", ["huge", "", ".", "paper.toml", "../paper", "configs"])
+def test_an_unknown_name_lists_the_presets(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=rf"one of {', '.join(preset_names())} or a TOML file; there is no '.*'"):
+        load_config(name)
+
+
+@pytest.mark.parametrize(
+    "content", [b"[training\n", b"seed = \n", b"[training]\nseed = 1\nseed = 2\n", b"\xff\xfe", b"a = 1" * 2]
+)
+def test_a_file_that_is_not_toml_is_named(tmp_path, content):
+    (tmp_path / "bad.toml").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"bad\.toml is not valid TOML: "):
+        load_config(str(tmp_path / "bad.toml"))
+
+
+def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").touch()
+
+    def refuse(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("os.open", refuse)
+    with pytest.raises(ConfigError, match=r"mine\.toml cannot be read: Permission denied"):
+        load_config(str(tmp_path / "mine.toml"))
+
+
+# What is refused -------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_table_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match="unknown setting 'model' in configuration; known: matcher, training, prep"):
+        Config.from_dict({"model": {}})
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_an_unknown_key_is_refused_with_the_known_ones(table):
+    known = ", ".join(TABLES[table])
+    with pytest.raises(ConfigError, match=rf"unknown setting 'colour' in \[{table}\]; known: {known}"):
+        Config.from_dict({table: {"colour": 1}})
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("value", [1, "a", [], None, True])
+def test_a_table_must_be_a_table(table, value):
+    with pytest.raises(ConfigError, match=rf"\[{table}\] must be a table of settings; got "):
+        Config.from_dict({table: value})
+
+
+@pytest.mark.parametrize("value", [None, [], "paper", 1])
+def test_a_configuration_must_be_tables(value):
+    with pytest.raises(ConfigError, match="configuration must be tables of settings; got"):
+        Config.from_dict(value)
+
+
+def wrong_types():
+    """Every setting with a value of each other type; a whole number will do for a float."""
+    for table, defaults in TABLES.items():
+        for name, default in defaults.items():
+            wanted = type(default)
+            for value in (1, 1.5, "text", True, None, [1]):
+                if type(value) is not wanted and not (wanted is float and type(value) is int):
+                    yield pytest.param(table, name, wanted, value, id=f"{table}.{name}={value!r}")
+
+
+@pytest.mark.parametrize(("table", "name", "wanted", "value"), list(wrong_types()))
+def test_a_value_of_another_type_is_refused_and_named(table, name, wanted, value):
+    with pytest.raises(ConfigError, match=rf"{table}\.{name} must be of type {wanted.__name__}; got "):
+        Config.from_dict({table: {name: value}})
+
+
+OUT_OF_RANGE = [
+    *[("matcher", name, value) for name in ("fingers", "hidden", "embedding_dim") for value in (0, -1)],
+    *[("matcher", "dropout", value) for value in (-0.1, 1.0, 1.5, math.nan, math.inf)],
+    *[
+        ("training", name, value)
+        for name in ("iterations", "touches_per_batch", "positives_per_touch", "negatives_per_touch", "validate_every")
+        for value in (0, -3)
+    ],
+    *[("training", "learning_rate", value) for value in (0.0, -1e-4, math.nan, math.inf)],
+    *[("training", f"{loss}_weight", value) for loss in LOSSES for value in (-0.1, math.nan, math.inf)],
+    *[("training", name, "other") for name in ("schedule", "precision")],
+    *[
+        ("training", name, value)
+        for name in ("validation_fraction", "test_fraction")
+        for value in (-0.1, 1.0, 2.0, math.nan, math.inf)
+    ],
+    *[("training", "seed", value) for value in (-1, 2**32)],
+    *[("preprocessing", name, value) for name in ("touch_px", "photo_px") for value in (0, -1, 4097)],
+    ("preprocessing", "background", "green"),
+]
+
+
+@pytest.mark.parametrize(("table", "name", "value"), OUT_OF_RANGE)
+def test_a_value_out_of_range_is_refused_and_named(table, name, value):
+    with pytest.raises(ConfigError, match=name) as caught:
+        Config.from_dict({table: {name: value}})
+    assert str(value) in str(caught.value)
+
+
+def test_a_weight_is_of_a_loss_that_there_is():
+    with pytest.raises(ConfigError, match="must be of one of contrastive, listwise; got 'triplet'"):
+        TrainingConfig(weights={"triplet": 1.0})
+
+
+def test_a_weight_stands_in_a_file_under_the_name_of_its_loss():
+    config = Config.from_dict({"training": {"listwise_weight": 1}})
+    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0}
+    table = config.to_dict()["training"]
+    assert (table["contrastive_weight"], table["listwise_weight"]) == (0.0, 1.0)
+    assert "weights" not in table
+
+
+def test_the_parts_held_out_must_leave_something_to_train_on():
+    TrainingConfig(validation_fraction=0.5, test_fraction=0.49)
+    with pytest.raises(ConfigError, match=r"leave objects to train on; got \(0\.5, 0\.5\)"):
+        TrainingConfig(validation_fraction=0.5, test_fraction=0.5)
+
+
+@pytest.mark.parametrize(
+    ("cls", "settings"),
+    [
+        (MatcherConfig, {"fingers": 1, "hidden": 1, "embedding_dim": 1, "dropout": 0.0}),
+        (TrainingConfig, {"validation_fraction": 0.0, "test_fraction": 0.0}),
+        (TrainingConfig, {"weights": {"contrastive": 0.0, "listwise": 1e9}}),
+        (TrainingConfig, {"iterations": 1, "touches_per_batch": 1, "validate_every": 1, "seed": 2**32 - 1}),
+        (Preprocessing, {"touch_px": 1, "photo_px": 4096}),
+    ],
+)
+def test_the_ends_of_the_ranges_are_taken(cls, settings):
+    assert dataclasses.asdict(cls(**settings)) == dataclasses.asdict(cls()) | settings
+
+
+def test_a_configuration_is_frozen_and_survives_its_dictionary():
+    config = Config(MatcherConfig(tower="small"), TrainingConfig(seed=4), Preprocessing(touch_px=64))
+    assert Config.from_dict(config.to_dict()) == config
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.training.seed = 5

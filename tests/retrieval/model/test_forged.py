@@ -1,0 +1,261 @@
+"""Checkpoints, settings and indexes that somebody wrote on purpose: well formed, and unusable. Each is one sentence."""
+
+import contextlib
+import os
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from packaging.version import Version
+from safetensors.torch import save_file
+
+from indexes.errors import CorruptIndex
+from indexes.store.folder import IndexStore
+from retrieval.commands.main import main
+from retrieval.errors import BadInput, CheckpointError, ConfigError
+from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
+from retrieval.model.config import load_config
+from retrieval.model.stored import read_judge, read_stored
+from retrieval.search.objects import listed_photo
+from retrieval.training.gate import load_gate
+from tests.retrieval.model.test_checkpoint import rewrite, save
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+needs_complex = pytest.mark.skipif(
+    Version(version("safetensors")) < Version("0.7"), reason="this safetensors writes no complex numbers"
+)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save(tmp_path / "m.safetensors")
+    return tmp_path / "m.safetensors"
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """As `saved`, for examples that write elsewhere."""
+    path = tmp_path_factory.mktemp("kept") / "m.safetensors"
+    save(path)
+    return path
+
+
+def with_settings(path, part="matcher", **changes):
+    """Write the checkpoint again with other settings, its checksum made to fit."""
+    _, header = read_tensors(path)
+    config = header["config"]
+    rewrite(path, config=config | {part: config[part] | changes})
+    return path
+
+
+@pytest.mark.parametrize("name", ["hidden", "embedding_dim", "fingers", "pruner_width"])
+@pytest.mark.parametrize("size", [10**9, 2**70])
+def test_weights_are_compared_with_the_settings_before_memory_is_asked_for(saved, name, size):
+    with_settings(saved, **{name: size})
+    with pytest.raises(CheckpointError, match=r"do not fit its configuration|too large to be counted"):
+        load_checkpoint(saved)
+
+
+def test_no_matcher_of_another_size_is_made(saved, monkeypatch):
+    made = []
+    real = torch.nn.Linear.__init__
+
+    def counted(self, inputs, outputs, *arguments, **settings):
+        real(self, inputs, outputs, *arguments, **settings)
+        made.append(self.weight.device.type)
+
+    monkeypatch.setattr(torch.nn.Linear, "__init__", counted)
+    with_settings(saved, hidden=4096)
+    with pytest.raises(CheckpointError):
+        load_checkpoint(saved)
+    assert set(made) == {"meta"}
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    part=st.sampled_from(["config", "split", "calibration", "provenance", "format", "software", "task"]),
+    value=JSON,
+)
+def test_any_part_of_a_header_may_be_forged(kept, part, value):
+    forged = kept.with_name("forged.safetensors")
+    state, header = read_tensors(kept)
+    write_tensors(forged, state, header | {part: value})
+    for read in (load_checkpoint, read_stored, load_gate):
+        with contextlib.suppress(BadInput):
+            read(forged)
+
+
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    part=st.sampled_from(["matcher", "training", "preprocessing"]),
+    key=st.sampled_from(["hidden", "tower", "dropout", "seed", "learning_rate", "touch_px", "background", "init"]),
+    value=JSON | st.just(10**400),
+)
+def test_any_setting_in_a_header_may_be_forged(kept, part, key, value):
+    forged = kept.with_name("forged.safetensors")
+    state, header = read_tensors(kept)
+    config = {**header["config"], part: {**header["config"][part], key: value}}
+    write_tensors(forged, state, header | {"config": config})
+    with contextlib.suppress(BadInput):
+        load_checkpoint(forged)
+
+
+def test_a_header_nested_without_end_is_refused(saved, tmp_path):
+    for text in ("[" * 100_000, "[" * 900 + "]" * 900, '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}"):
+        save_file({"w": torch.zeros(1)}, tmp_path / "deep.safetensors", {"touch_retrieval": text})
+        with pytest.raises(CheckpointError, match="damaged"):
+            load_checkpoint(tmp_path / "deep.safetensors")
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {"queries.touch_halves": torch.zeros(3, 5, dtype=torch.float16)},
+        {"queries.touch_halves": torch.zeros(3, dtype=torch.float16)},
+        {"queries.touch_halves": torch.zeros(3, 8, dtype=torch.bfloat16)},
+        pytest.param({"head.out.bias": torch.zeros(1, dtype=torch.complex64)}, marks=needs_complex),
+        {"head.out.bias": torch.zeros(1).to(torch.float8_e4m3fn)},
+        {"head.out.bias": torch.zeros(())},
+    ],
+)
+def test_forged_tensors_are_refused(saved, tensors):
+    rewrite(saved, tensors=tensors)
+    with pytest.raises(CheckpointError):
+        load_checkpoint(saved)
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {"head.second.weight": torch.zeros(3, 4)},
+        {"head.second.bias": torch.zeros(3)},
+        {"head.out.weight": torch.zeros(())},
+        {"head.out.bias": torch.zeros(7)},
+        {"head.out.bias": torch.zeros(1, dtype=torch.int64)},
+        {"head.out.bias": torch.zeros(1, dtype=torch.bfloat16)},
+        {"head.out.weight": None},
+    ],
+)
+def test_a_forged_judge_is_refused(saved, tensors):
+    state, header = read_tensors(saved)
+    state = {name: tensor for name, tensor in {**state, **tensors}.items() if tensor is not None}
+    write_tensors(saved, state, header)
+    with pytest.raises(CheckpointError):
+        read_judge(saved)
+
+
+def test_a_checkpoint_that_is_no_file_is_refused_without_being_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero", "."):
+        for read in (load_checkpoint, read_stored, load_gate):
+            with pytest.raises(CheckpointError, match=r"is a (pipe|device|folder), not a"):
+                read(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a = " + "[" * 100_000, "[matcher]\nhidden = 1" + "0" * 5000, "\x00", "[training]\nlearning_rate = 1" + "0" * 400],
+)
+def test_hostile_settings_are_refused(tmp_path, text):
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(ConfigError):
+        load_config(str(tmp_path / "c.toml"))
+
+
+def test_settings_in_a_pipe_are_refused_without_waiting(tmp_path):
+    os.mkfifo(tmp_path / "c.toml")
+    with pytest.raises(ConfigError, match="is a pipe, not a regular file"):
+        load_config(str(tmp_path / "c.toml"))
+    with pytest.raises(ConfigError):
+        load_config("n" * 10_000)
+
+
+def test_a_training_asks_before_it_would_write_over_another_file(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    (tmp_path / "model.md").write_text("# My notes\n")
+    for name, what in (("a.png", "a checkpoint"), ("model.safetensors", "a model card")):
+        with pytest.raises(BadInput, match=f"is not {what} that this program wrote"):
+            require_writable(tmp_path / name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "model.md"]
+
+
+# Rows of an index -------------------------------------------------------------------------------------------
+
+
+ROW = {"id": "mug/1.jpg", "object_id": "mug", "path": "mug/1.jpg", "metadata": {}}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"path": "../../etc/passwd"},
+        {"path": "mug/../../secret.png"},
+        {"path": "/etc/passwd"},
+        {"path": "a\0.png"},
+        {"path": ""},
+        {"path": 7},
+        {"object_id": None},
+        {"metadata": []},
+    ],
+)
+def test_a_row_of_a_photo_outside_the_catalogue_or_without_its_parts_is_refused(change):
+    assert listed_photo(ROW).path == "mug/1.jpg"
+    with pytest.raises(CorruptIndex):
+        listed_photo(ROW | change)
+
+
+def test_an_index_whose_rows_name_no_object_is_of_no_rig(tmp_path):
+    """`serve` looks for the simulated rig's objects before the index is opened to be searched, which says what is
+    wrong."""
+    from retrieval.serve.rig import of_index
+
+    vectors = np.eye(2, dtype=np.float32)
+    IndexStore(tmp_path).write([{"id": "a"}, {"id": "b"}], vectors, fingerprint={})
+    assert of_index(tmp_path) is None
+
+
+# Commands ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{", '{"seed": 1' + "0" * 5000 + "}", "7"])
+def test_a_hostile_split_is_one_sentence(tmp_path, capsys, text):
+    (tmp_path / "split.json").write_text(text)
+    assert main(["check", str(tmp_path), "--split", str(tmp_path / "split.json")]) == 2
+    said = capsys.readouterr().err
+    assert "unexpected" not in said
+    assert len(said.splitlines()) == 1
+
+
+def test_names_that_no_disk_takes_are_one_sentence(tmp_path, capsys):
+    name = "n" * 10_000
+    commands = [
+        ["check", name],
+        ["check", str(tmp_path), "--split", name],
+        ["query", "--gelsight", name, "--index", name],
+        ["build-index", name],
+        ["build-index", str(tmp_path), "--model", name],
+        ["train", name, "--out", str(tmp_path / "m.safetensors")],
+        ["train", str(tmp_path), "--out", name],
+        ["evaluate", name, "--out", str(tmp_path / "report")],
+        ["evaluate", str(tmp_path), "--out", name],
+        ["import", "billets", name, "--out", name],
+        ["rig", "calibrate", name],
+        ["rig", "check", "--rig", f"{name}.toml"],
+        ["collect", "--out", name],
+        ["collect", "--out", str(tmp_path / "r"), "--gate", name],
+        ["demo", "--out", name],
+        ["frontier", "--out", name],
+        ["export", name],
+    ]
+    for command in commands:
+        code, said = main(command), capsys.readouterr().err.splitlines()
+        assert (code, [line for line in said if "unexpected" in line]) == (2, []), command
+        assert len(said[-1]) < 540, command

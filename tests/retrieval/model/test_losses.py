@@ -1,0 +1,210 @@
+"""Both loss terms against plain loops, and where the naive formulae fail."""
+
+import math
+
+import pytest
+import torch
+
+from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
+from retrieval.model.losses.listwise import listwise_loss, pick_loss
+from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
+
+
+def unit(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(torch.randn(*shape, generator=generator, dtype=torch.float64), dim=-1)
+
+
+def loss_by_loops(scores, rows, columns):
+    """For each row with a positive and a negative: the mean over positives of -log softmax among the negatives."""
+    total = []
+    for i, row in enumerate(rows):
+        negatives = [math.exp(scores[i][j]) for j, column in enumerate(columns) if column != row]
+        positives = [math.exp(scores[i][j]) for j, column in enumerate(columns) if column == row]
+        if negatives and positives:
+            total.append(sum(-math.log(p / (p + sum(negatives))) for p in positives) / len(positives))
+    return sum(total) / len(total)
+
+
+def test_the_contrastive_loss_is_what_plain_loops_give():
+    touch, photo = unit(4, 8), unit(6, 8, seed=1)
+    touch_objects, photo_objects = torch.tensor([0, 1, 1, 2]), torch.tensor([0, 0, 1, 2, 3, 1])
+    scale = torch.tensor(math.log(5.0))
+    scores = (5.0 * touch @ photo.T).tolist()
+    rows, columns = touch_objects.tolist(), photo_objects.tolist()
+    transposed = [list(column) for column in zip(*scores, strict=True)]
+    expected = (loss_by_loops(scores, rows, columns) + loss_by_loops(transposed, columns, rows)) / 2
+    got = contrastive_loss(touch, photo, touch_objects, photo_objects, scale)
+    assert got.item() == pytest.approx(expected, rel=1e-5)  # float32 inside
+
+
+def test_photos_of_one_object_are_never_negatives_of_each_other():
+    """Two identical photos of the same object: as negatives of each other they would cost log 2."""
+    touch = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    photo = torch.tensor([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.0]])
+    loss = contrastive_loss(touch, photo, torch.tensor([0, 1]), torch.tensor([0, 0, 1]), torch.tensor(LOG_SCALE_MAX))
+    assert loss.item() < 1e-6
+    naive = torch.nn.functional.cross_entropy(100 * touch[:1] @ photo.T, torch.tensor([0]))
+    assert naive.item() == pytest.approx(math.log(2), rel=1e-5)
+
+
+def test_a_batch_of_one_object_has_no_contrast_and_no_nan():
+    touch = unit(3, 4).float().requires_grad_()
+    same = torch.zeros(3, dtype=torch.long)
+    loss = contrastive_loss(touch, unit(3, 4, seed=2).float(), same, same, torch.tensor(0.0))
+    loss.backward()
+    assert loss.item() == 0.0
+    assert torch.equal(touch.grad, torch.zeros_like(touch))
+
+
+def test_a_row_of_positives_alone_has_nothing_to_pick_from_and_does_not_thin_the_mean():
+    """Rows: two positives; a positive at 1 beside a negative at 3; two negatives. Only the second one counts."""
+    scores = torch.tensor([[5.0, -5.0], [1.0, 3.0], [0.0, 0.0]], requires_grad=True)
+    loss = pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
+    loss.backward()
+    assert loss.item() == pytest.approx(math.log(1 + math.exp(2)), rel=1e-6)
+    assert torch.equal(scores.grad[[0, 2]], torch.zeros(2, 2))
+    assert scores.grad[1].tolist() == pytest.approx([-1 / (1 + math.exp(-2)), 1 / (1 + math.exp(-2))], rel=1e-6)
+
+
+def test_photos_count_where_no_touch_has_both_a_positive_and_a_negative():
+    """One photo of object 0, touches of 0 and 1: the photo picks between them, and the mean halves its loss."""
+    touch, photo = torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([[1.0, 0.0]])
+    loss = contrastive_loss(touch, photo, torch.tensor([0, 1]), torch.tensor([0]), torch.tensor(0.0))
+    assert loss.item() == pytest.approx(math.log(1 + math.exp(-1)) / 2, rel=1e-6)
+
+
+def test_the_hardest_pair_at_the_largest_scale_keeps_its_loss_and_gradient():
+    """Positive at cosine -1, negative at +1, scale 100: the loss is 200; log(num / den + tiny) would stick at 88."""
+    touch = torch.tensor([[1.0, 0.0]], requires_grad=True)
+    photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
+    objects = torch.tensor([0]), torch.tensor([0, 1])
+    loss = contrastive_loss(touch, photo, *objects, torch.tensor(LOG_SCALE_MAX))
+    loss.backward()
+    naive = -torch.log(torch.softmax(torch.tensor([-100.0, 100.0]), 0)[0] + torch.finfo(torch.float32).tiny)
+    assert naive.item() < 88
+    # 200 from touch to photo; nothing from photo to touch, where no photo has a touch of another object.
+    assert loss.item() == pytest.approx(200.0 / 2, rel=1e-4)
+    assert float(touch.grad.abs().sum()) > 50
+
+
+def test_the_match_loss_is_what_the_formula_says():
+    logits, labels = torch.tensor([0.0, 2.0, -1.0]), torch.tensor([1.0, 0.0, 1.0])
+    expected = (math.log(2) + math.log(1 + math.exp(2)) + math.log(1 + math.exp(1))) / 3
+    assert match_loss(logits, labels).item() == pytest.approx(expected, rel=1e-6)
+
+
+def at_angles(*degrees):
+    """Unit vectors of the plane."""
+    radians = torch.tensor(degrees, dtype=torch.float64) * math.pi / 180
+    return torch.stack([radians.cos(), radians.sin()], 1)
+
+
+def sigmoid_loss_by_loops(cosines, rows, columns, scale, bias):
+    total = 0.0
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            sign = 1 if row == column else -1
+            total += math.log(1 + math.exp(-sign * (scale * cosines[i][j] + bias)))
+    return total / len(rows)
+
+
+def test_both_losses_at_known_angles_are_what_two_loops_give():
+    touch, photo = at_angles(0, 90), at_angles(0, 60, 180)
+    cosines = [[1.0, 0.5, -1.0], [0.0, math.sqrt(3) / 2, 0.0]]
+    rows, columns = [0, 1], [0, 1, 0]
+    labels = torch.tensor(rows), torch.tensor(columns)
+    got = sigmoid_loss(touch, photo, *labels, torch.tensor(math.log(3.0)), torch.tensor(-1.0))
+    assert got.item() == pytest.approx(sigmoid_loss_by_loops(cosines, rows, columns, 3.0, -1.0), rel=1e-6)
+    scores = [[3 * cosine for cosine in row] for row in cosines]
+    turned = [list(column) for column in zip(*scores, strict=True)]
+    expected = (loss_by_loops(scores, rows, columns) + loss_by_loops(turned, columns, rows)) / 2
+    got = contrastive_loss(touch, photo, *labels, torch.tensor(math.log(3.0)))
+    assert got.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_sigmoid_loss_starts_near_what_calling_every_pair_false_costs():
+    """Scale 10 and bias -10: of orthogonal pairs only the positives cost; with a bias of 0 every pair would."""
+    touch, photo, objects = torch.eye(16)[:8], torch.eye(16)[8:], torch.arange(8)
+    scale, bias = torch.tensor(SIGMOID_LOG_SCALE_INIT), torch.tensor(SIGMOID_BIAS_INIT)
+    loss = sigmoid_loss(touch, photo, objects, objects, scale, bias)
+    assert loss.item() == pytest.approx(10.0, abs=1e-3)
+
+
+def test_logits_of_ten_thousand_either_way_keep_loss_and_gradient():
+    """Two wrong pairs and two right ones at +-1e4; -log(sigmoid) and exp would be infinite there."""
+    touch = torch.tensor([[1.0, 0.0], [-1.0, 0.0]], requires_grad=True)
+    photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
+    objects, scale = torch.tensor([0, 1]), torch.tensor(math.log(1e4))
+    assert torch.isinf(-torch.log(torch.sigmoid(torch.tensor(-1e4))))
+    for loss in (
+        sigmoid_loss(touch, photo, objects, objects, scale, torch.tensor(0.0)),
+        contrastive_loss(touch, photo, objects, objects, scale),
+    ):
+        (gradient,) = torch.autograd.grad(loss, touch)
+        assert loss.item() == pytest.approx(2e4, rel=1e-4)  # both of a touch's pairs, or the gap between them
+        assert torch.isfinite(gradient).all()
+        assert float(gradient.abs().sum()) > 1e4
+    right = sigmoid_loss(touch, -photo, objects, objects, scale, torch.tensor(0.0))
+    assert right.item() == 0.0
+
+
+@pytest.mark.parametrize("logit", [1e4, -1e4])
+def test_the_match_loss_at_ten_thousand_is_the_logit_or_nothing(logit):
+    assert match_loss(torch.tensor([logit]), torch.tensor([float(logit < 0)])).item() == pytest.approx(1e4)
+    assert match_loss(torch.tensor([logit]), torch.tensor([float(logit > 0)])).item() == 0.0
+
+
+def test_one_touch_and_its_photo_have_a_sigmoid_loss_and_no_contrast():
+    touch, photo, own = at_angles(0), at_angles(60), torch.tensor([0])
+    loss = sigmoid_loss(touch, photo, own, own, torch.tensor(0.0), torch.tensor(0.0))
+    assert loss.item() == pytest.approx(math.log(1 + math.exp(-0.5)), rel=1e-6)
+    assert contrastive_loss(touch, photo, own, own, torch.tensor(0.0)).item() == 0.0
+
+
+def test_an_object_twice_in_a_batch_is_never_its_own_negative():
+    """Pulling its touches and photos together can only lower the loss; as negatives the second ones would raise it."""
+    photo, objects = at_angles(0, 0, 180), torch.tensor([0, 0, 1])
+    scale, bias = torch.tensor(math.log(10.0)), torch.tensor(0.0)
+    together = sigmoid_loss(at_angles(0, 0, 180), photo, objects, objects, scale, bias)
+    apart = sigmoid_loss(at_angles(0, 90, 180), photo, objects, objects, scale, bias)
+    assert together.item() < 0.001 < apart.item()
+    naive = sigmoid_loss(at_angles(0, 0, 180), photo, torch.arange(3), torch.arange(3), scale, bias)
+    assert naive.item() > 5
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_embeddings_lose_only_their_own_rounding(dtype):
+    touch, photo = unit(5, 16), unit(6, 16, seed=1)
+    labels = torch.tensor([0, 1, 2, 3, 3]), torch.tensor([0, 1, 2, 3, 3, 4])
+    scale, bias = torch.tensor(LOG_SCALE_MAX), torch.tensor(-10.0)
+    for loss in (contrastive_loss, lambda *inputs: sigmoid_loss(*inputs, bias)):
+        rounded = loss(touch.to(dtype), photo.to(dtype), *labels, scale)
+        exact = loss(touch.to(dtype).double(), photo.to(dtype).double(), *labels, scale)
+        assert rounded.dtype == torch.float32
+        assert rounded.item() == pytest.approx(exact.item(), rel=1e-5)  # the sums are in float32
+    # What the arithmetic itself would lose at 100 times a cosine, done in half precision:
+    naive = (100 * touch.to(dtype) @ photo.to(dtype).T).double() - 100 * touch.to(dtype).double() @ photo.to(
+        dtype
+    ).T.double()
+    assert naive.abs().max() > 0.005
+
+
+def test_the_listwise_loss_of_match_logits_is_that_of_two_loops():
+    scores = torch.tensor([[2.0, -1.0, 0.5], [0.0, 1.0, 3.0]])
+    touch_objects, photo_objects = torch.tensor([0, 1]), torch.tensor([0, 1, 0])
+
+    def one_way(table, rows, columns):
+        means = []
+        for row, mine in enumerate(rows):
+            others = [math.exp(table[row][c]) for c, theirs in enumerate(columns) if theirs != mine]
+            own = [table[row][c] for c, theirs in enumerate(columns) if theirs == mine]
+            means.append(sum(-math.log(math.exp(s) / (math.exp(s) + sum(others))) for s in own) / len(own))
+        return sum(means) / len(means)
+
+    table = scores.tolist()
+    turned = scores.T.tolist()
+    wanted = (one_way(table, [0, 1], [0, 1, 0]) + one_way(turned, [0, 1, 0], [0, 1])) / 2
+    assert float(listwise_loss(scores, touch_objects, photo_objects)) == pytest.approx(wanted, rel=1e-6)
+    assert torch.isfinite(listwise_loss(scores * 1e4, touch_objects, photo_objects))

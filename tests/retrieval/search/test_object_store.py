@@ -1,0 +1,528 @@
+"""A cluster in an object store: built, torn, killed and fetched, it is the cluster in a folder.
+
+The store is fsspec's in this process; `benchmarks.faults` and one slow test ask a server that speaks S3 (moto).
+"""
+
+import dataclasses
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indexes.errors import CorruptIndex, NoIndex
+from indexes.store.cluster import cluster_file, read_cluster
+from retrieval.commands.main import main
+from retrieval.console.files import cache_folder
+from retrieval.data import storage
+from retrieval.errors import BadInput, StorageError
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search import build_cluster as building
+from retrieval.search import object_store
+from retrieval.search.build_cluster import build_cluster
+from retrieval.search.object_store import StoredCluster
+from retrieval.search.searcher import Searcher
+from tests import s3
+from tests.retrieval.search.test_shards import same_answers
+
+fsspec = pytest.importorskip("fsspec")
+URL = "memory://bucket/cluster"
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch):
+    monkeypatch.setattr(storage, "WAITS_S", (0.0,) * 5)
+
+
+@pytest.fixture
+def store():
+    """An empty object store in this process: {path: its file}."""
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    yield system.store
+    system.store.clear()
+
+
+@pytest.fixture
+def build(catalogue, model):
+    """Builds the catalogue, or another one, in four shards behind the URL."""
+
+    def built(folder=catalogue, shards=4, **how):
+        return build_cluster(folder, load_checkpoint(model), URL, shards, quiet=True, **how)
+
+    return built
+
+
+def another_machine():
+    """This one, without what it keeps."""
+    shutil.rmtree(cache_folder(), ignore_errors=True)
+
+
+def changed(catalogue, folder, times=1):
+    """A copy of the catalogue with so many more photos, each of its own content."""
+    shutil.copytree(catalogue, folder, dirs_exist_ok=True)
+    name = min(path.name for path in folder.iterdir())
+    for number in range(times):
+        data = next(catalogue.glob("*/2.jpg")).read_bytes()
+        (folder / name / f"new-{number}.jpg").write_bytes(data + bytes([number]))  # decoders stop at the end marker
+    return folder
+
+
+# Building and searching -----------------------------------------------------------------------------------------------
+
+
+def test_answers_are_those_of_the_cluster_in_a_folder(build, store, searcher, grasps):
+    report = build()
+    assert (report.index, report.photos, report.embedded, len(report.shards)) == (URL, 24, 24, 4)
+    another_machine()
+    with Searcher.open(URL) as opened:
+        for own in grasps:
+            same_answers(opened.query(own), searcher.query(own))
+
+
+def test_another_machine_embeds_nothing_again_and_puts_nothing(build, store, embedded, monkeypatch):
+    first = build()
+    before = {path: file.created for path, file in store.items()}
+    embedded.clear()
+    another_machine()
+    again = build()
+    assert (again.written, again.generation, again.embedded, embedded) == (False, first.generation, 0, [])
+    assert {path: file.created for path, file in store.items()} == before
+
+
+def test_a_changed_catalogue_puts_the_shards_that_changed_and_keeps_the_generation_before(
+    build, store, catalogue, tmp_path, embedded
+):
+    build()
+    first = set(store)
+    embedded.clear()
+    report = build(changed(catalogue, tmp_path / "c"))  # elsewhere: all shards say so
+    assert (report.written, report.photos, embedded) == (True, 25, [1])
+    assert first <= set(store)
+    second = set(store)
+    build(changed(catalogue, tmp_path / "c", 2))
+    third = StoredCluster(URL)
+    entries = third.parsed(third.manifest()).shards
+    assert third.generations().keys() == {*object_store.names(entries), *_generations(second - first)}
+
+
+def _generations(paths):
+    folders = {path.rpartition("/")[0] for path in paths if path.endswith("/manifest.json")}
+    return {folder.removeprefix("/bucket/cluster/") for folder in folders}
+
+
+def test_another_number_of_shards_takes_the_codes_from_the_store(build, store, embedded):
+    build()
+    embedded.clear()
+    another_machine()
+    report = build(shards=3)
+    assert (report.photos, report.embedded, embedded) == (24, 0, [])
+
+
+def test_what_was_fetched_stays_and_old_generations_go(build, store, catalogue, tmp_path, requests):
+    build()
+    Searcher.open(URL).close()
+    count = requests.count("get_file")
+    assert count >= 4 * 5
+    Searcher.open(URL).close()
+    assert requests.count("get_file") == count
+    for times in (1, 2, 3):
+        build(changed(catalogue, tmp_path / "c", times))
+        Searcher.open(URL).close()
+    kept = list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))
+    assert len(kept) == 4 * object_store.KEPT
+
+
+# Faults ---------------------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """As a signal that nobody catches."""
+
+
+class Requests(list):
+    """What was asked of the store, in order; `rule` is asked first, and may raise, or answer by True."""
+
+    rule = None
+
+
+@pytest.fixture
+def requests(monkeypatch):
+    """The requests of this test."""
+    kind, made = type(fsspec.filesystem("memory")), Requests()
+
+    def counted(name, plain):
+        def asked(self, *words, **how):
+            made.append(name)
+            if made.rule and made.rule(name, *words):
+                return None
+            return plain(self, *words, **how)
+
+        return asked
+
+    for name in ("put_file", "pipe_file", "rm_file", "get_file", "cat_file", "info", "find"):
+        monkeypatch.setattr(kind, name, counted(name, getattr(kind, name)))
+    return made
+
+
+@pytest.mark.slow
+def test_killed_at_any_request_one_cluster_or_the_other_answers_and_nothing_is_embedded_twice(
+    build, store, requests, catalogue, tmp_path, embedded, touch
+):
+    """At twelve requests, evenly, of a build that changes a cluster."""
+    build()
+    before, expected, work = dict(store), Searcher.open(URL).query(touch), tmp_path / "work"
+    folder = changed(catalogue, tmp_path / "c", 2)
+    shutil.copytree(cache_folder(), work)
+    start = len(requests)
+    build(folder)
+    count, seen = len(requests) - start, []
+    for number in np.linspace(0, count - 1, 12).astype(int):
+        another_machine()
+        shutil.copytree(work, cache_folder())
+        store.clear()
+        store.update(before)
+        embedded.clear()
+        end = len(requests) + number + 1
+
+        def killed(*_, end=end):
+            if len(requests) >= end:
+                raise Killed
+
+        requests.rule = killed
+        with pytest.raises(Killed):
+            build(folder)
+        requests.rule = None
+        with Searcher.open(URL) as opened:
+            seen.append(opened.described.photos)
+            if seen[-1] == 24:
+                same_answers(opened.query(touch), expected)
+        report = build(folder)
+        assert (report.photos, sum(embedded)) == (26, 2)
+    assert set(seen) == {24, 26}
+    assert seen == sorted(seen)
+
+
+def test_killed_before_the_first_switch_there_is_no_cluster_and_another_machine_takes_up_what_was_put(
+    build, store, requests, embedded
+):
+    def third_shard(name, *_):
+        if name == "put_file" and sum(name == "put_file" for name in requests) > 14:
+            raise Killed
+
+    requests.rule = third_shard
+    with pytest.raises(Killed):
+        build()
+    requests.rule = None
+    with pytest.raises(NoIndex, match="there is no cluster here"):
+        Searcher.open(URL)
+    whole = [name for name, is_whole in StoredCluster(URL).generations().items() if is_whole]
+    assert 1 <= len(whole) < 4
+    embedded.clear()
+    another_machine()
+    report = build()
+    kept = sum(entry["photos"] for entry in report.shards if any(name.startswith(entry["folder"]) for name in whole))
+    assert (report.photos, sum(embedded)) == (24, 24 - kept)
+
+
+def test_what_is_torn_on_its_way_is_sent_and_fetched_again(build, store, requests, touch):
+    left = {"put_file": 5, "get_file": 5}
+
+    def torn(name, *words):
+        if not left.get(name) or requests.count(name) % 2:
+            return False
+        left[name] -= 1
+        source, target = words
+        if name == "put_file":
+            store_file(target, Path(source).read_bytes()[:-7])
+        else:
+            Path(target).write_bytes(store[source].getvalue()[:-7])
+        return True
+
+    requests.rule = torn
+    build()
+    with Searcher.open(URL) as opened:
+        assert opened.query(touch).index["searched"] == 1.0
+    assert left == {"put_file": 0, "get_file": 0}
+
+
+def store_file(path, content):
+    with fsspec.filesystem("memory").open(path, "wb") as file:
+        file.write(content)
+
+
+def test_a_store_that_refuses_one_request_of_twenty_loses_nothing(build, store, requests, searcher, grasps):
+    refused = []
+
+    def refuse(name, *_):
+        if len(requests) % 20 == 7:
+            refused.append(name)
+            raise OSError("503 Slow Down")
+
+    requests.rule = refuse
+    build()
+    with Searcher.open(URL) as opened:
+        same_answers(opened.query(grasps[0]), searcher.query(grasps[0]))
+    assert len(refused) >= 5
+
+
+def test_a_store_that_goes_on_refusing_is_told_and_the_work_is_kept(build, store, requests, embedded):
+    def refuse(name, *_):
+        if name == "put_file":
+            raise OSError("503 Slow Down")
+
+    requests.rule = refuse
+    with pytest.raises(StorageError, match=r"memory://bucket/cluster/shard-0.*: the storage refused 6 times"):
+        build()
+    requests.rule = None
+    assert sum(embedded) > 0
+    assert build().photos == 24
+    assert sum(embedded) == 24
+
+
+@pytest.mark.parametrize("what", ["halves.npy", "manifest.json", "rows.jsonl"])
+@pytest.mark.parametrize("how", ["torn", "altered", "gone"])
+def test_damage_in_the_store_is_named_and_mended(what, how, build, store, touch):
+    build()
+    path = next(path for path in sorted(store) if path.endswith(f"/{what}"))
+    data = store[path].getvalue()
+    if how == "gone":
+        del store[path]
+    else:
+        content = data[:-100] if how == "torn" else data[:-100] + bytes(100)
+        store_file(path, content)
+    with pytest.raises(CorruptIndex, match=rf"memory://bucket/cluster/shard-0.*{what} (is missing|has|was altered)"):
+        Searcher.open(URL)
+    build(verify=how == "altered")
+    assert store[path].getvalue() == data
+    with Searcher.open(URL) as opened:
+        assert opened.query(touch).index["searched"] == 1.0
+
+
+def test_damage_that_another_machine_finds_is_embedded_again(build, store, embedded):
+    build()
+    path = next(path for path in sorted(store) if path.endswith("/halves.npy"))
+    store_file(path, b"torn")
+    another_machine()
+    embedded.clear()
+    report = build()
+    assert report.photos == 24
+    assert 0 < report.embedded == sum(embedded) < 24
+    another_machine()
+    with Searcher.open(URL) as opened:
+        assert opened.described.photos == 24
+
+
+def test_of_two_builds_at_once_the_one_that_comes_second_is_told(build, store, catalogue, tmp_path, monkeypatch, touch):
+    build()
+    run = building.one_after_another
+    other = changed(catalogue, tmp_path / "other", 2)
+
+    def meanwhile(jobs, checkpoint):
+        found = list(run(jobs, checkpoint))
+        monkeypatch.setattr(building, "one_after_another", run)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # another machine
+        build(other)
+        return found
+
+    monkeypatch.setattr(building, "one_after_another", meanwhile)
+    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+        build(changed(catalogue, tmp_path / "c"))
+    with Searcher.open(URL) as opened:
+        assert opened.described.photos == 26
+        assert opened.query(touch).index["searched"] == 1.0
+
+
+def test_of_two_first_builds_that_both_looked_one_makes_the_cluster_and_the_other_adds_to_it(
+    build, store, catalogue, tmp_path, requests, embedded, monkeypatch
+):
+    """The second switches between the last look of the first and its switch."""
+    mine, theirs = (changed(catalogue, tmp_path / name, times) for name, times in (("mine", 1), ("theirs", 2)))
+
+    def meanwhile(name, path, *_):
+        if name == "pipe_file" and path.endswith("/CLUSTER.json"):
+            requests.rule = None
+            with monkeypatch.context() as elsewhere:
+                elsewhere.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # another machine
+                build(theirs)
+
+    requests.rule = meanwhile
+    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+        build(mine)
+    with Searcher.open(URL) as opened:
+        assert opened.described.photos == 26
+    embedded.clear()
+    report = build(mine)
+    assert (report.generation, report.photos, embedded) == ("cluster-000002", 25, [])
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_forged_digest_leads_nowhere(build, store, cluster):
+    build()
+    manifest = read_cluster(cluster)
+    entry = dataclasses.replace(manifest.shards[0], sha256="../../../elsewhere")
+    forged = dataclasses.replace(manifest, shards=[entry])
+    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", cluster_file(forged))
+    with pytest.raises(CorruptIndex, match=r"memory://bucket/cluster: .*shards is not what the format says"):
+        Searcher.open(URL)
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"no JSON", b"[" * 100_000, b"x" * (object_store.MOST_BYTES + 1)])
+def test_a_manifest_that_is_none_is_refused_in_a_sentence(content, store):
+    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", content)
+    with pytest.raises((CorruptIndex, StorageError), match="memory://bucket/cluster"):
+        Searcher.open(URL)
+
+
+def test_urls_that_are_none_are_refused(tmp_path):
+    with pytest.raises(BadInput, match="is a folder of this machine"):
+        StoredCluster(f"file://{tmp_path}")
+    with pytest.raises(BadInput, match="cannot be opened"):
+        StoredCluster("nosuch://bucket/cluster")
+
+
+def test_commands_take_a_url(store, catalogue, model, touch, capsys):
+    build = ["build-index", str(catalogue), "--model", str(model), "--out", URL]
+    assert main([*build, "--preview"]) == 2
+    assert main(build) == 0
+    assert len(StoredCluster(URL).generations()) == 1
+    assert main([*build, "--shards", "3"]) == 0
+    assert main(build) == 0
+    capsys.readouterr()
+    query = ["query", "--gelsight", *map(str, touch), "--json"]
+    assert main([*query, "--index", URL]) in (0, 3, 4)
+    named = capsys.readouterr().out
+    assert main(query) in (0, 3, 4)  # the one built last
+    assert '"path": "memory://bucket/cluster"' in named
+    assert '"path": "memory://bucket/cluster"' in capsys.readouterr().out
+    assert main([*query, "--index", "memory://bucket/nowhere"]) != 0
+    assert "there is no cluster here; run `retrieve build-index" in capsys.readouterr().err
+
+
+# A real S3 server -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
+    s3_server, catalogue, model, searcher, grasps
+):
+    s3.put(catalogue, "photos/catalog")
+    s3_server.refuse, s3_server.tear = 20, 7
+    url = "s3://photos/cluster"
+    report = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
+    assert (report.photos, report.embedded, report.skipped) == (24, 24, [])
+    assert s3_server.refused
+    assert s3_server.torn
+    another_machine()
+    with Searcher.open(url) as opened:
+        for own in grasps:
+            ours, theirs = opened.query(own), searcher.query(own)
+            assert [match.photo for match in ours.results] == [match.photo for match in theirs.results]
+    again = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
+    assert (again.written, again.embedded) == (False, 0)
+
+
+@pytest.fixture
+def switches(s3_server, cluster):
+    """Two builds that have both looked at a cluster on S3, one that was there or none: what each would put, and a
+    function that has the first switch, the second doing so between the first one's last look and its request."""
+    s3_server.refuse = s3_server.tear = None
+    s3.put(cluster, "photos/else")
+    manifest = read_cluster(cluster)
+    mine, theirs = (dataclasses.replace(manifest, about={"catalogue": name}) for name in ("mine", "theirs"))
+
+    def switch(url, before):
+        first, second = StoredCluster(url), StoredCluster(url)
+        if before:
+            first.switch(None, manifest)
+        seen, put, left = first.manifest(), first._system.pipe_file, [theirs]
+
+        def meanwhile(path, content, **how):
+            if left:
+                second.switch(seen, left.pop())
+            put(path, content, **how)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(first._system, "pipe_file", meanwhile)
+            first.switch(seen, mine)
+
+    yield switch, mine, theirs
+    s3_server.conditions = "honoured"
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("before", [False, True], ids=["created", "replaced"])
+def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_server):
+    if before:
+        pytest.importorskip("moto", "5.1.5", reason="this moto replaces a file whatever the condition")
+    switch, _, theirs = switches
+    url = f"s3://photos/raced-{before}"
+    with pytest.raises(StorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
+        switch(url, before)
+    assert StoredCluster(url).manifest() == cluster_file(theirs)
+    assert s3_server.conditional >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("conditions", ["unknown", "ignored"])
+def test_a_store_without_conditional_writes_is_looked_at_before_the_switch(conditions, switches, s3_server):
+    """Between that look and the switch it cannot be helped: the second to switch stays."""
+    switch, mine, theirs = switches
+    s3_server.conditions = conditions
+    url = f"s3://photos/{conditions}"
+    switch(url, True)
+    stored = StoredCluster(url)
+    assert stored.manifest() == cluster_file(mine)
+    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+        stored.switch(b"an older one", theirs)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_server):
+    _, mine, theirs = switches
+    stored = StoredCluster("s3://photos/torn")
+    stored.switch(None, theirs)
+    seen, put, failures = stored.manifest(), stored._system.pipe_file, ["torn", "not answered"]
+
+    def failing(path, content, **how):
+        torn = failures and failures.pop(0) == "torn"
+        put(path, content[:100] if torn else content, **how)
+        if not torn:
+            raise OSError("the line was cut")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stored._system, "pipe_file", failing)
+        stored.switch(seen, mine)
+    assert (stored.manifest(), failures) == (cluster_file(mine), [])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Ray's own warnings
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
+def test_ray_builds_into_and_holds_a_cluster_on_s3(s3_server, catalogue, model, searcher, grasps):
+    """Whoever holds a shard fetches it."""
+    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.session import connected
+
+    s3_server.refuse = s3_server.tear = None
+    s3.put(catalogue, "photos/catalog")
+    with connected(2) as ray:
+        url, checkpoint = "s3://photos/by-ray", load_checkpoint(model)
+        report = build_cluster("s3://photos/catalog", checkpoint, url, 2, quiet=True, run=by_ray(workers=1))
+        assert (report.photos, report.embedded) == (24, 24)
+        another_machine()
+        held = Deployments(ray, Held(cpus=0.1, wait_s=120.0))
+        with Searcher.open(url, shards=held.open) as opened:
+            for own in grasps:
+                ours, theirs = opened.query(own), searcher.query(own)
+                assert [match.object_id for match in ours.results] == [match.object_id for match in theirs.results]
+                assert ours.index["searched"] == 1.0
+        held.close()
+    assert len(list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))) == 2

@@ -1,0 +1,133 @@
+"""`build-index` stopped or killed at any moment: what was embedded until then is not embedded again."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indexes.store.folder import IndexStore
+from indexes.store.unfinished import FOLDER
+from retrieval.commands.main import main
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search import embed
+from retrieval.search.build import build_index
+
+PHOTOS, BATCH = 24, 4
+
+KILLED = """
+import os, signal, sys, torch
+from pathlib import Path
+from retrieval.model import photo_encoder
+from retrieval.search import embed
+from retrieval.search.build import build_index
+from retrieval.model.checkpoint import load_checkpoint
+
+catalogue, model, index, fatal, batch = sys.argv[1:]
+torch.set_num_threads(1)
+embed.BATCH, encode, calls = int(batch), photo_encoder.encode_photos, []
+
+def counted(*arguments):
+    calls.append(1)
+    if len(calls) == int(fatal):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return encode(*arguments)
+
+photo_encoder.encode_photos = counted
+build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=True)
+"""
+
+
+def killed(catalogue, model, index, call):
+    """Build in a process that SIGKILL ends as it encodes its batch number `call`."""
+    arguments = [sys.executable, "-c", KILLED, *map(str, (catalogue, model, index, call, BATCH))]
+    done = subprocess.run(arguments, capture_output=True, timeout=300, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+
+
+def same(one, other):
+    """Both generations hold the same rows, and what is made of them; another batch sums in another order."""
+    assert one.rows == other.rows
+    np.testing.assert_allclose(one.arrays["halves"][:], other.arrays["halves"][:], rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(one.embeddings[one.slots], other.embeddings[other.slots], atol=1e-5)
+
+
+@pytest.mark.parametrize("call", [1, 2, 6])
+def test_a_first_build_that_was_killed_goes_on_where_it_was(call, own, model, tmp_path, embedded):
+    index, checkpoint = tmp_path / "index", load_checkpoint(model)
+    killed(own, model, index, call)
+    assert not (index / "CURRENT").exists()
+    left = BATCH * (call - 1)
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert sum(embedded) == PHOTOS - left
+    assert (report.embedded, report.resumed, report.reused) == (PHOTOS - left, left, left)
+    assert not (index / FOLDER).exists()
+    assert list(index.glob("*.tmp-*")) == []
+    whole = build_index(own, checkpoint, tmp_path / "whole", quiet=True)
+    same(IndexStore(index).open(), IndexStore(tmp_path / "whole").open())
+    assert report.half_error == pytest.approx(whole.half_error, rel=0.05)  # the batches were others
+
+
+def test_two_kills_one_after_the_other_lose_nothing_though_photos_are_renamed_between(own, model, tmp_path, embedded):
+    index = tmp_path / "index"
+    killed(own, model, index, 3)
+    for number, photo in enumerate(sorted(own.rglob("*.jpg"))):
+        photo.rename(photo.with_name(f"again{number}.jpg"))
+    killed(own, model, index, 3)
+    report = build_index(own, load_checkpoint(model), index, quiet=True)
+    assert (sum(embedded), report.resumed) == (PHOTOS - 4 * BATCH, 4 * BATCH)
+
+
+def test_a_killed_rebuild_leaves_the_old_index_and_what_it_had_embedded(own, model, tmp_path, embedded):
+    index, checkpoint = tmp_path / "index", load_checkpoint(model)
+    objects = sorted(own.iterdir())
+    away = shutil.move(objects[0], tmp_path / "away")
+    build_index(own, checkpoint, index, quiet=True)
+    shutil.move(away, objects[0])
+    for path in objects[1].iterdir():
+        path.write_bytes(path.read_bytes() + b"other content, the same picture")
+    killed(own, model, index, 2)
+    assert IndexStore(index).open().count == PHOTOS - 3
+    embedded.clear()
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (sum(embedded), report.embedded, report.resumed, report.reused) == (2, 2, 4, 22)
+    assert "2 embedded, 4 from a build that was cut off, 18 unchanged, 0 removed" in next(report.lines())
+
+
+def test_what_another_model_left_is_not_taken(own, model, tmp_path, embedded):
+    index, other = tmp_path / "index", tmp_path / "other.safetensors"
+    killed(own, model, index, 4)
+    from tests.retrieval.search.test_build import changed_model
+
+    report = build_index(own, changed_model(load_checkpoint(model), other), index, quiet=True)
+    assert (sum(embedded), report.resumed) == (PHOTOS, 0)
+    assert not (index / FOLDER).exists()
+
+
+def test_ctrl_c_keeps_what_was_embedded_and_says_so(own, model, tmp_path, embedded, monkeypatch, capsys):
+    index, keep = tmp_path / "index", embed.Unfinished.keep
+
+    def interrupted(self, *arguments):
+        keep(self, *arguments)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(embed.Unfinished, "keep", interrupted)
+    command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
+    assert main(command) == 1
+    assert f"what was embedded is kept in {index}; the same command goes on with it" in capsys.readouterr().err
+    done = sum(embedded)
+    monkeypatch.setattr(embed.Unfinished, "keep", keep)
+    assert main(command) == 0
+    assert sum(embedded) == PHOTOS
+    assert done >= 16
+
+
+def test_an_index_without_leftovers_is_what_a_build_leaves(own, model, tmp_path):
+    index = tmp_path / "index"
+    build_index(own, load_checkpoint(model), index, quiet=True)
+    assert sorted(path.name for path in index.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
+    assert not Path(index / FOLDER).exists()

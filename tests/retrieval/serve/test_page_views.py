@@ -1,0 +1,265 @@
+"""The page in a real browser: what people say, the history, the catalogue, the human test. Each sentence is a click."""
+
+import io
+import json
+import zipfile
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+
+from benchmarks.models.next_grasp import another_grasp
+from retrieval.search.searcher import Searcher
+from robot.recording.folder import RecordingWriter
+from tests import synthetic
+from tests.browser import address, ask, chromium, gel_files, page, serious
+
+pytestmark = pytest.mark.slow
+MANY = 100_000
+INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def files(touch, tmp_path_factory):
+    return gel_files(tmp_path_factory.mktemp("gels"), touch)
+
+
+@pytest.fixture(scope="module")
+def url(index, tmp_path_factory):
+    """A service that keeps what it is told, with a recording of twelve objects that the model never saw."""
+    folder = tmp_path_factory.mktemp("kept")
+    unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
+    with (
+        RecordingWriter(folder / "recording", INFO) as writer,
+        address(index, None, writer, unseen, history=folder) as found,
+    ):
+        yield found
+
+
+@pytest.fixture
+def opened(browser, url):
+    with page(browser, url) as found:
+        yield found
+
+
+def to(opened, name):
+    """Another view, by its link."""
+    opened.get_by_role("navigation").get_by_role("link", name=name).click()
+
+
+def test_how_the_answer_changed_grasp_by_grasp_is_drawn_and_told_in_numbers(opened, files):
+    ask(opened, files)
+    section = opened.get_by_role("region", name="Grasp by grasp")
+    section.get_by_text("changed the answer most").wait_for()
+    assert section.locator("svg .none circle").count() == 2  # after one grasp, after two
+    section.get_by_text("As numbers").click()
+    assert section.get_by_role("columnheader").all_inner_texts() == ["Object", "Grasp 1", "Grasp 2"]
+    last = section.get_by_role("row", name="None of these").get_by_role("cell").last.inner_text()
+    assert last == opened.locator(".photo.none .p").inner_text()
+
+
+def test_which_grasp_would_tell_most_by_itself_is_said_in_bits(opened, files, index):
+    with Searcher.open(index) as searcher:
+        expected = [divergence_bits(searcher.query([files[at : at + 2]], top=100)) for at in (0, 2)]
+    ask(opened, files)
+    section = opened.get_by_role("region", name="Grasp by grasp")
+    said = section.get_by_text("would tell most").inner_text()
+    assert f"grasp {1 + int(np.argmax(expected))} would tell most: {max(expected):.1f} of the 4.0 bits" in said
+    section.get_by_text("As numbers").click()
+    row = section.get_by_role("row", name="The grasp by itself tells").get_by_role("cell")
+    assert [float(text.split()[0]) for text in row.all_inner_texts()] == pytest.approx(expected, abs=0.0051)
+
+
+def divergence_bits(answer):
+    """Of the probabilities of eight objects and none from those before, 1/16 each and 1/2."""
+    now = np.array([*(match.probability for match in answer.results), answer.none_probability])
+    before = np.array([1 / 16] * 8 + [1 / 2])
+    return float(np.sum(now * np.log2(now / before)))
+
+
+@pytest.mark.parametrize("grasps", [1, 2])
+def test_what_another_grasp_may_be_expected_to_tell_is_said_in_bits(opened, files, index, grasps):
+    with Searcher.open(index) as searcher:
+        expected, left, weight = another_grasp(searcher.query([files[at : at + 2] for at in (0, 2)][:grasps], top=100))
+    ask(opened, files[: 2 * grasps])
+    said = opened.get_by_role("region", name="Another grasp").inner_text()
+    about = f"about {expected:.2f} of the {left:.1f} bits" if expected >= 0.005 else "hardly anything"
+    assert f"would tell {about}" in said
+    assert f"{grasps + 1} grasps of one object weigh as much as {weight:.2f} independent ones" in said
+    assert "the matcher cannot say" in said
+
+
+def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):
+    ask(opened, files)
+    opened.get_by_role("button", name="It was another object").click()
+    name = opened.locator(".photo.object .name").nth(2).inner_text()
+    opened.get_by_label("Which object was it?").fill(name)
+    opened.get_by_role("list", name="Objects", exact=True).get_by_role("button", name=name).click()
+    opened.get_by_text(f"Said to be {name}.").wait_for()
+    to(opened, "History")
+    opened.get_by_label("Show", exact=True).select_option("Said to be another object")
+    row = opened.locator(".query", has_text=f"Said to be {name}").first
+    row.wait_for()
+    row.get_by_role("link").click()
+    opened.locator(".answer").get_by_text(f"Said to be {name}.").wait_for()
+    assert opened.get_by_alt_text("Gel image").count() == 4
+
+
+@pytest.mark.parametrize(
+    ("button", "told"), [("Right", "Said to be right."), ("None of the catalogue", "Said to be none of these.")]
+)
+def test_right_and_none_are_a_click_each_and_the_history_shows_them(opened, files, button, told):
+    opened.get_by_text("Options").click()
+    prior = opened.get_by_label("Chance, before anything is felt, that the catalogue lacks it")
+    prior.fill("0.001")  # so that an object is the answer, of which both can be said
+    prior.blur()
+    ask(opened, files)
+    asked = opened.get_by_role("region", name="Was this right?")
+    asked.get_by_role("button", name=button, exact=True).click()
+    opened.get_by_text(told).wait_for()
+    assert asked.get_by_role("button").count() == 0
+    to(opened, "History")
+    opened.locator(".query").first.get_by_text(told.removesuffix(".")).wait_for()
+
+
+def test_the_history_is_searched_and_exported(opened, files):
+    ask(opened, files[:2])
+    to(opened, "History")
+    opened.locator(".query").first.wait_for()
+    opened.get_by_role("searchbox", name="Search").fill("what nobody ever said")
+    opened.get_by_text("Nothing was found.").wait_for()
+    opened.get_by_role("searchbox", name="Search").fill("")
+    opened.locator(".query").first.wait_for()
+    with opened.expect_download() as download:
+        opened.get_by_role("link", name="Export all").click()
+    with zipfile.ZipFile(io.BytesIO(download.value.path().read_bytes())) as archive:
+        assert "history.jsonl" in archive.namelist()
+        assert len(archive.read("history.jsonl").splitlines()) >= 1
+
+
+def test_touches_that_feel_alike_are_found_from_a_touch(opened, files):
+    ask(opened, files[:2])
+    ask(opened, files[2:])
+    to(opened, "History")
+    opened.get_by_role("button", name="Alike").first.click()
+    opened.get_by_role("heading", name="Touches that feel like this one to the model").wait_for()
+    opened.get_by_role("region", name="Touches that feel alike").locator(".query").first.wait_for()
+
+
+def test_the_catalogue_is_searched_and_its_photos_lead_to_their_neighbours(opened, catalogue):
+    name = sorted(path.name for path in catalogue.iterdir() if path.is_dir())[0]
+    to(opened, "Catalogue")
+    opened.locator(".grid li").nth(23).wait_for()
+    opened.get_by_role("searchbox", name="Search").fill(f"{name} 2.jpg")
+    opened.get_by_text("1 photo found").wait_for()
+    opened.locator(".grid button").click()
+    dialog = opened.get_by_role("dialog", name=name)
+    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
+    assert dialog.get_by_role("button", name="Where it agrees").count() == 0  # with no touch
+    dialog.locator(".alike button").first.click()
+    opened.get_by_role("dialog").locator(".alike li").first.wait_for()
+    opened.keyboard.press("Escape")
+    opened.get_by_role("searchbox", name="Search").fill("no such words")
+    opened.get_by_text("No photo of the catalogue has all these words.").wait_for()
+    assert opened.locator(".grid li").count() == 0
+
+
+@pytest.fixture
+def many(opened):
+    """The page, whose service says that it has 100,000 photos; and the offsets that were asked for."""
+    offsets = []
+
+    def listed(route):
+        asked = {name: values[0] for name, values in parse_qs(urlsplit(route.request.url).query).items()}
+        offset, limit = int(asked.get("offset", 0)), int(asked["limit"])
+        offsets.append(offset)
+        last = min(MANY, offset + limit)
+        items = [{"id": f"o{one}/1.jpg", "object_id": f"object {one}", "metadata": {}} for one in range(offset, last)]
+        document = {"generation": "g", "total": MANY, "offset": offset, "next": None, "items": items}
+        route.fulfill(content_type="application/json", body=json.dumps(document))
+
+    picture = synthetic._jpeg(synthetic.draw_background(1))
+    opened.route("**/v1/catalogue*", listed)
+    opened.route("**/v1/thumbnails/**", lambda route: route.fulfill(content_type="image/jpeg", body=picture))
+    return opened, offsets
+
+
+def test_of_100_000_photos_those_on_the_screen_are_drawn_and_their_pages_asked_for(many):
+    opened, offsets = many
+    to(opened, "Catalogue")
+    opened.get_by_text("100,000 photos of").wait_for()
+    opened.locator(".grid li").first.wait_for()
+    assert opened.locator(".grid li").count() < 100
+    for share in (0.5, 0.99, 0.2):
+        opened.evaluate("(share) => scrollTo(0, share * document.documentElement.scrollHeight)", share)
+        opened.wait_for_timeout(300)
+        opened.locator(".grid li").first.wait_for()
+        opened.locator(".grid button").last.get_by_text("object ").wait_for()
+        places = [int(one) for one in opened.locator(".grid li").evaluate_all("all => all.map((o) => o.dataset.place)")]
+        assert len(places) < 120
+        assert max(places) == pytest.approx(share * MANY, rel=0.02)
+    assert len(set(offsets)) < 12  # of 500 pages
+
+
+def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
+    opened, _ = many
+    to(opened, "Catalogue")
+    opened.locator(".grid button").first.focus()
+    opened.keyboard.press("ArrowRight")
+    focus = "document.activeElement.innerText"
+    opened.locator(".grid button:focus", has_text="object 1").wait_for()
+    opened.keyboard.press("End")
+    opened.locator(".grid button:focus", has_text="object 99999").wait_for()
+    assert opened.evaluate("document.activeElement.closest('li').getAttribute('aria-posinset')") == str(MANY)
+    opened.keyboard.press("Home")
+    opened.locator(".grid button:focus", has_text="object 0").wait_for()
+    assert opened.evaluate(focus).strip() == "object 0"
+
+
+def test_ten_choices_are_made_by_mouse_and_by_key_and_the_result_stands_beside_the_models(opened):
+    to(opened, "Test")
+    opened.get_by_role("button", name="Begin").wait_for()
+    assert opened.locator("main").get_by_text("false", exact=True).count() == 0
+    opened.get_by_label("Trials").fill("2")
+    opened.get_by_label("Your name, if you like").fill("Ada")
+    opened.get_by_role("button", name="Begin").click()
+    photos = opened.get_by_role("list", name="Photos to choose from").get_by_role("button")
+    photos.nth(9).wait_for()
+    assert (photos.count(), opened.get_by_alt_text("Gel image of finger").count()) == (10, 2)
+    photos.nth(3).click()
+    opened.get_by_role("button", name="Next").click()
+    opened.get_by_text("Trial 2 of 2").wait_for()
+    opened.keyboard.press("0")
+    opened.get_by_role("button", name="The result").click()
+    opened.get_by_role("heading", name="The result").wait_for()
+    assert opened.locator(".score .p").count() == 2
+    assert all(" of 2, " in text and "[" in text for text in opened.locator(".score .p").all_inner_texts())
+    opened.get_by_role("link", name="All series, and another one").click()
+    opened.locator(".series").get_by_text("Ada").first.wait_for()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_axe_finds_nothing_serious_in_any_view_and_none_is_wider_than_the_screen(browser, url, files, width, scheme):
+    with page(browser, url, width, color_scheme=scheme) as opened:
+        ask(opened, files)
+        opened.get_by_text("As numbers").click()
+        opened.get_by_role("button", name="It was another object").click()
+        opened.locator(".names button").first.wait_for()
+        for name, shown in (("", ""), ("Catalogue", ".grid li"), ("History", ".query"), ("Test", ".begin")):
+            if name:
+                to(opened, name)
+                opened.locator(shown).first.wait_for()
+            assert serious(opened) == [], name
+            assert opened.evaluate("document.documentElement.scrollWidth") <= width, name
+        opened.get_by_role("button", name="Begin").click()
+        opened.locator(".choices-grid").wait_for()
+        opened.keyboard.press("1")
+        opened.get_by_role("button", name="Next").wait_for()
+        assert serious(opened) == []

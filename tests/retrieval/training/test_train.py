@@ -1,0 +1,628 @@
+"""Training: shared images, resumption bit for bit, interruption, frozen towers, and ranks that equal one process."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
+from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
+from retrieval.model.checkpoint import load_checkpoint, read_tensors
+from retrieval.model.fusion import Matcher
+from retrieval.model.losses.contrastive import contrastive_loss
+from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.match import match_loss
+from retrieval.training import distil
+from retrieval.training.batches import FrozenFeatures, TrainedFeatures
+from retrieval.training.judgement import with_verdicts
+from retrieval.training.step import batch_loss, shuffle_fingers
+from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
+from tests.conftest import TINY
+from tests.labelled import label_recording
+from tests.waiting import running, until
+
+CPU = torch.device("cpu")
+
+
+def with_training(config, **changes):
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, **changes))
+
+
+def trainer_for(recording, out, config=TINY):
+    grasps = load_grasps(recording)
+    return Trainer(config, make_split(grasps, validation=0.25, test=0.2, seed=0), grasps, out, source="test")
+
+
+def same_weights(left, right):
+    return all(torch.equal(left[name], right[name]) for name in left)
+
+
+def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, monkeypatch):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors")
+    batch = trainer.sampler.batch(0, 4)
+    assert len(batch.labels) == 16  # pairs, of 4 touches and no more than 16 photos
+    counts = {"touch": 0, "photo": 0}
+    for name, tower in (("touch", trainer.matcher.touch_tower), ("photo", trainer.matcher.photo_tower)):
+        tower.register_forward_hook(
+            lambda _, images, __, name=name: counts.update({name: counts[name] + len(images[0])})
+        )
+    with trainer.features as features:
+        trainer.loss(features.prepare(trainer.matcher, batch).result())
+    assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
+
+
+def test_labelled_pairs_train_and_never_validate(recording, tmp_path):
+    config = with_training(TINY, **label_recording(recording, tmp_path))
+    trainer, alone = (trainer_for(recording, tmp_path / "m.safetensors", each) for each in (config, TINY))
+    assert len(trainer.sampler.objects) == len(alone.sampler.objects) + 12
+    assert {name for name in trainer.sampler.objects if not name.startswith("like ")} == set(alone.sampler.objects)
+    assert trainer.validation.grasps == alone.validation.grasps
+    assert trainer.data_digest != alone.data_digest
+    assert trainer.split == alone.split
+
+
+def test_labelled_photos_without_touches_are_refused():
+    with pytest.raises(ConfigError, match="labelled photos are paired with labelled touches"):
+        with_training(TINY, photos="photos")
+
+
+def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
+    """Without the contrastive term and dropout: exactly the paper's loss."""
+    config = with_training(TINY, weights={}, precision="float32")
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, standardise=False, dropout=0.0))
+    torch.manual_seed(0)
+    matcher = build_matcher(config)
+    sampler = PairSampler(load_grasps(recording), seed=0)
+    with TrainedFeatures(config, CPU) as source:
+        loaded = source.prepare(matcher, sampler.batch(0, 3)).result()
+        loss, logits = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
+    batch = loaded.batch
+    one_by_one = torch.cat(
+        [
+            matcher(loaded.touches[touch][None], loaded.photos[photo][None])
+            for touch, photo in zip(batch.touch_index, batch.photo_index, strict=True)
+        ]
+    )
+    torch.testing.assert_close(logits, one_by_one, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(loss, match_loss(one_by_one, torch.from_numpy(batch.labels)), rtol=1e-5, atol=1e-6)
+
+
+def test_each_loss_of_the_table_is_added_with_its_weight(recording):
+    config = with_training(TINY, weights={"contrastive": 0.3, "listwise": 0.7}, precision="float32")
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, dropout=0.0))
+    torch.manual_seed(0)
+    matcher = build_matcher(config)
+    with TrainedFeatures(config, CPU) as source:
+        loaded = source.prepare(matcher, PairSampler(load_grasps(recording), seed=0).batch(0, 3)).result()
+        features = [part.detach() for part in source.train_features(matcher, loaded)]
+    matcher.eval()
+    loss, logits = batch_loss(matcher, config.training, loaded.batch, *features)
+    touch, photo = matcher.touch_code(features[0]), matcher.photo_code(features[1])
+    objects = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
+    expected = match_loss(logits, torch.from_numpy(loaded.batch.labels))
+    expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
+    expected = expected + 0.7 * listwise_loss(matcher.head(touch.half[:, None], photo.half[None]), *objects)
+    assert loss.item() == expected.item()
+
+
+def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording, tmp_path):
+    out = tmp_path / "m.safetensors"
+    train(recording, out, with_training(TINY, weights={}), quiet=True)
+    torch.manual_seed(TINY.training.seed)
+    first = build_matcher(TINY).state_dict()
+    last = load_checkpoint(out).matcher.state_dict()
+    assert torch.equal(first["touch_projection.weight"], last["touch_projection.weight"])
+    assert torch.equal(first["log_scale"], last["log_scale"])
+    assert not torch.equal(first["head.second.weight"], last["head.second.weight"])
+
+
+def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recording, tmp_path):
+    whole, parts = trainer_for(recording, tmp_path / "a.safetensors"), tmp_path / "b.safetensors"
+    whole.run(quiet=True)
+    broken = trainer_for(recording, parts)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(broken, 3)
+    resumed = trainer_for(recording, parts)
+    resumed.resume()
+    assert resumed.step == 3
+    resumed.run(quiet=True)
+    assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
+    assert whole.best == resumed.best
+    assert (tmp_path / "a.safetensors").read_bytes() == parts.read_bytes()
+    assert not state_path(parts).exists()
+
+
+PRUNED = dataclasses.replace(
+    with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, pruner_width=8)
+)
+TINY_UNPRUNED = dataclasses.replace(PRUNED, matcher=TINY.matcher)
+
+
+def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, tmp_path):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", PRUNED)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(trainer, 4)
+    underway = load_checkpoint(trainer.out)
+    assert underway.config == TINY_UNPRUNED
+    assert underway.queries is None
+    trainer = trainer_for(recording, trainer.out, PRUNED)
+    trainer.run(quiet=True)
+    made = load_checkpoint(trainer.out)
+    assert made.config == PRUNED
+    assert made.matcher.pruner is not None
+    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.half)
+    assert not state_path(trainer.out).exists()
+
+
+def test_a_pruner_changes_nothing_else_that_training_makes(recording, tmp_path):
+    for name, config in (("a", PRUNED), ("b", TINY)):
+        trainer_for(recording, tmp_path / f"{name}.safetensors", config).run(quiet=True)
+    with_one, without = (load_checkpoint(tmp_path / f"{name}.safetensors").matcher.state_dict() for name in "ab")
+    assert same_weights(without, with_one)
+    assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"pruner"}
+
+
+def power_cut(*_, **__):
+    raise RuntimeError("power cut")
+
+
+def power_cut_before_deleting(path):
+    unlink = Path.unlink
+
+    def guarded(file, missing_ok=False):
+        return power_cut() if file == path else unlink(file, missing_ok)
+
+    return guarded
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_a_power_cut_while_the_pruner_is_taught_changes_no_bit(written, recording, tmp_path, monkeypatch):
+    """Before its checkpoint is written, and after that, while the state of the training still lies there."""
+    trainer_for(recording, tmp_path / "a.safetensors", PRUNED).run(quiet=True)
+    broken = trainer_for(recording, tmp_path / "b.safetensors", PRUNED)
+    with monkeypatch.context() as cut:
+        if written:
+            cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
+        else:
+            cut.setattr("retrieval.training.distil.order_loss", power_cut)
+        with pytest.raises(RuntimeError, match="power cut"):
+            broken.run(quiet=True)
+    assert (load_checkpoint(broken.out).matcher.pruner is not None) == written
+    resumed = trainer_for(recording, broken.out, PRUNED)
+    resumed.resume()
+    assert resumed.step == PRUNED.training.iterations
+    resumed.run(quiet=True)
+    assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
+    assert not state_path(broken.out).exists()
+
+
+def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_one(recording, tmp_path, monkeypatch):
+    out, taught = tmp_path / "m.safetensors", distil.order_loss
+
+    def interrupted(*given):
+        os.kill(os.getpid(), signal.SIGINT)
+        return taught(*given)
+
+    monkeypatch.setattr("retrieval.training.distil.order_loss", interrupted)
+    with pytest.raises(
+        Interrupted, match=r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
+    ):
+        train(recording, out, PRUNED, quiet=True)
+    left = load_checkpoint(out)
+    assert left.config == TINY_UNPRUNED
+    assert left.posterior is None
+    monkeypatch.undo()
+    made = train(recording, out, PRUNED, resume=True, quiet=True)
+    assert made.config == PRUNED
+    assert made.posterior is not None
+
+
+def test_ctrl_c_while_the_posterior_is_fitted_leaves_a_checkpoint_that_resuming_completes(
+    recording, tmp_path, monkeypatch
+):
+    whole, broken = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    train(recording, whole, TINY, quiet=True)
+    with monkeypatch.context() as interrupting:
+        interrupting.setattr("retrieval.training.train.with_verdicts", interrupted_before(with_verdicts))
+        with pytest.raises(Interrupted, match=r"before the checkpoint was complete; .* ranks photos"):
+            train(recording, broken, TINY, quiet=True)
+    assert load_checkpoint(broken).posterior is None
+    assert state_path(broken).exists()
+    assert train(recording, broken, TINY, resume=True, quiet=True).posterior is not None
+    assert whole.read_bytes() == broken.read_bytes()
+    assert not state_path(broken).exists()
+
+
+def interrupted_before(function):
+    """The same function, which is called with a Ctrl-C under way."""
+
+    def interrupted(*given, **named):
+        os.kill(os.getpid(), signal.SIGINT)
+        return function(*given, **named)
+
+    return interrupted
+
+
+def test_a_power_cut_while_the_posterior_is_fitted_changes_no_bit(recording, tmp_path, monkeypatch):
+    trainer_for(recording, tmp_path / "a.safetensors").run(quiet=True)
+    broken = trainer_for(recording, tmp_path / "b.safetensors")
+    with monkeypatch.context() as cut:
+        cut.setattr("retrieval.training.train.with_verdicts", power_cut)
+        with pytest.raises(RuntimeError, match="power cut"):
+            broken.run(quiet=True)
+    resumed = trainer_for(recording, broken.out)
+    resumed.resume()
+    assert resumed.step == TINY.training.iterations
+    resumed.run(quiet=True)
+    assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
+
+
+def stop_after(trainer, steps):
+    """Run, and fail like a power cut in the step after `steps`, once the state of that step is on disk."""
+    loss = trainer.loss
+
+    def failing(loaded):
+        if trainer.step == steps:
+            raise RuntimeError("power cut")
+        return loss(loaded)
+
+    trainer.loss = failing
+    trainer.run(quiet=True)
+
+
+def test_an_unfinished_training_is_neither_overwritten_nor_resumed_by_another(recording, tmp_path):
+    out = tmp_path / "m.safetensors"
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(trainer_for(recording, out), 3)
+    with pytest.raises(CheckpointError, match="--resume"):
+        train(recording, out, TINY, quiet=True)
+    with pytest.raises(CheckpointError, match="another config"):
+        train(recording, out, with_training(TINY, learning_rate=1e-4), resume=True, quiet=True)
+    out.unlink()
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        train(recording, out, TINY, resume=True, quiet=True)
+
+
+def test_there_is_nothing_to_resume_without_a_state(recording, tmp_path):
+    with pytest.raises(CheckpointError, match="there is no"):
+        train(recording, tmp_path / "m.safetensors", TINY, resume=True, quiet=True)
+
+
+def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, tmp_path):
+    trainer = trainer_for(
+        recording, tmp_path / "m.safetensors", with_training(TINY, iterations=1000, validate_every=900)
+    )
+    loss = trainer.loss
+
+    def interrupted(loaded):
+        if trainer.step == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return loss(loaded)
+
+    trainer.loss = interrupted
+    with pytest.raises(Interrupted, match="stopped at step 2 of 1000"):
+        trainer.run(quiet=True)
+    assert load_checkpoint(tmp_path / "m.safetensors").provenance["step"] == 2
+    assert state_path(tmp_path / "m.safetensors").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_frozen_towers_are_run_once_for_each_image_and_do_not_change(recording, tmp_path):
+    config = with_training(TINY, freeze_towers=True)
+    # ResNet-18 has batch statistics, which would move if a tower were ever in training mode.
+    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, tower="resnet18"))
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
+    before = {name: value.clone() for name, value in trainer.matcher.photo_tower.state_dict().items()}
+    seen = []
+    trainer.matcher.photo_tower.register_forward_hook(lambda _, images, __: seen.append(len(images[0])))
+    trainer.run(quiet=True)
+    assert isinstance(trainer.features, FrozenFeatures)
+    assert same_weights(before, trainer.matcher.photo_tower.state_dict())
+    known = {photo for part in trainer.sampler.photos for photo in part} | set(trainer.validation.photos)
+    assert sum(seen) <= len(known)
+
+
+def test_frozen_batch_norm_keeps_its_running_statistics(recording):
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, tower="resnet18"))
+    matcher = Matcher(config.matcher)
+    before = matcher.photo_tower.bn1.running_mean.clone()
+    set_training_mode(matcher, dataclasses.replace(config.training, freeze_batch_norm=True))
+    matcher.photo_tower(torch.rand(2, 3, 32, 32))
+    assert torch.equal(before, matcher.photo_tower.bn1.running_mean)
+    set_training_mode(matcher, config.training)
+    matcher.photo_tower(torch.rand(2, 3, 32, 32))
+    assert not torch.equal(before, matcher.photo_tower.bn1.running_mean)
+
+
+def test_training_takes_the_number_of_fingers_from_the_recording(model):
+    assert load_checkpoint(model).config.matcher.fingers == 2
+
+
+def test_a_background_policy_needs_frames_of_the_untouched_gel(recording, tmp_path):
+    grasps = [dataclasses.replace(grasp, backgrounds=()) for grasp in load_grasps(recording)]
+    config = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, background="difference"))
+    split = make_split(grasps, validation=0.25, test=0.2, seed=0)
+    with pytest.raises(DatasetError, match="no-contact frame for each finger"):
+        Trainer(config, split, grasps, tmp_path / "m.safetensors", source="test").run(quiet=True)
+    train(recording, tmp_path / "n.safetensors", with_training(config, iterations=1), quiet=True)
+
+
+def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("retrieval.model.encode.has_fast_bfloat16", lambda device: False)
+    with pytest.raises(ConfigError, match="bfloat16 needs hardware"):
+        train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
+
+
+def test_a_training_that_diverges_says_so_and_writes_nothing(recording, tmp_path):
+    from retrieval.errors import NumericalError
+
+    trainer = trainer_for(recording, tmp_path / "m.safetensors")
+    with torch.no_grad():
+        trainer.matcher.head.out.bias.fill_(torch.nan)
+    with pytest.raises(NumericalError, match="lower learning_rate"):
+        trainer.run(quiet=True)
+    assert not (tmp_path / "m.safetensors").exists()
+
+
+GRADIENTS = """
+import sys, torch
+from pathlib import Path
+from retrieval.training import distributed
+from retrieval.training.batches import TrainedFeatures
+from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.model.losses.contrastive import contrastive_loss
+from retrieval.training.step import batch_loss
+from retrieval.training.train import build_matcher, set_training_mode
+from tests.conftest import TINY
+from tests.labelled import label_recording
+from tests.retrieval.training.test_train import with_training
+
+torch.set_num_threads(1)
+distributed.start()
+torch.manual_seed(0)
+# Where hardware multiplies bfloat16, towers in training would round differently in batches of another size.
+config = with_training(TINY, precision="float32")
+matcher = build_matcher(config)
+set_training_mode(matcher, config.training)
+with TrainedFeatures(config, torch.device("cpu")) as source:
+    loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
+    torch.manual_seed(1)
+    if sys.argv[3] == "local":  # the naive way: every rank's loss over its own share of the images
+        rows = torch.tensor(distributed.share(len(loaded.batch.photos)))
+        touch = matcher.touch_code(matcher.touch_features(loaded.touches)).embedding
+        photo = matcher.photo_code(matcher.photo_features(loaded.photos)).embedding
+        touches = torch.tensor(distributed.share(len(loaded.batch.grasps)))
+        touch_objects, photo_objects = (
+            torch.from_numpy(labels) for labels in (loaded.batch.touch_objects, loaded.batch.photo_objects)
+        )
+        labels = touch_objects[touches], photo_objects[rows]
+        loss = contrastive_loss(touch, photo, *labels, matcher.log_scale)
+    elif sys.argv[3] == "contrast":
+        touch, photo = source.train_features(matcher, loaded)
+        labels = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
+        loss = contrastive_loss(
+            matcher.touch_code(touch).embedding, matcher.photo_code(photo).embedding, *labels, matcher.log_scale
+        )
+    else:
+        loss, _ = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
+loss.backward()
+distributed.average_gradients(matcher)
+if distributed.rank() == 0:
+    torch.save({name: value.grad for name, value in matcher.named_parameters() if value.grad is not None}, sys.argv[2])
+distributed.stop()
+"""
+
+
+def gradients(recording, tmp_path, ranks, loss):
+    """Gradients of one batch, reckoned by so many ranks."""
+    script, out = tmp_path / "gradients.py", tmp_path / f"{loss}{ranks}.pt"
+    script.write_text(GRADIENTS)
+    run_ranks(script, ranks, recording, out, loss)
+    return torch.load(out, weights_only=True)
+
+
+def difference(ours, reference):
+    """Largest difference of a gradient, relative to the largest gradient."""
+    scale = max(float(value.abs().max()) for value in reference.values())
+    return max(float((ours[name] - reference[name]).abs().max()) for name in reference) / scale
+
+
+@pytest.mark.slow
+def test_two_ranks_have_the_gradient_of_one_process(recording, tmp_path):
+    one, two = (gradients(recording, tmp_path, ranks, "all") for ranks in (1, 2))
+    assert difference(two, one) < 1e-5  # float32, summed in another order
+
+
+@pytest.mark.slow
+def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, tmp_path):
+    reference = gradients(recording, tmp_path, 1, "contrast")
+    assert difference(gradients(recording, tmp_path, 2, "contrast"), reference) < 1e-5
+    assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("negatives", "frozen", "shared"),
+    [("auto", False, True), ("auto", True, False), ("dataset", False, False), ("batch", True, True)],
+)
+def test_negatives_come_from_the_batch_or_the_whole_set_as_set(recording, tmp_path, negatives, frozen, shared):
+    config = with_training(TINY, negatives=negatives, freeze_towers=frozen)
+    assert trainer_for(recording, tmp_path / "m.safetensors", config).sampler.share_photos is shared
+
+
+def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording, tmp_path):
+    config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
+    made = train(recording, tmp_path / "m.safetensors", config, quiet=True)
+    assert made.split.validation == ()
+    assert len(made.split.train) + len(made.split.test) == 12
+    assert made.provenance["step"] == 4
+    assert made.posterior is None
+
+
+BATCH_STATISTICS = """
+import sys, torch
+from torch import nn
+from retrieval.training import distributed
+from retrieval.model.towers import build_tower
+
+torch.set_num_threads(1)
+distributed.start()
+torch.manual_seed(0)
+if sys.argv[1] == "resnet18":
+    tower, images = build_tower("resnet18", "pooled").double(), torch.randn(5, 3, 64, 64).double()
+    encode = tower._encode  # without the check that images are in single precision
+else:
+    tower = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 2, 3), nn.BatchNorm2d(2))
+    encode, images = tower.double(), 30 + torch.randn(4, 3, 8, 8).double()
+if sys.argv[2] == "all":
+    distributed.share_batch_statistics(tower)
+with distributed.encoding(len(images)):
+    local = encode(images[distributed.share(len(images))])
+rows = distributed.gather_rows(local.flatten(1), len(images))
+loss = (rows * torch.randn(rows.shape).double()).sum() + rows.square().square().mean()
+loss.backward()
+distributed.average_gradients(tower)
+made = {name: value.grad for name, value in tower.named_parameters() if value.grad is not None}
+made |= {"loss": loss.detach()} | {name: value for name, value in tower.named_buffers() if "running" in name}
+torch.save(made, f"{sys.argv[3]}.{distributed.rank()}")
+distributed.stop()
+"""
+
+
+def run_ranks(script, ranks, *arguments):
+    """Run a script on so many ranks."""
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *torchrun, str(script), *map(str, arguments)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def of_one_batch(tmp_path, tower, ranks, statistics="all"):
+    """Of every rank: loss, gradients and running statistics of a tower after one batch, in double precision, so that
+    no ReLU falls the other way by rounding."""
+    script, out = tmp_path / "statistics.py", tmp_path / f"{ranks}{statistics}"
+    script.write_text(BATCH_STATISTICS)
+    run_ranks(script, ranks, tower, statistics, out)
+    return [torch.load(f"{out}.{rank}", weights_only=True) for rank in range(ranks)]
+
+
+def test_batch_statistics_are_those_of_all_ranks_images_each_counted_once(tmp_path):
+    """Four images on three ranks: the last share holds nothing new, the fourth image again and again."""
+    (one,) = of_one_batch(tmp_path, "tiny", 1)
+    three, *others = of_one_batch(tmp_path, "tiny", 3)
+    assert difference(three, one) < 1e-12
+    for other in others:  # the ranks stay one model, to the bit
+        assert all(torch.equal(other[name], three[name]) for name in three)
+
+
+@pytest.mark.slow
+def test_two_ranks_of_a_resnet_are_one_process(tmp_path):
+    (one,) = of_one_batch(tmp_path, "resnet18", 1)
+    assert difference(of_one_batch(tmp_path, "resnet18", 2)[0], one) < 1e-9
+    naive = of_one_batch(tmp_path, "resnet18", 2, statistics="own")[0]
+    assert difference(naive, one) > 0.3
+    assert abs(naive["loss"] - one["loss"]) > 0.01 * abs(one["loss"])
+
+
+TINY_TOML = """
+[matcher]
+tower = "small"
+tower_output = "pooled"
+hidden = 16
+pruner_width = 8
+embedding_dim = 8
+standardise = true
+[training]
+init = "random"
+iterations = 40
+touches_per_batch = 2
+distil_steps = 3
+validate_every = 30
+validation_fraction = 0.25
+contrastive_weight = 1.0
+[preprocessing]
+touch_px = 32
+photo_px = 32
+"""
+
+
+@pytest.mark.slow
+def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_path):
+    """A rank that left before the files are written, or that stopped at another step, would take the other down."""
+    out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
+    config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 100000"))
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*torchrun, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
+    with running(command, env=environment) as process:
+        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=240)
+    assert "--resume goes on from here" in said
+    stopped = read_tensors(state_path(out))[1]["step"]
+    assert stopped > 0
+    # A fresh and short one: nothing is there for a rank to read before the other has written it.
+    config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 2"))
+    state_path(out).unlink()
+    out.unlink()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    made = load_checkpoint(out)
+    assert made.provenance["step"] == 2
+    assert made.matcher.pruner is not None
+
+
+def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    bad = {
+        "shares 1 object": Split(0, tuple(names[:6]), tuple(names[5:9]), ()),
+        "2 objects in the train part.*has 0": Split(0, ("nothing", "known"), tuple(names), ()),
+        "2 objects in the validation part.*has 1": Split(0, tuple(names[:6]), (names[6], "unknown"), ()),
+    }
+    for message, split in bad.items():
+        with pytest.raises(DatasetError, match=message):
+            train(recording, tmp_path / "m.safetensors", TINY, split=split, quiet=True)
+
+
+@pytest.mark.parametrize("name", ["folder", "model.md", "file/model.safetensors"])
+def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(recording, tmp_path, monkeypatch, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
+    with pytest.raises(CheckpointError, match=r"is a folder; name the file|model card goes|cannot be written"):
+        train(recording, tmp_path / name, TINY, quiet=True)
+
+
+@pytest.mark.slow
+def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_path):
+    """SIGKILL by the system, through the command line."""
+    out = tmp_path / "m.safetensors"
+    config = tmp_path / "tiny.toml"
+    config.write_text(TINY_TOML.replace("validate_every = 30", "validate_every = 5"))
+    command = [sys.executable, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
+    with running(command) as process:
+        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
+    assert state_path(out).exists()
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert load_checkpoint(out).provenance["step"] > 0
+
+
+def test_fingers_are_shuffled_within_a_touch_and_by_the_seed():
+    features = torch.arange(24.0).view(4, 6)  # four touches of two fingers with three features
+    torch.manual_seed(3)
+    shuffled = shuffle_fingers(features, fingers=2)
+    torch.manual_seed(3)
+    assert torch.equal(shuffled, shuffle_fingers(features, fingers=2))
+    swapped = features.view(4, 2, 3).flip(1).flatten(1)
+    same, other = (shuffled == features).all(1), (shuffled == swapped).all(1)
+    assert (same ^ other).all()
+    seen = torch.cat([shuffle_fingers(features, fingers=2) for _ in range(50)])
+    assert 60 < int((seen == swapped.repeat(50, 1)).all(1).sum()) < 140
+    assert torch.equal(shuffle_fingers(features, fingers=1), features)

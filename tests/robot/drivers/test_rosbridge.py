@@ -1,0 +1,362 @@
+"""The rosbridge client: against scripted servers on a real websocket, every failure is a DeviceError and in time."""
+
+import contextlib
+import json
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.drivers.sawyer import rosbridge
+from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
+from robot.errors import DeviceError
+from tests.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
+from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
+
+
+def readers():
+    """Threads of links that live; those of websockets itself may take their time."""
+    return [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
+
+
+PLAIN = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@contextlib.contextmanager
+def scripted(answer):
+    """A websocket server: `answer(operation)` gives the texts to send back, or None to break the connection."""
+    from websockets.sync.server import serve as listen
+
+    heard = []
+
+    def handle(socket):
+        with contextlib.suppress(Exception):
+            for text in socket:
+                heard.append(json.loads(text))
+                replies = answer(heard[-1])
+                if replies is None:
+                    return
+                for reply in replies:
+                    socket.send(reply if isinstance(reply, str | bytes) else json.dumps(reply))
+
+    server = listen(handle, "127.0.0.1", 0, compression=None, close_timeout=0.2)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", heard
+    finally:
+        server.shutdown()
+        thread.join()
+
+
+@contextlib.contextmanager
+def linked(answer, timeout_s=5.0):
+    """A link to a scripted server."""
+    with scripted(answer) as (url, _), contextlib.closing(RosbridgeLink(url, timeout_s=timeout_s)) as link:
+        link.open()
+        yield link
+
+
+def reply_to(operation, **changes):
+    return {"op": "service_response", "id": operation["id"], "values": {"x": 1}, "result": True} | changes
+
+
+@settings(max_examples=50)
+@given(st.dictionaries(st.text(), PLAIN, max_size=3), st.text())
+def test_what_is_encoded_is_decoded(fields, name):
+    operation = fields | {"op": name}
+    assert decode(encode(operation)) == operation
+
+
+@settings(max_examples=100)
+@given(st.text() | st.binary() | PLAIN.map(lambda value: json.dumps(value)))
+def test_decoding_anything_gives_an_operation_or_nothing(text):
+    found = decode(text)
+    assert found is None or isinstance(found["op"], str)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, object(), {1, 2}])
+def test_what_json_cannot_hold_is_not_sent(value):
+    with pytest.raises(DeviceError, match="plain finite values"):
+        encode({"op": "publish", "msg": value})
+
+
+def test_nesting_without_end_is_noise():
+    assert decode("[" * 100_000) is None
+    assert decode('{"op":"publish"') is None
+    assert decode('{"op": 3}') is None
+
+
+def test_a_service_answers_by_its_own_id_only():
+    """A late answer to another call, one for another service and noise come first."""
+
+    def answer(operation):
+        wrong = reply_to(operation, id="other", values={"x": 2})
+        other = reply_to(operation, service="/other", values={"x": 3})
+        return [wrong, other, "noise", b"\xff", "[]", '{"op": "dance"}', reply_to(operation, service="/s")]
+
+    with linked(answer) as link:
+        assert link.call("/s", {"a": 1}) == {"x": 1}
+        assert link.counts == {"late": 2, "noise": 4}
+
+
+def test_an_answer_that_comes_after_its_time_is_never_that_of_the_next_call():
+    kept = []
+
+    def answer(operation):
+        kept.append(operation)
+        return [] if len(kept) == 1 else [reply_to(kept[0], values={"x": "old"}), reply_to(operation)]
+
+    with linked(answer) as link:
+        with pytest.raises(DeviceError, match=r"no answer of /s within 0\.05 s"):
+            link.call("/s", {}, timeout_s=0.05)
+        assert link.call("/s", {}) == {"x": 1}
+        assert link.counts["late"] == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"result": False, "values": "no such thing"}, "/s failed: no such thing"),
+        ({"result": "yes"}, "/s failed"),
+        ({"values": None}, "/s failed: None"),
+        ({"values": [1]}, r"/s failed: \[1\]"),
+    ],
+)
+def test_a_failed_call_says_why(changes, message):
+    with linked(lambda operation: [reply_to(operation, **changes)]) as link, pytest.raises(DeviceError, match=message):
+        link.call("/s", {})
+
+
+def test_a_status_error_that_names_a_call_fails_it_and_others_are_logged(caplog):
+    def answer(operation):
+        return [
+            {"op": "status", "level": "warning", "msg": "slow", "id": operation["id"]},
+            {"op": "status", "level": "error", "msg": "type unknown", "id": operation["id"]},
+        ]
+
+    with linked(answer) as link, pytest.raises(DeviceError, match="/s failed: type unknown"):
+        link.call("/s", {})
+    assert link.counts["status"] == 2
+    assert "slow" in caplog.text
+
+
+def test_messages_of_a_topic_are_kept_with_their_times():
+    def answer(operation):
+        publish = {"op": "publish", "topic": operation["topic"]}
+        return [*({**publish, "msg": {"data": n}} for n in range(3)), {**publish, "msg": 7}, {**publish, "topic": "/x"}]
+
+    with linked(answer) as link:
+        before = time.monotonic()
+        link.subscribe("/t", "std_msgs/Int32")
+        link._wait(lambda: link.counts["noise"] == 2 or None, 5.0, "messages")
+        history = link.history("/t")
+        assert [arrival.message["data"] for arrival in history] == [0, 1, 2]
+        assert before <= history[0].time_s <= history[-1].time_s <= time.monotonic()
+        assert link.wait_for("/t", since_s=before) == history[-1]
+        with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
+            link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
+
+
+def kept_after(texts):
+    """What a link that subscribed to /t has of it after these texts came."""
+    link = RosbridgeLink("ws://127.0.0.1:1")
+    link._socket = type("Deaf", (), {"send": lambda self, text: None})()
+    link._gone = ""
+    link.subscribe("/t", "std_msgs/String")
+    for text in texts:
+        link._take(text)
+    return link.history("/t")
+
+
+def test_of_a_topic_the_newest_messages_are_kept_up_to_a_number_and_a_length_of_all():
+    def published(number, characters):
+        return json.dumps({"op": "publish", "topic": "/t", "msg": {"n": number, "data": "x" * characters}})
+
+    many = kept_after(published(number, 10) for number in range(1000))
+    assert [arrival.message["n"] for arrival in many] == list(range(800, 1000))
+    long = kept_after(published(number, 100_000) for number in range(1000))
+    assert [arrival.message["n"] for arrival in long] == list(range(995, 1000))  # 5 x 100 KB within 512 KiB
+    alone = kept_after([published(0, 10), published(1, 1_000_000)])
+    assert [arrival.message["n"] for arrival in alone] == [1]
+
+
+def test_who_sends_a_message_without_measure_loses_the_connection_and_is_told_why():
+    def answer(operation):
+        return ['{"op": "publish", "topic": "/t", "msg": {"data": "' + "x" * 2**20 + '"}}']
+
+    with linked(answer) as link:
+        link.subscribe("/t", "std_msgs/String")
+        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is gone: .*message too big"):
+            link.wait_for("/t", timeout_s=20.0)
+        assert link.history("/t") == []
+
+
+def test_what_is_not_yet_read_does_not_pile_up(monkeypatch):
+    """Nothing is read here: a peer that floods has to wait before it has sent the half, however long it may take."""
+    text = json.dumps({"op": "publish", "topic": "/t", "msg": {"data": "x" * 2**17}})
+    read, sent = threading.Event(), []
+
+    def answer(operation):
+        for _ in range(1000):
+            yield text
+            sent.append(1)
+
+    with scripted(answer) as (url, _):
+        link = RosbridgeLink(url, timeout_s=20.0)
+        monkeypatch.setattr(link, "_take", lambda text: read.wait(60.0))
+        link.open()
+        link.subscribe("/t", "std_msgs/String")
+        until(lambda: link._socket.recv_messages.paused or len(sent) == 1000)
+        assert link._socket.recv_messages.paused
+        assert link._socket.recv_messages.frames.qsize() <= 20
+        assert len(sent) < 500
+        read.set()
+        link.close()
+
+
+def test_a_complaint_is_cut_off_and_harmless_on_a_terminal(caplog):
+    def answer(operation):
+        flood = {"op": "status", "level": "warning", "msg": "\x1b[2J" + "x" * 10**5}
+        return [flood, reply_to(operation, result=False, values="\x1b[31mno " + "y" * 10**5)]
+
+    with linked(answer) as link, pytest.raises(DeviceError) as caught:
+        link.call("/s", {})
+    for said in (caplog.text, str(caught.value)):
+        assert "\x1b" not in said
+        assert "\\x1b" in said
+        assert len(said) < 1000
+
+
+def test_a_connection_that_breaks_ends_every_wait_at_once():
+    with linked(lambda _: None, timeout_s=60.0) as link:
+        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is gone"):
+            link.call("/s", {})
+        assert not link.is_open
+        for use in (
+            link.check,
+            lambda: link.publish("/t", {}),
+            lambda: link.wait_for("/t"),
+            lambda: link.call("/s", {}),
+        ):
+            with pytest.raises(DeviceError, match="is gone"):
+                use()
+
+
+def test_a_link_closes_twice_and_before_it_was_opened_and_leaves_no_thread():
+    link = RosbridgeLink("ws://127.0.0.1:1")
+    link.close()
+    with pytest.raises(DeviceError, match="is gone"):
+        link.check()
+    with scripted(lambda _: []) as (url, _):
+        for _ in range(3):  # one after the other in one process
+            link = RosbridgeLink(url)
+            link.open()
+            assert link.is_open
+            link.close()
+            link.close()
+            assert not link.is_open
+            assert not readers()
+
+
+def test_nothing_published_while_the_link_is_gone_is_sent_later():
+    """The trap of clients that reconnect by themselves: an old motion command arrives seconds later."""
+    with scripted(lambda operation: None if operation["op"] == "call_service" else []) as (url, heard):
+        link = RosbridgeLink(url, timeout_s=5.0)
+        link.open()
+        with pytest.raises(DeviceError):
+            link.call("/break", {})
+        with pytest.raises(DeviceError):
+            link.publish("/robot/limb/right/joint_command", {"position": [1.0]})
+        link.close()
+        again = RosbridgeLink(url, timeout_s=5.0)
+        again.open()
+        again.publish("/t", {})
+        with pytest.raises(DeviceError):
+            again.call("/break", {})
+        again.close()
+        assert [operation["op"] for operation in heard] == ["call_service", "publish", "call_service"]
+        assert heard[1]["topic"] == "/t"
+
+
+def test_nobody_there_a_stranger_there_and_a_name_that_is_none_are_said_so():
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(DeviceError, match="roslaunch rosbridge_server"):
+            RosbridgeLink(f"ws://127.0.0.1:{port}", timeout_s=0.1).open()
+    for url in (f"ws://127.0.0.1:{port}", "ws://no such host:9090", "ws://[::1:9090"):
+        with pytest.raises(DeviceError, match="rosbridge must answer at"):
+            RosbridgeLink(url, timeout_s=0.5).open()
+
+
+def test_a_missing_package_is_a_sentence_with_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "websockets.sync.client", None)
+    with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[sawyer\]'"):
+        RosbridgeLink("ws://127.0.0.1:9090").open()
+
+
+def test_the_emulator_answers_what_rosbridge_would():
+    with serve(EmulatedSawyer()) as url, contextlib.closing(RosbridgeLink(url, timeout_s=5.0)) as link:
+        link.open()
+        with pytest.raises(DeviceError, match="/none does not exist"):
+            link.call("/none", {})
+        link.publish("/not/advertised", {"data": 1})
+        link.subscribe("/robot/state", "intera_core_msgs/RobotAssemblyState")
+        assert link.wait_for("/robot/state").message["enabled"] is True
+        assert link.counts["status"] == 1
+        link.advertise("/t", "std_msgs/Float64", latch=True)
+        link.publish("/t", {"data": 2.5})
+        link.subscribe("/t", "std_msgs/Float64")
+        assert link.wait_for("/t").message == {"data": 2.5}
+
+
+def test_faults_are_drawn_from_a_seed_and_counted():
+    kinds = ("dropped", "corrupted")
+    first, second = MessageFaults(0.5, kinds, seed=3), MessageFaults(0.5, kinds, seed=3)
+    drawn = [first.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
+    assert drawn == [second.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
+    assert set(drawn) == {None, *kinds}
+    assert first.counts == {kind: drawn.count(kind) for kind in kinds}
+    assert MessageFaults(1.0, kinds).draw(("delayed",)) is None
+    assert MessageFaults().draw(kinds) is None
+
+
+@pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
+def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
+    command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0", "--faults", "1"]
+    with running([*by, *command]) as process:
+        url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
+        link = RosbridgeLink(url, timeout_s=60.0)
+        link.open()
+        link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
+        link._wait(lambda: link.counts["noise"] or link.history("/robot/joint_states") or None, 60.0, "message")
+        link.close()
+        process.send_signal(signal.SIGINT)
+        counts, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "corrupted: " in counts or "duplicated: " in counts
+
+
+def test_the_module_needs_no_optional_package_to_be_imported():
+    code = (
+        "import sys; import robot.drivers.sawyer.driver, robot.drivers.manual_arm; print('websockets' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "False"
+    assert rosbridge.__doc__

@@ -1,0 +1,702 @@
+"""The Sawyer driver against the emulated robot on a real websocket: it goes where told, no faster, and stops."""
+
+import contextlib
+import logging
+import math
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot.drivers.sawyer import messages, straight_line
+from robot.drivers.sawyer.driver import Sawyer
+from robot.drivers.sawyer.messages import JOINTS, Mount
+from robot.drivers.sawyer.rosbridge import Arrival
+from robot.drivers.sawyer.straight_line import Schedule, way_points
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import Pose, Region
+from tests.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
+from tests.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
+from tests.waiting import running, until
+
+WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+MOUNT = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
+HOME = Pose(0.0, 0.0, 60.0, 0.0)
+FAR = Pose(0.0, 0.0, 260.0, 0.0)
+
+
+def arm_at(url, **changes):
+    port = int(url.rpartition(":")[2])
+    given = {"workspace": WORKSPACE, "host": "127.0.0.1", "port": port, **MOUNT, "timeout_s": 5.0, **changes}
+    return Sawyer(**given)
+
+
+@contextlib.contextmanager
+def connected(emulator=None, **changes):
+    """An emulator and a connected arm; machines are slow, so states may be a second old unless a test says less."""
+    emulator = emulator or EmulatedSawyer()
+    with serve(emulator) as url, arm_at(url, **{"max_state_age_s": 1.0, **changes}) as arm:
+        yield emulator, arm
+
+
+@contextlib.contextmanager
+def while_it_moves(emulator, act):
+    """Do something to the robot once 15 more commands have come."""
+    before = len(emulator.commands)
+
+    def run():
+        until(lambda: len(emulator.commands) > before + 15)
+        act()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield
+    thread.join()
+
+
+def stands(emulator):
+    """Whether the emulated arm is at rest."""
+    return bool(np.abs(emulator.model.velocity).max() < 1e-3)
+
+
+def offset(pose, other):
+    turn = math.remainder(pose.yaw_rad - other.yaw_rad, math.tau)
+    return math.dist(pose.as_tuple()[:3], other.as_tuple()[:3]), abs(turn)
+
+
+# what is computed: no robot
+
+
+def test_the_tip_of_a_pose_by_hand():
+    """The rig stands 500 mm before the robot, turned by 90 deg; the tip hangs 150 mm above the fingertips."""
+    mount = Mount((500.0, 0.0, -100.0), math.pi / 2, 150.0, 0.0)
+    tip = mount.tip_of(Pose(10.0, 20.0, 30.0, 0.0))
+    assert tip["position"] == pytest.approx({"x": 0.480, "y": 0.010, "z": 0.080})
+    root = math.sqrt(0.5)
+    assert tip["orientation"] == pytest.approx({"x": root, "y": root, "z": 0.0, "w": 0.0})
+
+
+def test_jaws_that_close_across_the_tip_turn_the_tip_back_and_forth():
+    straight, across = Mount((0, 0, 0), 0.0, 0.0, 0.0), Mount((0, 0, 0), 0.0, 0.0, math.pi / 2)
+    assert straight.tip_of(Pose(0, 0, 0, math.pi / 2)) == across.tip_of(Pose(0, 0, 0, 0.0))
+
+
+@given(*[st.floats(-500, 500)] * 3, *[st.floats(-3.1, 3.1)] * 3)
+def test_the_pose_of_a_tip_is_the_one_it_was_made_for(x, y, z, yaw, base_yaw, tool_yaw):
+    mount = Mount((300.0, -200.0, 50.0), base_yaw, 120.0, tool_yaw)
+    found = mount.pose_of(mount.tip_of(Pose(x, y, z, yaw)))
+    assert offset(found, Pose(x, y, z, yaw)) == pytest.approx((0, 0), abs=1e-9)
+
+
+@pytest.mark.parametrize("lean_deg", [9.0, 11.0])
+def test_a_hand_that_leans_is_refused(lean_deg):
+    half = math.radians(180 - lean_deg) / 2
+    tip = {
+        "position": {"x": 0.5, "y": 0.0, "z": 0.1},
+        "orientation": {"x": math.sin(half), "y": 0.0, "z": 0.0, "w": math.cos(half)},
+    }
+    mount = Mount((0, 0, 0), 0.0, 0.0, 0.0)
+    if lean_deg < 10:
+        assert mount.pose_of(tip).z_mm == pytest.approx(100)
+    else:
+        with pytest.raises(DeviceError, match="hang straight down, it leans by 11 deg"):
+            mount.pose_of(tip)
+
+
+@settings(max_examples=60)
+@given(st.floats(-150, 150), st.floats(-150, 150), st.floats(0, 300), st.floats(-1.5, 1.5))
+def test_the_made_up_arm_is_honest(x, y, z, yaw):
+    tip = Mount((500.0, 0.0, -100.0), math.pi, 150.0, 0.0).tip_of(Pose(x, y, z, yaw))
+    place, turn = [tip["position"][axis] for axis in "xyz"], [tip["orientation"][axis] for axis in "xyzw"]
+    found = inverse(place, turn, READY)
+    position, quaternion = forward(found)
+    assert position == pytest.approx(place, abs=1e-9)
+    assert abs(np.dot(quaternion, turn)) == pytest.approx(1.0)  # a quaternion and its negative are one rotation
+
+
+def test_the_made_up_arm_says_no():
+    down = (1.0, 0.0, 0.0, 0.0)
+    assert inverse((0.5, 0.0, 0.1), down, READY) is not None
+    assert inverse((1.5, 0.0, 0.1), down, READY) is None
+    assert inverse((0.5, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), READY) is None
+    assert inverse((math.nan, 0.0, 0.1), down, READY) is None
+
+
+def test_way_points_stand_on_the_line_and_turn_the_shorter_way():
+    points = way_points(Pose(0, 0, 0, 3.0), Pose(30, 40, 0, -3.0))
+    assert points[0] == Pose(0, 0, 0, 3.0)
+    assert points[-1] == Pose(30, 40, 0, -3.0)
+    assert len(points) == 6  # 50 mm in steps of 10
+    assert [point.x_mm for point in points] == pytest.approx([0, 6, 12, 18, 24, 30])
+    assert points[2].yaw_rad == pytest.approx(3.0 + 0.4 * (math.tau - 6.0))
+    assert len(way_points(HOME, HOME)) == 2
+
+
+def planned(speed=100.0, joint_speed=10.0, ramp_s=0.3, goal=FAR):
+    poses = way_points(HOME, goal)
+    mount, joints = Mount((500.0, 0.0, -100.0), math.pi, 150.0, 0.0), [READY]
+    for pose in poses:
+        tip = mount.tip_of(pose)
+        place, turn = [tip["position"][axis] for axis in "xyz"], [tip["orientation"][axis] for axis in "xyzw"]
+        joints.append(inverse(place, turn, joints[-1]))
+    return Schedule.of(poses, np.array(joints[1:]), speed, joint_speed, ramp_s), mount
+
+
+@pytest.mark.parametrize("goal", [FAR, Pose(140, -140, 20, 1.0), Pose(-140, 140, 290, -1.0), Pose(0, 0, 62, 0)])
+@pytest.mark.parametrize("ramp_s", [0.0, 0.3, 3.0])
+def test_the_hand_stays_on_the_line_and_is_never_faster_than_asked(goal, ramp_s):
+    schedule, _ = planned(100.0, ramp_s=ramp_s, goal=goal)
+    moments = np.linspace(0, schedule.duration_s, 3000)
+    places = np.array([forward(schedule.at(moment))[0] for moment in moments]) * 1000
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (moments[1] - moments[0])
+    assert speeds.max() < 101.0
+    line = places[-1] - places[0]
+    along = np.outer((places - places[0]) @ line / (line @ line), line)
+    assert np.linalg.norm(places - places[0] - along, axis=1).max() < 0.1
+    assert math.dist(places[0], places[-1]) == pytest.approx(math.dist(HOME.as_tuple()[:3], goal.as_tuple()[:3]))
+
+
+def test_no_joint_is_faster_than_its_limit():
+    schedule, _ = planned(500.0, joint_speed=0.2, goal=Pose(0, 0, 60, 1.5))
+    moments = np.arange(0, schedule.duration_s, 0.01)
+    joints = np.array([schedule.at(moment) for moment in moments])
+    assert np.abs(np.diff(joints, axis=0)).max() <= 0.2 * 0.01 + 1e-12
+    assert schedule.duration_s == pytest.approx(1.5 / 0.2 + 0.3)
+
+
+@given(st.just(0.0) | st.floats(1e-6, 20), st.just(0.0) | st.floats(1e-6, 5))
+def test_a_schedule_begins_and_ends_where_it_must(full, ramp_s):
+    schedule = Schedule(np.array([[0.0] * 7, [1.0] * 7]), np.array([0.0, full]), ramp_s)
+    if full > 0:
+        assert schedule.at(0.0)[0] == pytest.approx(0, abs=1e-12)
+    assert schedule.at(schedule.duration_s)[0] == pytest.approx(1.0)
+    assert schedule.at(1e9)[0] == pytest.approx(1.0)
+    assert schedule.at(schedule.duration_s / 2)[0] == pytest.approx(0.5 if full > 0 else 1.0)
+
+
+ANY = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(
+                [
+                    "name",
+                    "position",
+                    "names",
+                    "states",
+                    "pose",
+                    "orientation",
+                    "x",
+                    "y",
+                    "joints",
+                    "result_type",
+                    "data",
+                ]
+            ),
+            inner,
+            max_size=4,
+        )
+    ),
+    max_leaves=10,
+)
+READERS = {
+    "state": messages.robot_state,
+    "collision": messages.collided,
+    "joints": messages.joints_of,
+    "tip": lambda message: messages.tip_of(message, "right_hand"),
+    "pose": Mount((0, 0, 0), 0.0, 0.0, 0.0).pose_of,
+    "ik": messages.ik_answer,
+    "number": messages.number_of,
+}
+
+
+@pytest.mark.parametrize("reader", sorted(READERS))
+@settings(max_examples=60)
+@given(message=st.dictionaries(st.sampled_from(["name", "names", "position", "joints", "result_type"]), ANY))
+def test_a_message_of_any_content_is_read_or_is_a_device_error(reader, message):
+    with contextlib.suppress(DeviceError):
+        READERS[reader](message)
+
+
+def test_joints_are_read_by_name_and_those_of_others_left_alone():
+    names = ["head_pan", *reversed(JOINTS)]
+    found = messages.joints_of({"name": names, "position": [9.0, *range(7)]})
+    assert found.tolist() == [6, 5, 4, 3, 2, 1, 0]
+    assert messages.joints_of({"name": ["finger"], "position": [0.1]}) is None
+    for bad in (math.nan, None, "1", True, 1e300):
+        with pytest.raises(DeviceError, match="right_j0 must be a finite number"):
+            messages.joints_of({"name": list(JOINTS), "position": [bad, 0, 0, 0, 0, 0, 0]})
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"stopped": True, "estop_button": 1, "estop_source": 1}, "red button, its button is pressed"),
+        ({"stopped": True, "estop_button": 3, "estop_source": 1}, "released, but the stop still holds"),
+        ({"stopped": True, "estop_button": 77, "estop_source": 78}, "unknown"),
+        ({"error": True}, "error of one of its parts"),
+        ({"enabled": False}, "is not enabled"),
+    ],
+)
+def test_what_keeps_the_arm_from_moving_says_what_a_person_must_do(fields, words):
+    message = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
+    assert messages.robot_state(message).obstacle is None
+    assert words in messages.robot_state(message | fields).obstacle
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"port": 0},
+        {"tool_mm": -1.0},
+        {"tool_mm": math.nan},
+        {"base_xyz_mm": [0.0, 0.0]},
+        {"base_xyz_mm": [0.0, 0.0, math.nan]},
+        {"speed_ratio": 1.5},
+        {"joint_speed_rad_s": 0.0},
+        {"rate_hz": 1.0},
+        {"max_state_age_s": 0.0},
+        {"ik_retries": 1000},
+    ],
+)
+def test_settings_out_of_range_are_refused_without_a_robot(changes):
+    with pytest.raises(RobotConfigError, match=next(iter(changes))):
+        arm_at("ws://127.0.0.1:9090", **changes)
+
+
+def test_a_joint_state_repeated_with_its_old_stamp_grows_old():
+    now = [0.0]
+    arm = arm_at("ws://127.0.0.1:9090", clock=lambda: now[0])
+    names = {"name": list(JOINTS), "position": [0.0] * 7}
+
+    def heard(*stamps_and_times):
+        arrivals = [Arrival({"header": {"stamp": stamp}, **names}, at) for stamp, at in stamps_and_times]
+        arm._link = SimpleNamespace(history=lambda _: arrivals, check=lambda: None)
+
+    now[0] = 2.0
+    heard((1, 1.0), (2, 1.9), (2, 1.95))
+    assert arm._fresh_joints().tolist() == [0.0] * 7
+    heard((1, 1.0), (2, 1.2), (2, 1.6), (2, 1.99))
+    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, it is 0\.80 s"):
+        arm._fresh_joints()
+    heard((None, 1.2), (None, 1.9))  # without stamps the arrival counts
+    assert arm._fresh_joints().tolist() == [0.0] * 7
+    heard()
+    with pytest.raises(DeviceError, match="never came"):
+        arm._fresh_joints()
+
+
+# with the emulated robot
+
+
+def test_it_goes_where_it_is_told_as_the_robot_itself_measures_it():
+    with connected() as (emulator, arm):
+        target = Pose(20.0, -30.0, 90.0, 0.2)
+        assert offset(arm.move_to(target, 200.0), target) < (1.0, 0.02)
+        x, y, z = forward(emulator.model.joints)[0]
+        assert (x, y, z) == pytest.approx((0.480, 0.030, 0.140), abs=1e-3)  # base turned by 180 deg: 500 - 20, 30
+        assert offset(arm.pose(), target) < (1.0, 0.02)
+        until(lambda: stands(emulator))
+
+
+def test_commands_never_step_further_than_speed_allows_in_two_ticks_even_after_a_nap():
+    with connected() as (emulator, arm):
+        arm.move_to(HOME, 200.0)
+        emulator.commands.clear()
+        command, naps = arm._command, []
+
+        def drowsy(joints):
+            command(joints)
+            if len(emulator.commands) > 10 and not naps:
+                naps.append(time.sleep(0.15))
+
+        arm._command = drowsy
+        arm.move_to(Pose(0.0, 0.0, 110.0, 0.0), 100.0)
+        places = np.array([forward(joints)[0] for _, joints in emulator.commands]) * 1000
+        assert len(naps) == 1
+        assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 100.0 * 0.02 * 1.01
+
+
+def test_settings_are_read_back_and_what_is_not_taken_is_noted():
+    with connected(speed_ratio=0.2) as (emulator, arm):
+        assert emulator.model.speed_ratio == 0.2
+        found = {"url": arm.settings()["url"], "tip": "right_hand", "speed_ratio": 0.2, "command_timeout_s": 0.2}
+        assert arm.settings() == found  # and nothing that is measured: it would be another each time
+        assert arm.refused == {}
+    emulator = EmulatedSawyer()
+    emulator.silent.add(LIMB + "set_speed_ratio")
+    with connected(emulator, timeout_s=0.5) as (_, arm):
+        assert arm.refused == {"speed_ratio": "asked 0.3, nothing can be read back"}
+
+
+def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
+    with connected() as (emulator, arm):
+        with while_it_moves(emulator, emulator.press_estop), pytest.raises(DeviceError) as caught:
+            arm.move_to(FAR, 50.0)
+        assert "stopped by the red button" in str(caught.value)
+        assert "turn the button" in str(caught.value)
+        for use in (arm.recover, lambda: arm.move_to(FAR, 50.0)):
+            with pytest.raises(DeviceError, match="never resets an emergency stop"):
+                use()
+        assert emulator.model.stopped
+        assert offset(arm.pose(), FAR)[0] > 50
+        emulator.release_estop()
+        until(lambda: arm._robot_state().obstacle is None)
+        arm.recover()
+        target = Pose(0, 0, arm.pose().z_mm + 5, 0)
+        assert offset(arm.move_to(target, 100.0), target)[0] < 1
+
+
+def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
+    def bump():
+        emulator.model.collided = True
+        published = len(arm._link.history(LIMB + "collision_detection_state"))
+        history = lambda: arm._link.history(LIMB + "collision_detection_state")  # noqa: E731
+        until(lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99)
+        emulator.model.collided = False
+
+    with connected() as (emulator, arm):
+        with while_it_moves(emulator, bump), pytest.raises(DeviceError, match="reports a collision, the arm holds"):
+            arm.move_to(FAR, 50.0)
+        held = np.array(emulator.commands[-1][1])
+        assert np.abs(emulator.model.joints - held).max() < 0.02
+        assert offset(arm.pose(), FAR)[0] > 50
+        arm.recover()
+        target = Pose(0, 0, arm.pose().z_mm + 5, 0)
+        assert offset(arm.move_to(target, 100.0), target)[0] < 1
+
+
+def test_a_collision_that_lasts_needs_a_person():
+    with connected() as (emulator, arm):
+        emulator.model.collided = True
+        until(lambda: arm._collided_since(0.0))
+        with pytest.raises(DeviceError, match="recovery is refused: the robot reports a collision"):
+            arm.recover()
+        with pytest.raises(DeviceError, match="reports a collision"):
+            arm.move_to(FAR, 50.0)
+        assert offset(arm.pose(), FAR)[0] > 100
+
+
+@pytest.mark.parametrize(
+    ("topic", "message", "age_s"),
+    [
+        ("/robot/joint_states", "joint state must be at most", 0.5),
+        ("/robot/state", r"at most 1 s old.* an emergency stop would not be seen", 1.0),
+        (LIMB + "collision_detection_state", r"at most 1 s old.* a collision would not be seen", 1.0),
+    ],
+)
+def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkeypatch):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.5)
+    with connected(max_state_age_s=age_s) as (emulator, arm):
+        with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
+            arm.move_to(FAR, 20.0)
+        count = len(emulator.commands)
+        until(lambda: stands(emulator))  # the robot's own time-out
+        assert len(emulator.commands) == count
+        assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
+        emulator.silent.clear()
+        arm.recover()
+        assert offset(arm.pose(), FAR)[0] > 50
+
+
+def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
+    emulator = EmulatedSawyer()
+    emulator.silent.add(messages.COLLISION[0])
+    with caplog.at_level(logging.WARNING), connected(emulator, timeout_s=0.5) as (_, arm):
+        assert arm.refused == {"collision state": "nothing comes: collisions are not seen"}
+        assert "collisions are not seen" in caplog.text
+        arm.move_to(HOME, 200.0)
+        arm.recover()
+        emulator.silent.clear()
+        arm.close()
+        arm.connect()
+        assert arm.refused == {}
+
+
+def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatch):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.1)
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
+    with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
+        emulator.silent.add(messages.COLLISION[0])
+        until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
+        for _ in range(2):
+            with pytest.raises(DeviceError, match=r"no message on .*collision_detection_state"):
+                arm.recover()
+            with pytest.raises(DeviceError):
+                arm.move_to(FAR, 50.0)
+        assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
+        emulator.silent.clear()
+        arm.recover()
+        assert arm.refused == {}
+
+
+def test_however_often_the_robot_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
+    """Doubled each time, the last of twenty waits would take more than a day."""
+    waits = []
+    arm = arm_at("ws://127.0.0.1:9090", reconnect_tries=20)
+    monkeypatch.setattr(arm, "_join", Mock(side_effect=DeviceError("nobody is there")))
+    monkeypatch.setattr("robot.drivers.sawyer.driver.time", SimpleNamespace(sleep=waits.append))
+    with pytest.raises(DeviceError, match="nobody is there"):
+        arm._rejoin()
+    assert (len(waits), waits[0], max(waits)) == (19, 0.25, 5.0)
+
+
+def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():
+    now = [0.0]
+    state = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
+    for allowed_s, limit_s in ((0.5, 2.0), (3.0, 3.0)):
+        arm = arm_at("ws://127.0.0.1:9090", clock=lambda: now[0], max_state_age_s=allowed_s)
+        arm._link = SimpleNamespace(history=lambda _: [Arrival(state, 0.0)], check=lambda: None)
+        now[0] = limit_s - 0.01
+        assert arm._robot_state().enabled
+        now[0] = limit_s + 0.01
+        for look, words in ((arm._robot_state, "emergency stop"), (arm._collisions, "collision")):
+            with pytest.raises(DeviceError, match=f"at most {limit_s:g} s old.*{words} would not be seen"):
+                look()
+
+
+def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
+    with connected() as (emulator, arm):
+        with while_it_moves(emulator, emulator.drop_connections), pytest.raises(DeviceError, match="is gone") as caught:
+            arm.move_to(FAR, 50.0)
+        assert "and while sawyer was stopped" in caught.value.__notes__[0]
+        with pytest.raises(DeviceError, match="is gone"):
+            arm.stop()
+        until(lambda: stands(emulator))
+        with caplog.at_level(logging.WARNING):
+            arm.recover()
+        assert "connecting again" in caplog.text
+        target = Pose(0, 0, arm.pose().z_mm + 5, 0)
+        assert offset(arm.move_to(target, 100.0), target)[0] < 1
+
+
+def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
+    with contextlib.ExitStack() as robot:
+        arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), reconnect_tries=3, timeout_s=5.0)
+        arm.connect()
+        robot.close()
+        until(lambda: not arm._link.is_open)
+        with caplog.at_level(logging.WARNING), pytest.raises(DeviceError, match="rosbridge must answer at"):
+            arm.recover()
+        assert caplog.text.count("try ") == 3
+        with pytest.raises(DeviceError):
+            arm.pose()
+        arm.close()
+
+
+def test_ctrl_c_leaves_the_arm_standing():
+    with connected() as (emulator, arm):
+        watch, seen = arm._watch, []
+
+        def interrupted(*args):
+            seen.append(args)
+            if len(seen) == 30:
+                raise KeyboardInterrupt
+            return watch(*args)
+
+        arm._watch = interrupted
+        with pytest.raises(KeyboardInterrupt):
+            arm.move_to(FAR, 50.0)
+        assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
+        until(lambda: stands(emulator))
+        assert offset(arm.pose(), FAR)[0] > 50
+
+
+PROGRAM = """
+from robot.drivers.sawyer.driver import Sawyer
+from robot.readings import Region, Pose
+from tests.waiting import until
+box = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
+place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
+with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
+    arm.move_to(Pose(0.0, 0.0, 260.0, 0.0), 20.0)
+"""
+
+
+def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
+    emulator = EmulatedSawyer()
+    with serve(emulator) as url:
+        code = PROGRAM.replace("PORT", url.rpartition(":")[2])
+        with running([sys.executable, "-c", code]) as process:
+            until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 60.0)
+            process.send_signal(signal.SIGINT)
+            errors = process.communicate(timeout=60)[1]
+        assert "KeyboardInterrupt" in errors
+        assert "and while" not in errors
+        assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
+        until(lambda: stands(emulator))
+
+
+def test_closing_from_another_thread_ends_a_motion():
+    with connected() as (emulator, arm):
+        with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is gone"):
+            arm.move_to(FAR, 20.0)
+        until(lambda: stands(emulator))
+        assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.05
+        assert not arm.is_connected
+
+
+def test_closing_an_arm_that_nobody_moves_sends_it_nothing():
+    with connected() as (emulator, _):
+        pass
+    assert not emulator.commands
+
+
+def test_the_robots_kinematics_is_asked_again_with_another_seed_and_not_for_ever():
+    with connected(ik_retries=2) as (emulator, arm):
+        emulator.refuse_ik = 2
+        arm.move_to(HOME, 200.0)
+        emulator.refuse_ik, emulator.calls = 1000, 0
+        before = emulator.model.joints
+        with pytest.raises(DeviceError, match=r"after 3 tries: .*no joint angles reach it; nothing has moved"):
+            arm.move_to(FAR, 200.0)
+        assert emulator.calls == 3
+        assert np.abs(emulator.model.joints - before).max() < 2e-3
+
+
+def test_solutions_that_leap_are_refused_before_anything_moves(monkeypatch):
+    with connected() as (emulator, arm):
+        leap = np.array([1.0, 0, 0, 0, 0, 0, 0])
+        answer = messages.ik_answer
+        monkeypatch.setattr(messages, "ik_answer", lambda values: answer(values) + leap)
+        with pytest.raises(DeviceError, match=r"turns a joint by 1\.0"):
+            arm.move_to(FAR, 100.0)
+        assert offset(arm.pose(), FAR)[0] > 100
+        assert stands(emulator)
+
+
+@pytest.mark.parametrize("kind", ["wrong_id", "dropped", "corrupted"])
+def test_answers_that_never_come_end_in_time(kind):
+    with connected(EmulatedSawyer(), timeout_s=1.0, ik_retries=1) as (emulator, arm):
+        arm._link.timeout_s = 0.1
+        emulator.faults.rate, emulator.faults.kinds = 1.0, (kind,)
+        emulator.silent.update(topic for topic, _ in (messages.COLLISION,))
+        call = arm._link.call
+        with pytest.raises(DeviceError, match="no answer of"):
+            call(messages.IK_SERVICE, messages.ik_request({}, "right_hand", None))
+
+
+def test_an_arm_that_stands_outside_the_workspace_is_not_moved_from_here():
+    """Within 20 mm of it, as after a stop, it is."""
+    with connected(base_xyz_mm=[500.0, 0.0, -20.0]) as (emulator, arm):
+        with pytest.raises(DeviceError, match=r"must be in the workspace .*first, but is at .* bring it there by hand"):
+            arm.move_to(Pose(0.0, 0.0, 30.0, 0.0), 100.0)
+        assert stands(emulator)
+    with connected(base_xyz_mm=[500.0, 0.0, -60.0]) as (_, arm):
+        assert arm.pose().z_mm == pytest.approx(-10.0, abs=0.5)
+        arm.move_to(Pose(0.0, 0.0, 5.0, 0.0), 100.0)
+
+
+def test_an_arm_held_by_somebody_is_not_pushed_on():
+    class Held(SawyerModel):
+        def command(self, target):
+            pass
+
+    with connected(EmulatedSawyer(model=Held())) as (_, arm), pytest.raises(DeviceError, match="must follow within"):
+        arm.move_to(Pose(0.0, 0.0, 250.0, 1.5), 200.0)
+    with (
+        connected(EmulatedSawyer(model=Held()), settle_s=0.1) as (_, arm),
+        pytest.raises(DeviceError, match="is the arm blocked"),
+    ):
+        arm.move_to(Pose(0.0, 0.0, 45.0, 0.0), 200.0)
+
+
+def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
+    for prepare in (EmulatedSawyer.press_estop, lambda emulator: setattr(emulator.model, "enabled", False)):
+        emulator = EmulatedSawyer()
+        prepare(emulator)
+        with serve(emulator) as url:
+            arm = arm_at(url)
+            with pytest.raises(DeviceError, match="by hand"):
+                arm.connect()
+            assert not arm.is_connected
+            assert not arm._link.is_open
+            arm.close()
+
+
+def test_motors_stay_off_where_connecting_must_let_nothing_move():
+    emulator = EmulatedSawyer()
+    emulator.model.enabled = False
+    with serve(emulator) as url:
+        arm = arm_at(url, enable=True)
+        arm.may_move = False
+        with pytest.raises(DeviceError, match="is not enabled"):
+            arm.connect()
+        arm.close()
+    assert not emulator.model.enabled
+
+
+def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
+    emulator = EmulatedSawyer()
+    emulator.model.enabled = False
+    with caplog.at_level(logging.WARNING), connected(emulator, enable=True):
+        assert emulator.model.enabled
+        assert "motors are being enabled" in caplog.text
+    emulator = EmulatedSawyer()
+    emulator.press_estop()
+    with serve(emulator) as url, pytest.raises(DeviceError, match="never resets"):
+        arm_at(url, enable=True).connect()
+    assert not emulator.model.enabled
+
+
+def test_a_robot_that_says_nothing_or_has_no_such_tip_is_named():
+    emulator = EmulatedSawyer()
+    emulator.silent.add(LIMB + "tip_states")
+    with serve(emulator) as url, pytest.raises(DeviceError, match="no message on /robot/limb/right/tip_states"):
+        arm_at(url, timeout_s=0.5).connect()
+    with connected(tip="left_hand") as (_, arm), pytest.raises(DeviceError, match="must report its tip 'left_hand'"):
+        arm.pose()
+
+
+def test_it_connects_closes_and_connects_again_and_leaves_no_thread():
+    with serve(EmulatedSawyer()) as url:
+        arm = arm_at(url)
+        arm.close()
+        for _ in range(3):
+            arm.connect()
+            arm.pose()
+            arm.close()
+            arm.close()
+            with pytest.raises(DeviceError, match="must be connected"):
+                arm.pose()
+            assert not [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
+
+
+@pytest.mark.parametrize(
+    ("rate", "kinds"),
+    [
+        (0.02, ("dropped", "duplicated", "corrupted", "command_dropped")),
+        (0.25, ("delayed", "wrong_id", "ik_failed", "disconnected")),
+    ],
+)
+def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds, monkeypatch, capsys):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.01)
+    faults, outcomes = MessageFaults(rate, kinds, seed=20), Counter()
+    with connected(EmulatedSawyer(faults=faults), timeout_s=1.0) as (emulator, arm):
+        for number in range(10):
+            target = Pose(0.0, 0.0, 40.0 + 20 * (number % 2), 0.0)
+            try:
+                assert offset(arm.move_to(target, 200.0), target)[0] < 1.5
+                outcomes["done"] += 1
+            except DeviceError:
+                outcomes["failed"] += 1
+                until(lambda: stands(emulator))
+                arm.recover()
+    with capsys.disabled():
+        print(f"\n10 motions: {dict(outcomes)}; faults: {dict(sorted(faults.counts.items()))}")
+    assert outcomes["done"] >= 5
+    assert sum(faults.counts.values()) > 0
+
+
+def test_way_point_steps_are_those_of_the_documented_accuracy():
+    assert (straight_line.STEP_MM, math.degrees(straight_line.STEP_RAD)) == (10.0, pytest.approx(5.0))

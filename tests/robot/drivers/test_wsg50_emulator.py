@@ -1,0 +1,280 @@
+"""The emulated WSG-50, by bytes written here by hand: what it says, how it moves, how it fails."""
+
+import struct
+
+import pytest
+
+from robot.drivers.wsg50.codec import Packet, decode, encode
+from robot.errors import RobotConfigError
+from tests.emulators.wsg50.faults import LineFaults
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.mechanics import Mechanics
+from tests.wsg50_packets import bytes_of
+
+MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x21, 0x22, 0x23, 0x24, 0x25, 0x26
+IDLE, NO_PART, PART_LOST, HOLDING, ERROR = 0, 2, 3, 4, 7
+
+
+class Hand:
+    """An emulator whose clock stands until it is told to go on, spoken to without a port."""
+
+    def __init__(self, **settings):
+        self.now = 0.0
+        self.emulator = EmulatedWSG50(clock=lambda: self.now, **{"referenced": True} | settings)
+
+    def tell(self, command, payload=b""):
+        """Status and parameters of its answer."""
+        *_, answer = self.emulator.receive(Packet(command, payload))
+        assert answer.id == command
+        return struct.unpack_from("<H", answer.payload)[0], answer.payload[2:]
+
+    def wait(self, seconds):
+        """What it says meanwhile, as (id, status)."""
+        said = []
+        for _ in range(round(seconds * 100)):
+            self.now += 0.01
+            said += self.emulator.tick()
+        return [(packet.id, struct.unpack_from("<H", packet.payload)[0]) for packet in said]
+
+    def to(self, command, width, speed=100.0):
+        """A motion with a width, awaited: its result."""
+        payload = struct.pack("<ff", width, speed)
+        status, _ = self.tell(command, b"\x02" + payload if command == MOVE else payload)
+        if status != 26:
+            return status
+        ((own, result),) = self.wait(5)
+        assert own == command
+        return result
+
+    def state(self):
+        return self.tell(0x41, bytes(3))[1][0]
+
+    def flags(self):
+        number = struct.unpack("<I", self.tell(0x40, bytes(3))[1])[0]
+        return {bit for bit in range(32) if number >> bit & 1}
+
+    def value(self, command):
+        return struct.unpack("<f", self.tell(command, bytes(3))[1])[0]
+
+
+def test_the_jaws_take_the_time_that_their_speed_and_acceleration_ask():
+    jaws = Mechanics(100.0)
+    jaws.acceleration_mm_s2 = 1000.0
+    jaws.go(40.0, 100.0)
+    jaws.advance(0.1)
+    assert jaws.speed_mm_s == pytest.approx(-100.0)  # 0.1 s at 1000 mm/s^2
+    assert jaws.opening_mm == pytest.approx(95.0, abs=0.2)
+    jaws.advance(0.5)
+    assert jaws.opening_mm == pytest.approx(45.0, abs=0.4)  # and 0.5 s at 100 mm/s; then it brakes
+    jaws.advance(0.3)
+    assert (jaws.opening_mm, jaws.moves, jaws.speed_mm_s) == (pytest.approx(40.0), False, 0.0)
+
+
+def test_an_object_stops_the_jaws_from_outside_and_not_from_within():
+    jaws = Mechanics(100.0, object_mm=40.0)
+    jaws.go(0.0, 100.0)
+    jaws.advance(5)
+    assert (jaws.opening_mm, jaws.blocked, jaws.moves) == (40.0, -1, False)
+    jaws.go(60.0, 100.0)
+    jaws.advance(5)
+    assert (jaws.opening_mm, jaws.blocked) == (pytest.approx(60.0), 0)
+
+
+def test_it_answers_the_printed_commands_as_the_table_says():
+    hand = Hand()
+    assert hand.tell(0x06, b"abc") == (0, b"abc")
+    assert hand.tell(0x33) == (0, struct.pack("<f", 40))
+    assert struct.unpack("<8f", hand.tell(0x53)[1]) == (110, 5, 420, 100, 5000, 5, 80, 120)
+    assert len(hand.tell(0x50)[1]) == 8
+    assert hand.tell(0x90) == (14, b"")
+    assert hand.tell(0x25, bytes(7)) == (13, b"")
+    assert hand.tell(0x25, bytes(9)) == (15, b"")
+    assert hand.tell(0x22, b"\x00") == (12, b"")
+
+
+def test_a_motion_is_pending_first_and_denied_while_another_runs():
+    hand = Hand(opening_mm=100.0)
+    move = b"\x02" + struct.pack("<ff", 50, 100)
+    assert hand.tell(MOVE, move) == (26, b"")
+    hand.wait(0.1)
+    assert hand.state() == 6
+    assert 1 in hand.flags()
+    assert hand.tell(MOVE, move) == (4, b"")
+    assert hand.tell(GRASP, bytes(8)) == (4, b"")
+    assert hand.wait(2) == [(MOVE, 0)]
+    assert hand.value(0x43) == pytest.approx(50.0)
+    assert {0, 7} <= hand.flags()
+
+
+def test_it_homes_before_anything_else_moves():
+    hand = Hand(referenced=False)
+    assert hand.to(MOVE, 60) == 3
+    assert hand.tell(0x20, b"\x03") == (24, b"")
+    assert hand.tell(0x20, b"\x00") == (26, b"")
+    assert 0 not in hand.flags()
+    assert hand.wait(3) == [(0x20, 0)]
+    assert 0 in hand.flags()
+    assert hand.value(0x43) == pytest.approx(110.0)
+
+
+def test_grasping_finds_a_part_holds_it_and_says_when_it_is_lost():
+    hand = Hand(object_mm=40.0)
+    assert hand.to(GRASP, 0.0) == 0
+    assert (hand.state(), hand.value(0x43), hand.value(0x45)) == (HOLDING, 40.0, 40.0)
+    assert hand.to(GRASP, 0.0) == 16
+    assert hand.to(MOVE, 60.0) == 16
+    hand.emulator.object_mm = None
+    hand.wait(0.1)
+    assert (hand.state(), hand.value(0x45)) == (PART_LOST, 0.0)
+    assert hand.to(RELEASE, 80.0) == 0
+    assert (hand.state(), hand.value(0x43)) == (IDLE, pytest.approx(80.0))
+
+
+def test_grasping_nothing_fails_and_must_be_released():
+    hand = Hand()
+    assert hand.to(GRASP, 30.0) == 18
+    assert (hand.state(), hand.value(0x43)) == (NO_PART, pytest.approx(27.0))  # 3 mm of clamping travel
+    assert hand.to(GRASP, 0.0) == 16
+    assert hand.to(RELEASE, 60.0) == 0
+    assert hand.to(RELEASE, 60.0) == 16  # from idle
+
+
+def test_positioning_into_an_object_is_blocked():
+    hand = Hand(object_mm=40.0)
+    assert hand.to(MOVE, 20.0) == 29
+    assert 2 in hand.flags()
+    assert hand.value(0x43) == 40.0
+
+
+def test_stop_aborts_a_motion_and_leaves_it_usable():
+    hand = Hand(opening_mm=100.0)
+    hand.tell(MOVE, b"\x02" + struct.pack("<ff", 10, 50))
+    hand.wait(0.2)
+    first, second = hand.emulator.receive(Packet(STOP))
+    assert (first.id, first.payload) == (MOVE, b"\x13\x00")
+    assert (second.id, second.payload) == (STOP, b"\x00\x00")
+    assert not hand.emulator.moves
+    assert 6 in hand.flags()
+    assert hand.to(MOVE, 50.0) == 0
+
+
+def test_a_fast_stop_ends_only_with_an_acknowledgement():
+    hand = Hand(opening_mm=100.0)
+    assert hand.tell(ACK, b"ack")[0] == 16  # nothing to acknowledge
+    hand.tell(MOVE, b"\x02" + struct.pack("<ff", 10, 50))
+    assert hand.tell(FAST_STOP)[0] == 0
+    assert (hand.state(), 12 in hand.flags()) == (ERROR, True)
+    assert hand.to(MOVE, 50.0) == 16
+    assert hand.tell(0x20, b"\x00")[0] == 16
+    assert hand.tell(ACK, b"nak")[0] == 24
+    assert hand.tell(ACK, b"ack")[0] == 0
+    assert (hand.state(), 12 in hand.flags()) == (IDLE, False)
+
+
+def test_a_fault_shows_its_flag():
+    hand = Hand()
+    hand.emulator.fail("temperature")
+    assert {12, 14} <= hand.flags()
+
+
+def test_limits_are_held_and_what_is_outside_is_refused():
+    hand = Hand()
+    assert [hand.tell(0x32, struct.pack("<f", force))[0] for force in (4, 5, 80, 81)] == [28, 0, 0, 28]
+    assert [hand.tell(0x30, struct.pack("<f", each))[0] for each in (99, 100, 5000, 5001)] == [28, 0, 0, 28]
+    assert hand.tell(0x31) == (0, struct.pack("<f", 5000))
+    assert [hand.to(MOVE, 60.0, speed) for speed in (4, 421)] == [28, 28]
+    assert [hand.to(MOVE, width) for width in (-1, 111)] == [28, 28]
+    assert hand.tell(0x35)[0] == 1
+    assert hand.tell(0x34, struct.pack("<ff", 20, 90)) == (0, b"")
+    assert hand.tell(0x35) == (0, struct.pack("<ff", 20, 90))
+    assert [hand.to(MOVE, width) for width in (19, 91, 50)] == [28, 28, 0]
+
+
+def test_setting_it_while_it_moves_is_a_fast_stop():
+    hand = Hand(opening_mm=100.0)
+    hand.tell(MOVE, b"\x02" + struct.pack("<ff", 10, 50))
+    assert hand.tell(0x32, struct.pack("<f", 20))[0] == 16
+    assert hand.emulator.in_fast_stop
+    assert not hand.emulator.moves
+
+
+def test_it_can_be_tared_with_force_fingers_and_not_while_holding():
+    hand = Hand(object_mm=40.0)
+    assert hand.tell(0x38)[0] == 1
+    hand.emulator.has_force_fingers = True
+    assert hand.tell(0x38)[0] == 0
+    hand.to(GRASP, 0.0)
+    assert hand.tell(0x38)[0] == 16
+
+
+def test_updates_come_by_themselves_until_told_to_end():
+    hand = Hand()
+    assert hand.tell(0x43, b"\x01\x14\x00")[0] == 0  # every 20 ms
+    assert hand.wait(0.2) == [(0x43, 0)] * 10
+    assert hand.tell(0x43, b"\x03\x14\x00")[0] == 28  # only when it changes: nobody asks for it
+    assert hand.tell(0x43, b"\x01\x00\x00")[0] == 28
+    assert hand.wait(0.2) == []
+    hand.tell(0x43, b"\x01\x14\x00")
+    hand.tell(0x43, bytes(3))
+    assert hand.wait(0.2) == []
+
+
+def test_an_answer_that_fits_no_packet_is_a_range_error():
+    hand = Hand()
+    assert hand.tell(0x06, bytes(254)) == (0, bytes(254))
+    assert [hand.tell(0x06, bytes(size)) for size in (255, 256)] == [(28, b"")] * 2
+
+
+def test_a_command_is_answered_as_told_once_and_not_done():
+    hand = Hand(opening_mm=100.0)
+    hand.emulator.next_status = {GRASP: 20}
+    assert hand.to(GRASP, 0.0) == 20
+    assert hand.value(0x43) == 100.0
+    assert hand.to(GRASP, 0.0) == 18
+
+
+def test_a_client_that_goes_without_a_word_leaves_a_fast_stop():
+    hand = Hand()
+    hand.emulator.connected()
+    hand.tell(0x07)
+    hand.emulator.disconnected()
+    assert not hand.emulator.in_fast_stop
+    hand.emulator.connected()
+    hand.emulator.disconnected()
+    assert hand.emulator.in_fast_stop
+
+
+@pytest.mark.parametrize("kind", LineFaults.KINDS)
+def test_a_fault_does_to_a_packet_what_its_name_says(kind):
+    packet = decode(bytes_of("grasp 12 mm 34 mm/s"))[1]
+    faults = LineFaults(1.0, [kind], delay_s=0.5)
+    pieces = list(faults.on(packet))
+    data = b"".join(piece.data or b"" for piece in pieces)
+    good = encode(packet)
+    assert faults.counts == {kind: 1}
+    assert {
+        "dropped": pieces == [],
+        "duplicated": data == good + good,
+        "corrupted": len(data) == len(good) and sum((a ^ b).bit_count() for a, b in zip(data, good, strict=False)) == 1,
+        "delayed": [(piece.data, piece.pause_s) for piece in pieces] == [(good, 0.5)],
+        "split": data == good and [piece.pause_s for piece in pieces] == [0, 0.5],
+        "wrong id": (found := decode(data)[1]) and found.payload == packet.payload and found.id != packet.id,
+        "disconnect": [piece.data for piece in pieces] == [None],
+    }[kind]
+
+
+def test_faults_come_at_their_rate_and_the_same_from_the_same_seed():
+    packet = Packet(STOP)
+    runs = []
+    for _ in range(2):
+        faults = LineFaults(0.1, seed=3)
+        runs.append([list(faults.on(packet)) for _ in range(2000)])
+        assert 140 <= sum(faults.counts.values()) <= 260
+    assert runs[0] == runs[1]
+    assert not any(LineFaults().on(packet) is None for _ in range(5))
+
+
+@pytest.mark.parametrize("settings", [{"rate": 1.5}, {"rate": -0.1}, {"kinds": ["gone"]}])
+def test_faults_that_cannot_be_are_refused(settings):
+    with pytest.raises(RobotConfigError):
+        LineFaults(**settings)

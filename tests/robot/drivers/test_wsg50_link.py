@@ -1,0 +1,446 @@
+"""The line to a WSG-50: deadlines, replies told apart, old ones dropped, ports that go away."""
+
+import contextlib
+import itertools
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+
+import pytest
+from serial.urlhandler import protocol_socket
+
+from robot.drivers.wsg50 import codec as wsg50_codec
+from robot.drivers.wsg50 import commands
+from robot.drivers.wsg50 import link as wsg50_link
+from robot.drivers.wsg50.codec import Packet, decode, encode
+from robot.drivers.wsg50.commands import CommandId, Status
+from robot.drivers.wsg50.driver import WSG50
+from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoEcho, NoReply, Port
+from robot.errors import DeviceError
+from tests.waiting import until
+from tests.wsg50_packets import bytes_of
+
+OK = bytes(2)
+
+
+class Peer:
+    """The other end of a TCP line: answers each packet by a function packet -> bytes, or None to hang up."""
+
+    def __init__(self, answer):
+        self.answer, self.heard = answer, []
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def run(self):
+        try:
+            client, _ = self.server.accept()
+        except OSError:
+            return
+        buffer = bytearray()
+        with client:
+            while data := self.receive(client):
+                buffer += data
+                while True:
+                    used, packet = decode(buffer)
+                    del buffer[:used]
+                    if packet is None:
+                        break
+                    self.heard.append(packet.id)
+                    answer = self.answer(packet)
+                    if answer is None:
+                        return
+                    client.sendall(answer)
+
+    def receive(self, client):
+        try:
+            return client.recv(4096)
+        except OSError:
+            return b""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.server.shutdown(socket.SHUT_RDWR)
+        self.server.close()
+        self.thread.join()
+
+
+class Endless:
+    """Stands for a port whose other side sends the same over and over, faster than anybody reads."""
+
+    def __init__(self, data):
+        self.data = data
+
+    def __call__(self, name, **_):
+        return self
+
+    def read(self, timeout_s):
+        return self.data
+
+    def write(self, data): ...
+
+    def close(self): ...
+
+
+class Timed:
+    """Stands for a port, for the time and for a slow computer: a byte that is summed takes 10 us, a look .5 ms.
+
+    What its other side sends is `data` over and over, `at_once` bytes a look; an echo comes too where `echoes`.
+    """
+
+    def __init__(self, data, at_once, echoes):
+        self.stream, self.at_once, self.echoes = itertools.cycle(data), at_once, echoes
+        self.now_s, self.told = 1000.0, b""
+
+    def monotonic(self):
+        return self.now_s
+
+    def __call__(self, name, **_):
+        return self
+
+    def __getitem__(self, index):
+        self.now_s += 1e-5
+        return TABLE[index]
+
+    def read(self, timeout_s):
+        self.now_s += 5e-4
+        told, self.told = self.told, b""
+        return told + bytes(itertools.islice(self.stream, self.at_once))
+
+    def write(self, data):
+        packet = decode(data)[1]
+        if self.echoes and packet and packet.id == CommandId.LOOP:
+            self.told = reply(packet, packet.payload)
+
+    def close(self): ...
+
+
+TABLE = wsg50_codec._TABLE
+HALF = b"\xaa\xaa\xaa\x06\xff\x00"
+UPDATE = encode(Packet(CommandId.SYSTEM_STATE, OK + bytes(4)))
+FLOODS = pytest.mark.parametrize(
+    "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
+)
+
+
+def ends(call, seconds=20.0):
+    """What a call raises or returns, in a thread of its own: a call that does not end fails the test."""
+    ended = []
+
+    def run():
+        try:
+            ended.append(call())
+        except DeviceError as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert ended, f"not ended in {seconds} s"
+    return ended[0]
+
+
+def reply(packet, parameters=b"", status=0):
+    return encode(Packet(packet.id, status.to_bytes(2, "little") + parameters))
+
+
+def echoing(packet):
+    """Answers LOOP, and nothing else."""
+    return reply(packet, packet.payload) if packet.id == CommandId.LOOP else b""
+
+
+def linked(peer, timeout_s=0.2):
+    link = Link(peer.url, timeout_s=timeout_s)
+    link.open()
+    return closing(link)
+
+
+@pytest.fixture(autouse=True)
+def quick_close(monkeypatch):
+    """pyserial waits 0.3 s after closing a socket."""
+    import serial.urlhandler.protocol_socket as protocol
+
+    monkeypatch.setattr(protocol, "time", type("NoWait", (), {"sleep": staticmethod(lambda _: None)}))
+
+
+def test_a_loopback_port_gives_back_what_it_is_given():
+    port = Port("loop://", baud=115200, stop_bits=2, write_timeout_s=1.0)
+    port.write(bytes_of("stop"))
+    got = b""
+    while len(got) < len(bytes_of("stop")):
+        got += port.read(1.0)
+    assert got == bytes_of("stop")
+    assert port.read(0.01) == b""
+    port.close()
+
+
+def test_a_reply_is_found_among_updates_and_noise():
+    def answer(packet):
+        if packet.id == CommandId.LOOP:
+            return echoing(packet)
+        update = encode(Packet(CommandId.OPENING, OK + b"\x00\x00\x16\x43"))
+        return update + b"\xaa\xaa noise" + update + reply(packet, b"\x00\x00\x20\x42")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 40.0
+        assert commands.number(link.updates[CommandId.OPENING][0]) == 150.0
+
+
+def test_pending_is_not_the_end_of_a_command():
+    def answer(packet):
+        return echoing(packet) or reply(packet, status=Status.CMD_PENDING) + reply(packet)
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.call(Packet(CommandId.TARE)) == b""
+        link.begin(Packet(CommandId.HOME, b"\0"))
+        assert [link.poll(CommandId.HOME, 1.0), link.poll(CommandId.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
+        assert link.poll(CommandId.HOME, 0.01) is None
+
+
+def test_another_status_than_success_says_which_command_and_why():
+    with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
+        with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
+            link.tell(Packet(CommandId.STOP))
+        assert caught.value.status is Status.ACCESS_DENIED
+        assert peer.heard.count(CommandId.STOP) == 1  # an answer is an answer
+
+
+def test_silence_ends_with_the_deadline_and_is_asked_three_times():
+    with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
+        started = time.monotonic()
+        with pytest.raises(NoReply, match=r"INFO \(50h\) within 0.05 s"):
+            link.ask(commands.ask(CommandId.INFO), commands.info)
+        assert time.monotonic() - started < 5
+        assert peer.heard.count(CommandId.INFO) == 3
+        assert link.counts["asked again"] == 2
+
+
+@FLOODS
+@pytest.mark.parametrize(
+    ("wait", "end"),
+    [
+        (lambda link: link.pump(0.05), None),
+        (lambda link: link.pump(0.0), None),
+        (lambda link: link.poll(CommandId.HOME, 0.05), None),
+        (lambda link: link.sync(), NoEcho),
+        (lambda link: link.urgent(Packet(CommandId.STOP)), NoReply),
+        (lambda link: link.tell(Packet(CommandId.STOP)), NoEcho),
+    ],
+)
+def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
+    monkeypatch.setattr(wsg50_link, "Port", Endless(data))
+    link = Link("a port", timeout_s=0.05)
+    link.open()
+    ended = ends(lambda: wait(link))
+    assert ended is None if end is None else isinstance(ended, end)
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+@pytest.mark.parametrize("at_once", [1, 512])
+@pytest.mark.parametrize("data", [HALF, HALF + b"\x55", b"\xaa", UPDATE], ids=range(4))
+@pytest.mark.parametrize(
+    ("wait", "time_outs"),
+    [
+        (lambda link: link.poll(CommandId.HOME, 0.1), 1),
+        (lambda link: link.urgent(Packet(CommandId.STOP)), 1),
+        (lambda link: link.sync(), 3),
+        (lambda link: link.call(Packet(CommandId.STOP)), 4),
+        (lambda link: link.tell(Packet(CommandId.STOP)), 7),
+        (lambda link: link.pump(0.0), 0),
+    ],
+    ids=["poll", "urgent", "sync", "call", "tell", "pump"],
+)
+def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, at_once, echoes, monkeypatch):
+    """Half packets byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
+    peer = Timed(data, at_once, echoes)
+    for module, name in ((wsg50_link, "Port"), (wsg50_link, "time"), (wsg50_codec, "_TABLE")):
+        monkeypatch.setattr(module, name, peer)
+    link = Link("a port", timeout_s=0.1)
+    link.open()
+    began = peer.now_s
+    with contextlib.suppress(DeviceError):
+        wait(link)
+    assert peer.now_s - began <= 0.1 * time_outs + 0.05 * (time_outs + 1)  # and what has come by then is decoded
+
+
+@FLOODS
+def test_connecting_ends_though_the_other_side_never_falls_silent(data, monkeypatch):
+    monkeypatch.setattr(wsg50_link, "Port", Endless(data))
+    gripper = WSG50(port="a port", timeout_s=0.05)
+    assert "is it on, and connected" in str(ends(gripper.connect))
+    assert not gripper.is_connected
+
+
+def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end():
+    """pyserial reads on opening until nothing comes; here something comes whenever it looks."""
+    pending = [b"x"] * 100
+    with Peer(echoing) as peer, pytest.MonkeyPatch.context() as patch:
+        real = select.select
+
+        def always(read, write, other, timeout=None):
+            return (read, write, other) if pending and pending.pop() else real(read, write, other, timeout)
+
+        patch.setattr(protocol_socket.select, "select", always)
+        Port(peer.url, baud=9600, stop_bits=1, write_timeout_s=1.0).close()
+        assert len(pending) > 90
+
+
+def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
+    updates = b"".join(encode(Packet(CommandId.OPENING, OK + struct.pack("<f", each))) for each in range(800))
+
+    def answer(packet):
+        return echoing(packet) or reply(packet) + updates
+
+    with Peer(answer) as peer, linked(peer) as link:
+        link.tell(Packet(CommandId.STOP))
+        time.sleep(0.2)
+        link.pump(0.0)
+        assert commands.number(link.updates[CommandId.OPENING][0]) == 799.0
+
+
+def test_a_command_that_was_heard_damaged_is_asked_again():
+    statuses = [11, 0]
+
+    def answer(packet):
+        return echoing(packet) or reply(packet, status=statuses.pop(0))
+
+    with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
+        link.tell(Packet(CommandId.STOP))
+        assert peer.heard.count(CommandId.STOP) == 2
+        assert link.counts == {"asked again": 1}
+
+
+def test_where_nobody_echoes_nothing_is_asked_again():
+    with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
+        with pytest.raises(NoEcho):
+            link.tell(Packet(CommandId.STOP))
+        until(lambda: len(peer.heard) == 3)
+        time.sleep(0.1)
+        assert peer.heard == [CommandId.LOOP] * 3
+
+
+def test_a_gripper_that_echoes_nothing_is_not_there():
+    with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
+        with pytest.raises(NoReply, match="is it on, and connected"):
+            link.call(Packet(CommandId.STOP))
+        assert set(peer.heard) == {CommandId.LOOP}  # nothing was told to a line in doubt
+
+
+def test_a_late_reply_is_never_taken_for_the_present_one():
+    """The first question is answered after the second was asked; without the echo the old value would be taken."""
+    late = []
+
+    def answer(packet):
+        if packet.id == CommandId.LOOP:
+            return b"".join(late) + echoing(packet)
+        if not late:
+            late.append(reply(packet, b"\x00\x00\x80\x3f"))  # 1.0
+            return b""
+        return reply(packet, b"\x00\x00\x00\x40")  # 2.0
+
+    with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
+        with pytest.raises(NoReply):
+            link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
+        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 2.0
+        assert link.counts["unexpected"] == 1
+
+
+def test_a_doubled_reply_raises_doubt_before_the_next_command():
+    def answer(packet):
+        return echoing(packet) or 2 * reply(packet, b"\x00\x00\x80\x3f")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
+        link.pump(0.05)
+        loops = peer.heard.count(CommandId.LOOP)
+        link.call(commands.ask(CommandId.GET_ACCELERATION))
+        assert peer.heard.count(CommandId.LOOP) == loops + 1
+
+
+def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
+    half = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never come
+
+    def answer(packet):
+        return echoing(packet) or half + reply(packet, b"\x00\x00\x80\x3f")
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 1.0
+        assert link.counts["given up"] >= 1
+
+
+def test_replies_of_the_wrong_length_are_asked_again():
+    answers = [b"\x01", b"\x00\x00\x80\x3f"]
+
+    def answer(packet):
+        return echoing(packet) or reply(packet, answers.pop(0))
+
+    with Peer(answer) as peer, linked(peer) as link:
+        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 1.0
+        assert answers == []
+
+
+def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
+    with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
+        link.doubt()
+        link.urgent(Packet(CommandId.STOP))
+        assert peer.heard == [CommandId.STOP]
+
+
+def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
+    with Peer(lambda packet: None) as peer:
+        link = Link(peer.url, timeout_s=0.5)
+        link.open()
+        with pytest.raises(LinkLost, match=r"is gone.*recover"):
+            link.sync()
+        assert not link.is_open
+        with pytest.raises(LinkLost, match="must be open"):
+            link.tell(Packet(CommandId.STOP))
+        link.close()
+    with Peer(echoing) as other:
+        link.name = other.url
+        link.open()
+        link.open()
+        link.sync()
+        link.close()
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "port", ["/nowhere/tty", "socket://127.0.0.1:1", "socket://127.0.0.1", "what://is this", "loop://?x=1"]
+)
+def test_a_port_that_cannot_be_opened_is_a_sentence(port):
+    with pytest.raises(LinkLost, match="cannot be opened"):
+        Link(port).open()
+
+
+def test_a_terminal_that_goes_away_is_noticed():
+    own, other = os.openpty()
+    link = Link(os.ttyname(other), timeout_s=0.5)
+    link.open()
+    os.close(other)
+    os.close(own)
+    with pytest.raises(LinkLost):
+        link.sync()
+    assert not link.is_open
+
+
+def test_without_pyserial_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(DeviceError, match="needs pyserial, which is missing; run pip install pyserial"):
+        Link("loop://").open()
+
+
+def test_no_module_of_the_driver_needs_pyserial_to_be_imported():
+    blocked = (
+        "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, tests.emulators.wsg50.server"
+    )
+    subprocess.run([sys.executable, "-c", blocked], check=True, timeout=60)

@@ -1,0 +1,341 @@
+"""What holds of every importer, on a miniature of its data set; test_robot_importers_<name> has what is its own."""
+
+import re
+from hashlib import sha256
+from importlib import import_module
+from pathlib import Path
+
+import cv2
+import pytest
+
+from benchmarks.reference import DATA_SETS, data_sets
+from retrieval.commands.main import main
+from retrieval.data.check.recording import check_split
+from retrieval.data.dataset import Split, load_grasps
+from robot.errors import ImporterError, RecordingError, RobotError, UnknownName
+from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, read_options, title_of
+from robot.importers.base import SPLITS_FOLDER, DataSet, Item, Published, Skip, import_items, name_of, numbered
+from robot.recording.folder import RecordingWriter, Shared, read_recording
+from robot.storage import object_of
+from tests.documents import text_of
+from tests.miniatures import encoded, picture, pixels
+
+PICTURES = {".png", ".jpg"}
+SAID_BY_THE_SOURCE = ("folder", "lerobot", "open-x-tactile")
+"""Which sensor it was, and the like, differs from source to source."""
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
+@pytest.fixture(scope="module", params=IMPORTERS)
+def name(request):
+    return request.param
+
+
+def miniature(name):
+    return import_module(f"tests.miniatures.{name.replace('-', '_')}")
+
+
+@pytest.fixture
+def source(name, tmp_path):
+    miniature(name).write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+def content(folder):
+    """Every file of a folder by path and digest."""
+    return {
+        path.relative_to(folder): sha256(path.read_bytes()).digest() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+# Every importer ------------------------------------------------------------------------------------------------
+
+
+def test_a_data_set_becomes_a_recording_that_says_what_it_is(name, source, tmp_path):
+    recording = load_importer(name)(source, tmp_path / "out")
+    assert len(recording.grasps) == miniature(name).GRASPS
+    facts = data_set_of(name)
+    for key in ("source", "licence", "citation", "sensor", "fingers", "background"):
+        assert recording.info[key]
+        assert recording.info[key] == getattr(facts, key) or name in SAID_BY_THE_SOURCE
+    assert {len(grasp.touches) for grasp in recording.grasps} == {recording.info["fingers"]}
+    for grasp in recording.grasps:
+        assert all(cv2.imread(str(recording.folder / path)) is not None for path in grasp.images().values())
+        assert bool(grasp.touches_before) == (recording.info["background"] != "none")
+    assert load_grasps(tmp_path / "out")
+
+
+def test_a_recording_says_its_traps_and_what_of_the_layout_is_unverified(name, source, tmp_path):
+    recording = load_importer(name)(source, tmp_path / "out")
+    for note in data_set_of(name).notes():
+        assert note in recording.notes
+        assert note in recording.info["notes"]
+
+
+def test_a_second_import_reads_no_grasp_again_and_changes_no_byte(name, source, tmp_path, monkeypatch):
+    importer = load_importer(name)
+    first = importer(source, tmp_path / "out")
+    before = content(tmp_path / "out")
+    monkeypatch.setattr(RecordingWriter, "append", None)
+    assert importer(source, tmp_path / "out") == first
+    assert content(tmp_path / "out") == before
+
+
+def test_an_import_that_was_stopped_goes_on_and_ends_with_the_same_bytes(name, source, tmp_path):
+    def stop(done, total):
+        if done == total // 2 + 1:
+            raise KeyboardInterrupt
+
+    importer = load_importer(name)
+    with pytest.raises(KeyboardInterrupt):
+        importer(source, tmp_path / "out", stop)
+    held = len(read_recording(tmp_path / "out").grasps)
+    assert 0 < held < miniature(name).GRASPS
+    assert len(importer(source, tmp_path / "out").grasps) == miniature(name).GRASPS
+    importer(source, tmp_path / "whole")
+    assert content(tmp_path / "out") == content(tmp_path / "whole")
+
+
+def test_progress_is_told_after_each_grasp_and_ends_at_the_total(name, source, tmp_path):
+    calls = []
+    load_importer(name)(source, tmp_path / "out", lambda done, total: calls.append((done, total)))
+    assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
+    assert calls[-1][0] == calls[-1][1] >= miniature(name).GRASPS
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_folder_that_is_not_the_data_set_is_refused_in_a_sentence_and_nothing_is_made(name, there, tmp_path):
+    if there:
+        picture(tmp_path / "src/holiday/beach.jpg", 1)
+        (tmp_path / "src/notes.txt").write_text("nothing of the kind")
+    with pytest.raises(ImporterError) as caught:
+        load_importer(name)(tmp_path / "src", tmp_path / "out")
+    assert str(tmp_path / "src") in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("harm", ["empty", "garbage", "half", "folder", "gone"])
+def test_broken_files_cost_their_own_grasps_and_no_traceback(name, source, tmp_path, harm):
+    """Each kind of file in turn, the first and the last of it."""
+    by_kind = {}
+    for path in sorted(path for path in source.rglob("*") if path.is_file()):
+        by_kind.setdefault((path.suffix, len(path.relative_to(source).parts)), []).append(path)
+    for files in by_kind.values():
+        for path in {files[0], files[-1]}:
+            whole = path.read_bytes()
+            damage(path, whole, harm)
+            out = tmp_path / f"out-{sha256(str(path).encode()).hexdigest()[:8]}"
+            try:
+                recording = load_importer(name)(source, out)
+            except RobotError:
+                pass
+            else:
+                lost = miniature(name).GRASPS - len(recording.grasps)
+                assert lost >= 0
+                if lost and path.suffix in PICTURES and harm not in ("gone", "folder"):
+                    assert any(note.startswith("skipped") for note in recording.notes)
+                for grasp in recording.grasps:
+                    assert all(cv2.imread(str(out / image)) is not None for image in grasp.images().values())
+            repair(path, whole)
+
+
+def damage(path, whole, harm):
+    if harm in ("gone", "folder"):
+        path.unlink()
+    if harm == "folder":
+        path.mkdir()
+    if harm in ("empty", "garbage", "half"):
+        path.write_bytes({"empty": b"", "garbage": b"\x00garbage" * 9, "half": whole[: len(whole) // 2]}[harm])
+
+
+def repair(path, whole):
+    if path.is_dir():
+        path.rmdir()
+    path.write_bytes(whole)
+
+
+def test_published_splits_leak_no_object_and_no_sequence(name, source, tmp_path):
+    recording = load_importer(name)(source, tmp_path / "out")
+    grasps = load_grasps(tmp_path / "out")
+    for path in (tmp_path / "out" / SPLITS_FOLDER).glob("*.json"):
+        split = Split.from_dict(object_of(path.read_bytes(), RecordingError))
+        assert not [each for each in check_split(grasps, split) if each.severity == "error"]
+        assert {each for part in (split.train, split.validation, split.test) for each in part} <= {
+            grasp.object_id for grasp in recording.grasps
+        }
+
+
+def test_the_command_imports_it_and_lists_it(name, source, tmp_path, capsys):
+    assert main(["import", name, str(source), "--out", str(tmp_path / "out")]) == 0
+    assert f"{miniature(name).GRASPS} grasps of" in capsys.readouterr().err
+    assert main(["import"]) == 0
+    assert [title_of(name)] == [
+        line.removeprefix(name).strip() for line in capsys.readouterr().out.splitlines() if line.split()[0] == name
+    ]
+
+
+# The table, and options ------------------------------------------------------------------------------------------
+
+
+def test_every_miniature_has_its_importer():
+    files = {path.stem for path in (Path(__file__).parents[2] / "miniatures").glob("[!_]*.py")}
+    assert files == {name.replace("-", "_") for name in IMPORTERS}
+
+
+def test_the_page_of_data_sets_is_that_of_the_importers():
+    assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
+
+
+def test_an_unknown_name_lists_the_known_ones(capsys):
+    with pytest.raises(UnknownName, match=r"'bilets'; known: billets") as caught:
+        load_importer("bilets")
+    assert caught.value.exit_code == 2
+    assert main(["import", "bilets", "src", "--out", "out"]) == 2
+    said = capsys.readouterr().err
+    assert all(title_of(name) in said for name in IMPORTERS)
+
+
+def test_an_import_without_a_folder_says_what_it_needs(capsys):
+    assert main(["import", "billets"]) == 2
+    assert "retrieve import billets SRC --out recording/" in capsys.readouterr().err
+
+
+def with_options(
+    src, out, progress=None, *, sensor: str = "mine", every: int = 1, share: float = 0.5, all: bool = True
+):
+    """An importer."""
+
+
+def test_options_are_read_by_the_kind_that_the_importer_names():
+    assert options_of(with_options)["every"] == (int, 1)
+    words = ["sensor=GelSight = Mini", "every=3", "share=0.25", "all=false"]
+    assert read_options(with_options, words) == {"sensor": "GelSight = Mini", "every": 3, "share": 0.25, "all": False}
+
+
+@pytest.mark.parametrize("word", ["every=many", "every=", "all=no", "nonsense=1", "every", "=3", ""])
+def test_other_options_are_refused_in_a_sentence(word):
+    with pytest.raises(ImporterError, match="every") as caught:
+        read_options(with_options, [word]) if word != "all=no" else read_options(with_options, ["every=all=no"])
+    assert caught.value.exit_code == 2
+
+
+# The loop they share -----------------------------------------------------------------------------------------------
+
+FACTS = DataSet("here", "none", "nobody", "gel", "by hand", "nothing", traps=("beware",), unverified=("its size",))
+
+
+def item(number, **changes):
+    images = {"photo": encoded(".jpg", number), "touch_a": encoded(".png", 100 + number)}
+    return Item(f"g{number}", f"object{number % 2}", images | changes, {"sequence_id": "s"})
+
+
+def run(items, out, **more):
+    items = list(items)
+    return import_items(FACTS, iter(items), out, total=len(items), **more)
+
+
+def test_skips_are_counted_by_reason_with_the_first_names(tmp_path):
+    items = [item(0), *(Skip("it is dark", f"n{n}") for n in range(5)), item(1, touch_a=tmp_path / "gone.png")]
+    recording = run(items, tmp_path / "out")
+    assert recording.notes == (
+        "skipped 5: it is dark, such as n0, n1, n2",
+        "skipped 1: its touch a is missing, such as g1",
+        "beware",
+        "not verified on the data itself: its size",
+    )
+    assert read_recording(tmp_path / "out").info["skipped"] == {"it is dark": 5, "its touch a is missing": 1}
+
+
+def test_of_a_hostile_source_not_every_reason_is_kept(tmp_path):
+    recording = run([item(0), *(Skip(f"reason {n}", "x") for n in range(1000))], tmp_path / "out")
+    assert len(recording.info["skipped"]) == 21
+    assert recording.info["skipped"]["another reason"] == 980
+
+
+def test_a_path_longer_than_a_disk_takes_costs_its_own_grasp(tmp_path):
+    recording = run([item(0), item(1, photo=tmp_path / ("a" * 5000))], tmp_path / "out")
+    assert recording.info["skipped"] == {"its photo is missing": 1}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_picture_that_is_cut_off_is_not_imported(tmp_path, suffix):
+    cut = encoded(suffix, 1)[:-9]
+    recording = run([item(0), item(1, photo=cut)], tmp_path / "out")
+    assert recording.info["skipped"] == {"its photo is cut off": 1}
+
+
+def test_what_makes_a_picture_is_called_when_it_is_its_turn_and_not_for_grasps_that_are_held(tmp_path):
+    calls = []
+
+    def made(number):
+        calls.append(number)
+        return pixels(number)
+
+    items = [item(n, touch_a=lambda n=n: made(n)) for n in range(3)]
+    run(items[:2], tmp_path / "out")
+    assert calls == [0, 1]
+    run(items, tmp_path / "out")
+    assert calls == [0, 1, 2]
+
+
+def test_one_frame_of_many_grasps_is_read_and_kept_once(tmp_path):
+    calls = []
+
+    def frame():
+        calls.append(1)
+        return pixels(7)
+
+    recording = run([item(n, touch_a_before=Shared("rest", frame)) for n in range(3)], tmp_path / "out")
+    assert calls == [1]
+    assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/rest_shared.png"}
+
+
+def test_two_grasps_of_one_name_are_not_mixed(tmp_path):
+    recording = run([item(0), item(0, photo=encoded(".jpg", 50))], tmp_path / "out")
+    assert len(recording.grasps) == 1
+    assert recording.info["skipped"] == {"another grasp has its name": 1}
+
+
+def test_a_source_of_which_nothing_can_be_imported_is_an_error_that_says_why(tmp_path):
+    with pytest.raises(ImporterError, match=r"no grasp could be imported: skipped 1: it is dark, such as n"):
+        run([Skip("it is dark", "n")], tmp_path / "out")
+
+
+def test_what_the_disk_refuses_to_read_is_an_error_that_names_the_file(tmp_path):
+    def broken():
+        yield item(0)
+        (tmp_path / "gone").read_bytes()
+
+    with pytest.raises(ImporterError, match=r"gone cannot be read: No such file or directory"):
+        import_items(FACTS, broken(), tmp_path / "out", total=1)
+
+
+def test_a_published_split_is_kept_and_one_that_tears_objects_apart_is_told(tmp_path):
+    splits = {
+        "good": {"train": ["object0"], "test": ["object1"]},
+        "bad": {"train": ["object0", "object1"], "test": ["object1"]},
+    }
+    published = Published({"object0": {"material": "wood"}}, splits)
+    recording = run([item(0), item(1)], tmp_path / "out", published=published)
+    kept = tmp_path / "out" / SPLITS_FOLDER / "good.json"
+    assert Split.from_dict(object_of(kept.read_bytes(), RecordingError)) == Split(0, ("object0",), (), ("object1",))
+    assert not kept.with_name("bad.json").exists()
+    assert any("'bad' has grasps of 1 object(s) on two sides" in note for note in recording.notes)
+    assert recording.info["objects"] == {"object0": {"material": "wood"}}
+
+
+def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
+    assert name_of("mug", "01") == "mug-01"
+    strange = [name_of("my mug", "1"), name_of("my/mug", "1"), name_of("..", "1"), name_of("é" * 300), name_of("", "")]
+    strange += [name_of("caf\udce9"), name_of("caf\ud800")]  # a file's name that is no UTF-8; what JSON may escape
+    assert len(set(strange)) == len(strange)
+    assert all(each[0].isalnum() and len(each) <= 128 for each in strange)
+
+
+def test_files_are_in_the_order_of_their_numbers(tmp_path):
+    for each in ("img_10.png", "img_9.png", "img_2_b.png", "img_2_a.png", "Thumbs.db"):
+        (tmp_path / each).touch()
+    found = [path.name for _, path in numbered(tmp_path, re.compile(r"img_(\d+).*\.png"))]
+    assert found == ["img_2_a.png", "img_2_b.png", "img_9.png", "img_10.png"]
+    assert not list(numbered(tmp_path / "gone", re.compile(".*")))

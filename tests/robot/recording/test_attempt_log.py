@@ -1,0 +1,161 @@
+"""attempts.jsonl: what counts of it after a crash, and acceptance by object."""
+
+import json
+
+import pytest
+
+from robot.errors import RecordingError, StorageError
+from robot.recording.attempt_log import AttemptLog, LoggedAttempt, acceptance_table, read_attempts, tally
+from tests.robot.recording.test_crash import FullDisk
+
+HELD = LoggedAttempt("mug", 0, "held", True, 12.5, "mug-0000", 0.75, {"method": "circle", "error_mm": 0.3})
+NO_PLAN = LoggedAttempt("mug", 1, "no_plan", False, 13.0, reason="the object is wider than the stroke")
+MISSED = LoggedAttempt("mug", 2, "missed", False, 20.0, "mug-0002", 0.0)
+SLIPPED = LoggedAttempt("cup, blue", 0, "slipped", True, 31.0, "cup-0000", 1.0)
+ALL = (HELD, NO_PLAN, MISSED, SLIPPED)
+GRASPS = {attempt.grasp_id for attempt in ALL} - {None}
+
+
+def write(folder, attempts=ALL, grasps=GRASPS):
+    with AttemptLog(folder, grasps) as log:
+        for attempt in attempts:
+            log.append(attempt)
+    return folder / "attempts.jsonl"
+
+
+def test_what_is_appended_is_read(tmp_path):
+    path = write(tmp_path)
+    assert read_attempts(tmp_path, GRASPS) == list(ALL)
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    assert rows[1] == {
+        "object_id": "mug",
+        "number": 1,
+        "outcome": "no_plan",
+        "accepted": False,
+        "ended_s": 13.0,
+        "reason": "the object is wider than the stroke",
+    }
+
+
+def test_an_ungraspable_object_is_in_the_log_and_named_in_the_table_but_was_not_attempted(tmp_path):
+    ball = LoggedAttempt("ball", 0, "ungraspable", False, 31.0, reason="wider than the gripper opens")
+    write(tmp_path, (*ALL, ball))
+    tallies = list(tally(read_attempts(tmp_path, GRASPS)).values())
+    assert (tallies[2].attempts, tallies[2].skipped) == (0, "wider than the gripper opens")
+    assert [each.skipped for each in tallies[:2]] == [None, None]
+    assert acceptance_table(tallies, wanted=2).splitlines()[1:] == [
+        "mug               1   3     1       1        0        1  gave up",
+        "cup, blue         1   1     0       0        1        0  gave up",
+        "ball              0   0     0       0        0        0  skipped: wider than the gripper opens",
+        "all               2   4     1       1        1        1",
+    ]
+
+
+def test_a_log_is_continued(tmp_path):
+    whole = write(tmp_path / "", ALL).read_bytes()
+    other = tmp_path / "other"
+    other.mkdir()
+    write(other, ALL[:2])
+    with AttemptLog(other, GRASPS) as log:
+        assert log.attempts == list(ALL[:2])
+        for attempt in ALL[2:]:
+            log.append(attempt)
+    assert (other / "attempts.jsonl").read_bytes() == whole
+
+
+def test_half_a_last_line_does_not_count_wherever_it_was_cut(tmp_path):
+    path = write(tmp_path)
+    whole = path.read_bytes()
+    last = whole.rindex(b"\n", 0, -1) + 1
+    for end in range(last, len(whole)):
+        path.write_bytes(whole[:end])
+        assert read_attempts(tmp_path, GRASPS) == list(ALL[:3])
+        with AttemptLog(tmp_path, GRASPS) as log:
+            log.append(SLIPPED)
+        assert path.read_bytes() == whole
+
+
+def test_a_last_line_whose_grasp_was_never_appended_does_not_count(tmp_path):
+    path = write(tmp_path)
+    whole = path.read_bytes()
+    assert read_attempts(tmp_path, GRASPS - {"cup-0000"}) == list(ALL[:3])
+    AttemptLog(tmp_path, GRASPS - {"cup-0000"}).close()
+    assert path.read_bytes() == whole[: whole.rindex(b"\n", 0, -1) + 1]
+
+
+def test_an_earlier_line_without_its_grasp_is_damage(tmp_path):
+    write(tmp_path)
+    with pytest.raises(RecordingError, match=r"attempts\.jsonl, line 1: its grasp mug-0000 is not in the recording"):
+        read_attempts(tmp_path, GRASPS - {"mug-0000"})
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"",
+        b"[]",
+        b"{",
+        b"\xff",
+        b'{"object_id": "mug"}',
+        b'{"object_id": "mug", "number": 0, "outcome": "lost", "accepted": true, "ended_s": 1.0}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": 1, "ended_s": 1.0}',
+        b'{"object_id": "mug", "number": "0", "outcome": "held", "accepted": true, "ended_s": 1.0}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": null}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": "1.0"}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": NaN}',
+        b'{"object_id": "mug", "number": 0, "outcome": ["held"], "accepted": true, "ended_s": 1.0}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "grasp_id": []}',
+        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "colour": 3}',
+        b'{"object_id": "mug", "number": 1, "outcome": "held", "accepted": true, "ended_s": 1.0}',
+    ],
+)
+def test_a_damaged_line_is_named(tmp_path, line):
+    path = write(tmp_path)
+    path.write_bytes(line + b"\n" + path.read_bytes())
+    with pytest.raises(RecordingError, match=r"attempts\.jsonl, line 1: "):
+        read_attempts(tmp_path, GRASPS)
+
+
+def test_an_attempt_that_is_there_twice_is_damage(tmp_path):
+    path = write(tmp_path)
+    path.write_bytes(path.read_bytes() + path.read_bytes().splitlines(keepends=True)[1])
+    with pytest.raises(RecordingError, match="line 5: attempts must be in order and there once, so that number 3 is"):
+        read_attempts(tmp_path, GRASPS)
+
+
+def test_a_full_disk_leaves_whole_lines(tmp_path):
+    path = write(tmp_path, ALL[:2])
+    whole = path.read_bytes()
+    with AttemptLog(tmp_path, GRASPS) as log:
+        file, log._file = log._file, FullDisk(log._file, 7)
+        with pytest.raises(StorageError, match="No space left on device"):
+            log.append(MISSED)
+        assert path.read_bytes() == whole
+        log._file = file
+        log.append(MISSED)
+    assert read_attempts(tmp_path, GRASPS) == list(ALL[:3])
+
+
+def test_there_may_be_no_log(tmp_path):
+    assert read_attempts(tmp_path, GRASPS) == []
+
+
+# Acceptance -------------------------------------------------------------------------------------------------
+
+
+def test_attempts_are_counted_by_object():
+    mug, cup = tally(ALL).values()
+    assert (mug.object_id, mug.attempts, mug.accepted) == ("mug", 3, 1)
+    assert mug.outcomes == {"held": 1, "no_plan": 1, "missed": 1}
+    assert mug.reasons == {"the object is wider than the stroke": 1}
+    assert (cup.attempts, cup.accepted) == (1, 1)
+
+
+def test_the_table_has_a_line_an_object_and_says_who_was_given_up():
+    assert acceptance_table(list(tally(ALL).values()), wanted=1).splitlines() == [
+        "object     accepted  of  held  missed  slipped  no_plan",
+        "mug               1   3     1       1        0        1",
+        "cup, blue         1   1     0       0        1        0",
+        "all               2   4     1       1        1        1",
+    ]
+    assert acceptance_table(list(tally(ALL).values()), wanted=2).count("gave up") == 2

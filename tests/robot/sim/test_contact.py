@@ -1,0 +1,306 @@
+"""The contact solver: closed forms, another solver on small grids, units, soft objects, flags and wrong input."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from benchmarks.frontier.closed_forms import closed_form_table
+from robot.errors import RobotConfigError, SceneError
+from robot.sim.contact import kernels
+from robot.sim.contact import scaled_problem as pressing
+from robot.sim.contact.kernels import influence
+from robot.sim.contact.layer import Layer, press
+
+HALF_SPACE = Layer(0.2, 0.48)
+GEL = Layer(0.2, 0.48, 2.0)
+PIXEL = 0.12
+
+
+def bowl(rows=40, cols=48, radius=4.0, pixel=PIXEL):
+    y, x = (pixel * (np.arange(n) - (n - 1) / 2.0) for n in (rows, cols))
+    return (y[:, None] ** 2 + x**2) / (2.0 * radius)
+
+
+def matrix(layer, shape, pixel):
+    """Displacement of each pixel (mm) by unit pressure (MPa) on each other one, entry by entry."""
+    table = influence(shape, layer.thickness_mm / pixel, layer.poisson) * pixel / layer.plane_modulus_mpa
+    cells = [(i, j) for i in range(shape[0]) for j in range(shape[1])]
+    return np.array([[table[abs(i - k), abs(j - m)] for i, j in cells] for k, m in cells])
+
+
+# Closed forms ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def table():
+    return closed_form_table()
+
+
+def test_the_solver_is_within_the_prototype_s_error_of_every_closed_form(table):
+    assert [f"{check.case}, {check.quantity}, {check.grid}: {check.error}" for check in table if not check.holds] == []
+
+
+@pytest.mark.parametrize(
+    "case",
+    ["Hertz", "flat punch", "cone", "cylinder", "wavy", "thin compressible", "thin incompressible", "half-space"],
+)
+def test_the_table_covers(table, case):
+    assert any(check.case.startswith(case) for check in table)
+
+
+def test_errors_fall_with_the_grid(table):
+    errors = [abs(c.error) for c in table if c.case == "Hertz, 0.5 N" and c.quantity == "depth"]
+    assert errors == sorted(errors, reverse=True)
+    assert len(errors) == 3
+
+
+# Another solver --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3), Layer(0.2, 0.0, 0.05), Layer(5.0, 0.3, 1.0)])
+@pytest.mark.parametrize("kind", ["ball", "rough", "holes"])
+def test_pressure_is_that_of_an_active_set_method(layer, kind):
+    # min 1/2 p.K p + p.(gap - d), p >= 0, is the least squares problem of K's Cholesky factor.
+    shape, depth = (9, 8), 0.1
+    rough = np.random.default_rng([5]).random(shape) * 0.2
+    gap = {"ball": bowl(*shape, radius=1.0), "rough": rough, "holes": np.where(rough > 0.1, np.inf, rough)}[kind]
+    there = np.isfinite(gap).ravel()
+    factor = np.linalg.cholesky(matrix(layer, shape, PIXEL)[np.ix_(there, there)])
+    wanted = np.zeros(gap.size)
+    wanted[there] = nnls(factor.T, np.linalg.solve(factor, depth - gap.ravel()[there]))[0]
+    contact = press(gap, PIXEL, layer, depth_mm=depth, tolerance=1e-9)
+    assert contact.converged
+    assert contact.pressure_mpa.ravel() == pytest.approx(wanted, abs=1e-6 * wanted.max())  # K's condition, 1e3
+    assert contact.force_n == pytest.approx(wanted.sum() * PIXEL**2, rel=1e-8)
+
+
+@pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3)])
+@pytest.mark.parametrize("padded", [True, False])
+def test_a_depth_and_the_force_that_it_takes_are_one_contact(layer, padded):
+    gap = bowl()
+    by_force = press(gap, PIXEL, layer, force_n=0.3, tolerance=1e-8, padded=padded)
+    by_depth = press(gap, PIXEL, layer, depth_mm=by_force.approach_mm, tolerance=1e-8, padded=padded)
+    assert by_depth.force_n == pytest.approx(0.3, rel=1e-6)
+    assert by_depth.pressure_mpa == pytest.approx(by_force.pressure_mpa, abs=1e-5 * by_force.pressure_mpa.max())
+
+
+def test_displacement_is_the_influence_of_the_pressure():
+    gap = bowl(12, 10)
+    contact = press(gap, PIXEL, GEL, force_n=0.05)
+    exact = matrix(GEL, gap.shape, PIXEL) @ contact.pressure_mpa.ravel()
+    assert contact.displacement_mm.ravel() == pytest.approx(exact, rel=1e-10)
+
+
+# Coarse grid and window ------------------------------------------------------------------------------------
+
+
+def test_starting_from_a_coarse_grid_changes_nothing_but_the_time(monkeypatch):
+    gap = bowl(61, 83) + 0.02 * np.random.default_rng([6]).random((61, 83))
+    nested = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
+    monkeypatch.setattr(pressing, "_NEST_FROM", 1000)
+    plain = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
+    assert nested.pressure_mpa == pytest.approx(plain.pressure_mpa, abs=1e-6 * plain.pressure_mpa.max())
+    assert nested.approach_mm == pytest.approx(plain.approach_mm, rel=1e-8)
+
+
+def test_only_a_window_around_the_contact_is_iterated_on(monkeypatch):
+    sizes = []
+    original = kernels.Operator.__call__
+    monkeypatch.setattr(kernels.Operator, "__call__", lambda self, p: sizes.append(p.shape) or original(self, p))
+    contact = press(bowl(120, 160), PIXEL, GEL, force_n=0.05)
+    assert contact.converged
+    assert sizes.count((120, 160)) == 1  # one look at the whole field, for the answer
+    assert max(rows for rows, cols in sizes if (rows, cols) != (120, 160)) <= 45
+
+
+def test_what_the_coarse_grid_does_not_see_is_found():
+    # A needle of one pixel is 1/16 of its coarse pixel: the mean says it is far away.
+    gap = bowl(64, 64)
+    gap[5, 60] = -0.05
+    contact = press(gap, PIXEL, GEL, force_n=0.2, tolerance=1e-6)
+    assert contact.converged
+    assert contact.pressure_mpa[5, 60] > 0.0
+    assert contact.pressure_mpa[31, 31] > 0.0
+    distance = contact.displacement_mm + gap - contact.approach_mm
+    assert distance.min() > -1e-6 * contact.displacement_mm.max()
+
+
+def test_a_contact_moved_by_a_pixel_is_the_same_contact_moved_by_a_pixel():
+    gap = bowl(71, 70)
+    here, there = (press(gap[i : i + 70, :69], PIXEL, GEL, force_n=0.1, tolerance=1e-9) for i in (0, 1))
+    assert here.pressure_mpa[1:] == pytest.approx(there.pressure_mpa[:-1], abs=1e-7 * here.pressure_mpa.max())
+
+
+# Units and soft objects ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layer", [HALF_SPACE, GEL])
+def test_metres_newtons_and_pascals_give_the_same_contact(layer):
+    in_mm = press(bowl(), PIXEL, layer, force_n=0.3)
+    si = Layer(layer.modulus_mpa * 1e6, layer.poisson, layer.thickness_mm * 1e-3)
+    in_m = press(bowl() * 1e-3, PIXEL * 1e-3, si, force_n=0.3)
+    assert in_m.iterations == in_mm.iterations
+    assert in_m.pressure_mpa == pytest.approx(in_mm.pressure_mpa * 1e6, rel=1e-9)
+    assert in_m.displacement_mm == pytest.approx(in_mm.displacement_mm * 1e-3, rel=1e-9)
+
+
+def test_a_constant_added_to_the_gap_is_added_to_the_approach():
+    near, far = (press(bowl() + shift, PIXEL, GEL, force_n=0.3) for shift in (0.0, 7.0))
+    assert far.approach_mm == pytest.approx(near.approach_mm + 7.0, rel=1e-12)
+    # 7 mm less 7 mm leaves the rounding of 7 mm.
+    assert far.pressure_mpa == pytest.approx(near.pressure_mpa, rel=1e-6, abs=1e-9)
+
+
+def test_two_half_spaces_touch_like_one_of_the_composite_modulus():
+    # 1/E* = (1 - .48^2)/.2 + (1 - .3^2)/.5
+    composite = 1.0 / ((1.0 - 0.48**2) / 0.2 + (1.0 - 0.3**2) / 0.5)
+    soft = press(bowl(), PIXEL, HALF_SPACE, force_n=0.3, object_modulus_mpa=0.5, object_poisson=0.3)
+    rigid = press(bowl(), PIXEL, Layer(composite, 0.0), force_n=0.3)
+    assert soft.pressure_mpa == pytest.approx(rigid.pressure_mpa, rel=1e-9)
+    assert soft.approach_mm == pytest.approx(rigid.approach_mm, rel=1e-9)
+    # The gel's share of the displacement is its share of the compliance.
+    share = composite * (1.0 - 0.48**2) / 0.2
+    assert soft.displacement_mm == pytest.approx(share * rigid.displacement_mm, rel=1e-9)
+
+
+def test_a_softer_object_touches_more_and_indents_less():
+    presses = [press(bowl(), PIXEL, GEL, force_n=0.3, object_modulus_mpa=e) for e in (0.01, 0.2, 2e5, math.inf)]
+    assert all(contact.converged for contact in presses)
+    assert [c.area_mm2 for c in presses] == sorted((c.area_mm2 for c in presses), reverse=True)
+    assert [c.displacement_mm.max() for c in presses] == sorted(c.displacement_mm.max() for c in presses)
+    assert presses[2].displacement_mm == pytest.approx(presses[3].displacement_mm, rel=1e-4)
+
+
+def test_a_rigid_object_costs_no_operator_of_its_own(monkeypatch):
+    made = []
+    original = pressing._operator
+    monkeypatch.setattr(pressing, "_operator", lambda *key: made.append(key[2]) or original(*key))
+    press(bowl(), PIXEL, GEL, force_n=0.3)
+    assert set(made) == {2.0 / PIXEL}
+
+
+# Flags -----------------------------------------------------------------------------------------------------
+
+
+def test_a_resolved_light_press_has_no_flags():
+    contact = press(bowl(), PIXEL, GEL, force_n=0.3)
+    assert contact.flags == ()
+    assert contact.converged
+    assert contact.residual <= 1e-3
+    assert contact.force_n == pytest.approx(0.3, rel=1e-12)
+    assert contact.area_mm2 == pytest.approx((contact.pressure_mpa > 0.0).sum() * PIXEL**2)
+
+
+@pytest.mark.parametrize(
+    ("flag", "gap", "options"),
+    [
+        ("unresolved", bowl(), {"force_n": 1e-6}),
+        ("unresolved", bowl()[:, 20:22], {"force_n": 1e-3}),
+        ("at_border", bowl()[:, 20:], {"force_n": 0.3}),
+        ("at_border", np.zeros((1, 1)), {"force_n": 0.3}),
+        ("large_strain", bowl(), {"force_n": 5.0}),
+        ("steep", bowl(radius=1.0), {"force_n": 2.0}),
+        ("steep", np.arange(9.0)[None, :] * 0.5, {"force_n": 0.2}),
+        ("no_contact", bowl(), {"force_n": 0.0}),
+        ("no_contact", bowl() + 1.0, {"depth_mm": 0.5}),
+        ("no_contact", bowl(), {"depth_mm": -1.0}),
+    ],
+)
+def test_what_must_be_known_is_flagged(flag, gap, options):
+    contact = press(gap, PIXEL, GEL, **options)
+    assert contact.converged
+    assert flag in contact.flags
+
+
+def test_the_half_space_has_no_strain_to_exceed():
+    assert "large_strain" not in press(bowl(), PIXEL, HALF_SPACE, force_n=5.0).flags
+
+
+def test_stopped_short_is_said_and_still_carries_the_force():
+    contact = press(bowl(), PIXEL, GEL, force_n=0.3, tolerance=1e-8, max_iterations=3)
+    assert not contact.converged
+    assert "iteration_cap" in contact.flags
+    assert contact.iterations == 3
+    assert contact.residual > 1e-8
+    assert contact.force_n == pytest.approx(0.3, rel=1e-12)
+
+
+def test_an_empty_map_carries_no_force_and_says_so():
+    contact = press(np.full((6, 7), np.inf), PIXEL, GEL, force_n=1.0)
+    assert (contact.converged, contact.flags, contact.force_n, contact.approach_mm) == (
+        False,
+        ("no_contact",),
+        0.0,
+        0.0,
+    )
+    assert not contact.pressure_mpa.any()
+    assert not contact.displacement_mm.any()
+
+
+def test_an_empty_map_is_pressed_to_any_depth():
+    contact = press(np.full((6, 7), np.inf), PIXEL, GEL, depth_mm=1.0)
+    assert (contact.converged, contact.flags, contact.approach_mm) == (True, ("no_contact",), 1.0)
+
+
+def test_a_plane_on_an_incompressible_periodic_layer_cannot_go_deeper():
+    locked = Layer(0.2, 0.5, 2.0)
+    contact = press(np.zeros((6, 6)), PIXEL, locked, depth_mm=0.1, padded=False)
+    assert (contact.converged, contact.flags) == (False, ("rigid_volume",))
+    carried = press(np.zeros((6, 6)), PIXEL, locked, force_n=1.0, padded=False)
+    assert carried.converged
+    assert carried.approach_mm == pytest.approx(0.0, abs=1e-12)
+    assert carried.pressure_mpa == pytest.approx(1.0 / 36.0 / PIXEL**2)
+
+
+# Wrong input -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"gap_mm": np.full((3, 3), np.nan)}, SceneError, "number or \\+inf in each pixel, got NaN"),
+        ({"gap_mm": np.full((3, 3), -np.inf)}, SceneError, "got NaN or -inf"),
+        ({"gap_mm": np.zeros(3)}, SceneError, "rows x cols with at least one pixel, got shape \\(3,\\)"),
+        ({"gap_mm": [["a", "b"]]}, SceneError, "must be rows x cols of numbers"),
+        ({"gap_mm": np.zeros((0, 3))}, SceneError, "at least one pixel"),
+        ({"force_n": -1.0}, SceneError, "not negative, got -1.0 N"),
+        ({"force_n": math.nan}, SceneError, "finite and not negative, got nan"),
+        ({"force_n": math.inf}, SceneError, "finite and not negative, got inf"),
+        ({"force_n": None}, SceneError, "a force or a depth, got None N and None mm; give one"),
+        ({"depth_mm": 1.0}, SceneError, "a force or a depth, got 1.0 N and 1.0 mm; give one"),
+        ({"force_n": None, "depth_mm": math.nan}, SceneError, "depth must be finite, got nan"),
+        ({"force_n": 1e-300}, SceneError, "units that agree"),
+        ({"force_n": 1e300}, SceneError, "units that agree"),
+        ({"pixel_mm": 0.0}, RobotConfigError, "above 0 and finite, got 0.0"),
+        ({"pixel_mm": math.nan}, RobotConfigError, "above 0 and finite, got nan"),
+        ({"pixel_mm": math.inf}, RobotConfigError, "above 0 and finite, got inf"),
+        ({"tolerance": 0.0}, RobotConfigError, "between 0 and 1, got 0.0"),
+        ({"tolerance": math.nan}, RobotConfigError, "between 0 and 1, got nan"),
+        ({"max_iterations": 0}, RobotConfigError, "at least 1, got 0"),
+        ({"object_modulus_mpa": 0.0}, RobotConfigError, "an object's modulus must be above 0 MPa, got 0.0"),
+        ({"object_poisson": -1.0}, RobotConfigError, "an object's Poisson's ratio must be in \\(-1, 0.5\\], got -1.0"),
+    ],
+)
+def test_wrong_input_is_refused_with_what_to_do(change, error, message):
+    settings = {"gap_mm": bowl(4, 4), "pixel_mm": PIXEL, "layer": GEL, "force_n": 1.0, **change}
+    with pytest.raises(error, match=message):
+        press(settings.pop("gap_mm"), settings.pop("pixel_mm"), settings.pop("layer"), **settings)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"modulus_mpa": 0.0}, "modulus must be above 0 MPa, got 0.0"),
+        ({"modulus_mpa": math.nan}, "modulus must be above 0 MPa, got nan"),
+        ({"modulus_mpa": math.inf}, "must be finite, got inf"),
+        ({"modulus_mpa": 0.2, "poisson": 0.51}, "in \\(-1, 0.5\\], got 0.51"),
+        ({"modulus_mpa": 0.2, "poisson": math.nan}, "in \\(-1, 0.5\\], got nan"),
+        ({"modulus_mpa": 0.2, "thickness_mm": 0.0}, "thickness must be above 0 mm, got 0.0"),
+        ({"modulus_mpa": 0.2, "thickness_mm": math.nan}, "thickness must be above 0 mm, got nan"),
+    ],
+)
+def test_a_layer_that_cannot_be_is_refused(options, message):
+    with pytest.raises(RobotConfigError, match=message):
+        Layer(**options)

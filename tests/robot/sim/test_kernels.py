@@ -1,0 +1,186 @@
+"""Influence of pressure on an elastic surface: against limits, quadrature and plain loops."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import j0
+
+from robot.sim.contact.kernels import (
+    REACH,
+    THIN_PIXELS,
+    Operator,
+    influence,
+    layer_compliance,
+    layer_correction,
+    layer_symbol,
+    love_patch,
+    periodic_influence,
+)
+from tests.robot.sim.hard_contact import naive_symbol
+
+POISSON = (-0.9, 0.0, 0.3, 0.48, 0.5)
+
+
+def whole(quadrant):
+    """The quadrant mirrored to (2 rows - 1, 2 cols - 1)."""
+    half = np.concatenate([quadrant[:0:-1], quadrant])
+    return np.concatenate([half[:, :0:-1], half], axis=1)
+
+
+def by_loops(table, pressure):
+    """Displacement from each pixel's pressure in turn."""
+    rows, cols = pressure.shape
+    total = np.zeros(pressure.shape)
+    for i in range(rows):
+        for j in range(cols):
+            for k in range(rows):
+                for m in range(cols):
+                    total[k, m] += pressure[i, j] * table[abs(k - i), abs(m - j)]
+    return total
+
+
+# Closed form of the layer ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+def test_far_thicker_than_the_wave_a_layer_is_a_half_space(poisson):
+    assert layer_symbol(np.array([30.0, 1e3, 1e300]), poisson) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+def test_far_thinner_than_the_wave_a_layer_is_springs_of_its_confined_modulus(poisson):
+    # u = p h / M with M = E (1-v) / ((1+v)(1-2v)); in units of E* = E / (1-v^2) that is h (1-2v) / (1-v)^2.
+    q = np.array([0.0, 1e-9, 1e-7])
+    springs = 2.0 * (1.0 - 2.0 * poisson) / (1.0 - poisson) ** 2
+    assert layer_compliance(q, 2.0, poisson) == pytest.approx(springs, rel=1e-9, abs=1e-12)
+
+
+def test_a_thin_incompressible_layer_yields_with_the_cube_of_its_thickness():
+    # u = q^2 h^3 p / (3 G), and E* = 4 G for v = .5.
+    q = np.array([1e-12, 1e-8, 1e-4])
+    assert layer_compliance(q, 2.0, 0.5) == pytest.approx(4.0 / 3.0 * q**2 * 8.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+def test_the_layer_formula_is_the_printed_one_where_that_can_be_computed(poisson):
+    x = np.array([0.05, 0.2, 0.24999, 0.25001, 0.5, 1.0, 3.0, 10.0])
+    assert layer_symbol(x, poisson) == pytest.approx(naive_symbol(x, poisson), rel=1e-11)
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+@pytest.mark.parametrize("rho", [0.0, 0.37, 2.0, 7.77])
+def test_the_correction_is_the_transform_that_it_claims_to_be(poisson, rho):
+    exact = quad(lambda x: (1.0 - layer_symbol(np.array([x]), poisson)[0]) * j0(x * rho), 0.0, 25.0, limit=400)[0]
+    assert float(layer_correction(poisson)(rho)) == pytest.approx(exact, abs=1e-8)  # quad's own 1.5e-8
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+def test_where_influence_is_cut_off_nothing_was_left(poisson):
+    assert float(layer_correction(poisson)(REACH)) * REACH == pytest.approx(1.0, abs=1e-9)
+
+
+# Half-space ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("row", "col"), [(0, 2), (1, 1), (3, 5)])
+def test_love_s_patch_is_the_sum_of_point_forces_over_the_pixel(row, col):
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    total = 0.0
+    for y, wy in zip(nodes / 2.0, weights / 2.0, strict=True):
+        for x, wx in zip(nodes / 2.0, weights / 2.0, strict=True):
+            total += wy * wx / (math.pi * math.hypot(row + y, col + x))
+    assert love_patch((4, 6))[row, col] == pytest.approx(total, rel=1e-12)
+
+
+def test_the_loaded_pixel_itself_sinks_by_the_known_amount():
+    # Centre of a uniformly loaded square of side 1: 4 ln(1 + sqrt 2) / pi / E*.
+    assert love_patch((1, 1))[0, 0] == pytest.approx(4.0 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-14)
+
+
+# Influence tables ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("thickness", [2.0, 3.3])
+@pytest.mark.parametrize("poisson", POISSON)
+def test_uniform_pressure_on_a_layer_compresses_springs(thickness, poisson):
+    side = math.ceil(REACH * thickness) + 2
+    springs = thickness * (1.0 - 2.0 * poisson) / (1.0 - poisson) ** 2
+    assert whole(influence((side, side), thickness, poisson)).sum() == pytest.approx(springs, abs=1e-7)
+
+
+def test_a_very_thick_layer_is_a_half_space_but_for_its_finite_depth():
+    # 1/r less C(0)/h near the load.
+    table = influence((8, 8), 1e6, 0.48)
+    sunk = float(layer_correction(0.48)(0.0)) / (math.pi * 1e6)
+    assert table == pytest.approx(love_patch((8, 8)) - sunk, abs=1e-12)
+
+
+@pytest.mark.parametrize("poisson", POISSON)
+def test_pixels_and_waves_agree_where_one_takes_over_from_the_other(poisson):
+    x = np.arange(48) - 24.0
+    pressure = np.exp(-(x[:, None] ** 2 + x**2) / (2.0 * 5.0**2))
+    just_thin, just_thick = (
+        Operator(influence((48, 48), THIN_PIXELS * factor, poisson), (48, 48))(pressure) for factor in (0.999999, 1.0)
+    )
+    # A pixel's uniform pressure differs from a smooth one by (pixel / scale)^2 / 24, .2 %.
+    assert just_thin == pytest.approx(just_thick, abs=3e-3 * just_thick.max())
+
+
+def test_a_table_is_made_once_and_cannot_be_written():
+    table = influence((5, 7), 3.0, 0.48)
+    assert influence((5, 7), 3.0, 0.48) is table
+    with pytest.raises(ValueError, match="read-only"):
+        table[0, 0] = 1.0
+
+
+# Operator --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("thickness", [math.inf, 4.0, 0.5])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 1), (4, 7), (8, 8)])
+def test_the_operator_is_the_sum_over_pixels(thickness, shape):
+    pressure = np.random.default_rng([1, *shape]).random(shape)
+    table = influence(shape, thickness, 0.48)
+    assert Operator(table, shape)(pressure) == pytest.approx(by_loops(table, pressure), abs=1e-13)
+
+
+def test_a_window_feels_no_neighbours_and_is_a_corner_of_the_grid():
+    table = influence((9, 11), 4.0, 0.48)
+    pressure = np.random.default_rng([2]).random((3, 5))
+    large = np.zeros((9, 11))
+    large[4:7, 2:7] = pressure
+    inside = Operator(table, (9, 11))(large)[4:7, 2:7]
+    assert Operator(table, (3, 5))(pressure) == pytest.approx(inside, abs=1e-13)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 4), (6, 6)])
+def test_the_periodic_operator_wraps_around(shape):
+    table = periodic_influence(shape, 3.0, 0.4)
+    pressure = np.random.default_rng([3]).random(shape)
+    shifted = sum(
+        pressure[i, j] * np.roll(table, (i, j), axis=(0, 1)) for i in range(shape[0]) for j in range(shape[1])
+    )
+    assert Operator(table, shape, periodic=True)(pressure) == pytest.approx(shifted, abs=1e-13)
+
+
+@pytest.mark.parametrize("thickness", [math.inf, 20.0, 2.0, 1.0, 0.05])
+@pytest.mark.parametrize("poisson", POISSON)
+def test_the_operator_is_symmetric_positive_and_within_its_bound(thickness, poisson):
+    shape = (12, 9)
+    operator = Operator(influence(shape, thickness, poisson), shape)
+    columns = np.array([operator(unit.reshape(shape)).ravel() for unit in np.eye(shape[0] * shape[1])])
+    values = np.linalg.eigvalsh(columns)
+    assert columns == pytest.approx(columns.T, abs=1e-14 * operator.bound)
+    assert values[0] > 0.0
+    assert values[-1] <= operator.bound * (1.0 + 1e-12)
+
+
+def test_two_operators_add_with_a_weight():
+    gel, body = (Operator(influence((4, 5), h, 0.4), (4, 5)) for h in (3.0, math.inf))
+    pressure = np.random.default_rng([4]).random((4, 5))
+    both = gel.plus(body, 0.25)
+    assert both(pressure) == pytest.approx(gel(pressure) + 0.25 * body(pressure), abs=1e-14)
+    assert both.peak == gel.peak + 0.25 * body.peak
+    assert gel.peak == influence((4, 5), 3.0, 0.4)[0, 0]

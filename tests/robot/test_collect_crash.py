@@ -1,0 +1,228 @@
+"""A collection that is killed or runs in several processes ends in the same bytes as one that runs through at once."""
+
+import functools
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import pytest
+
+from robot.collect import CollectSettings, collect
+from robot.errors import DeviceError, RobotConfigError, RobotError, StorageError
+from robot.recording.folder import read_recording
+from robot.rig import load_rig
+from tests.fake_rig import FakeRig
+from tests.robot.recording.test_crash import Failing
+from tests.robot.test_collect import files
+from tests.waiting import running, until
+
+ROOT = Path(__file__).parents[2]
+NAMES = ["round-0", "thin-1", "wide-2", "round-3"]
+SETTINGS = CollectSettings(grasps=2, most_attempts=8)
+
+
+class BrokenRig(FakeRig):
+    """Raises what it is told to at the first attempt at an object."""
+
+    def __init__(self, seed, what):
+        super().__init__(seed)
+        self.what = what
+
+    def prepare(self, object_id, number):
+        super().prepare(object_id, number)
+        if object_id == "thin-1":
+            if self.what == "die":
+                os._exit(9)
+            raise {"value": ValueError("not of the contract"), "config": RobotConfigError("a setting")}[self.what]
+
+
+def run(out, jobs=1, make=None, names=NAMES):
+    return collect(make or functools.partial(FakeRig, 3), out, objects=names, seed=3, settings=SETTINGS, jobs=jobs)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The files of a collection that ran through."""
+    out = tmp_path_factory.mktemp("whole") / "r"
+    run(out)
+    return files(out)
+
+
+@pytest.fixture(autouse=True)
+def unsynced(monkeypatch):
+    """Waiting for the disk takes most of the time here; the processes that are killed do wait."""
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+
+
+# Killed -----------------------------------------------------------------------------------------------------
+
+CHILD = """
+import functools, os, signal, sys
+from robot.collect import collect
+from tests.fake_rig import FakeRig
+from tests.robot.test_collect_crash import NAMES, SETTINGS
+real, left = os.fsync, int(sys.argv[2])
+def fsync(descriptor):
+    global left
+    real(descriptor)
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+os.fsync = fsync
+collect(functools.partial(FakeRig, 3), sys.argv[1], objects=NAMES, seed=3, settings=SETTINGS)
+"""
+
+
+def killed(out, syncs):
+    """Collect in a process that is killed after so many syncs; returns whether it was."""
+    command = [sys.executable, "-c", CHILD, str(out), str(syncs)]
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    assert done.returncode in (0, -signal.SIGKILL), done.stderr
+    return done.returncode != 0
+
+
+@pytest.mark.parametrize("syncs", [*(pytest.param(syncs, marks=pytest.mark.slow) for syncs in (1, 3, 14)), 13])
+def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
+    assert killed(tmp_path / "r", syncs)
+    if syncs > 2:
+        read_recording(tmp_path / "r")
+    run(tmp_path / "r")
+    assert files(tmp_path / "r") == whole
+
+
+@pytest.mark.slow
+def test_a_collection_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path, whole):
+    kills = 0
+    while killed(tmp_path / "r", 41):
+        kills += 1
+        assert kills < 20
+    assert kills > 1
+    assert files(tmp_path / "r") == whole
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "stop"])
+def test_a_failure_at_any_step_of_an_attempt_can_be_gone_on_from(tmp_path, monkeypatch, error):
+    """Every call that touches the disk while the first attempt is written: two lines and eight images."""
+    names = ["round-0"]
+    run(tmp_path / "whole", names=names)
+    for step in range(3, 36, 3):
+        out = tmp_path / f"r{step}"
+        with pytest.raises((StorageError, KeyboardInterrupt)), Failing(monkeypatch, error, step):
+            run(out, names=names)
+        run(out, names=names)
+        assert files(out) == files(tmp_path / "whole")
+
+
+# Several processes ------------------------------------------------------------------------------------------
+
+
+def test_two_jobs_give_the_same_bytes_as_one(tmp_path, whole):
+    run(tmp_path / "r", jobs=2)
+    assert files(tmp_path / "r") == whole
+
+
+@pytest.mark.slow
+def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path):
+    make, settings = functools.partial(load_rig, "sim", seed=0), CollectSettings(grasps=1)
+    for jobs in (1, 2):
+        collect(make, tmp_path / str(jobs), objects=2, seed=0, settings=settings, jobs=jobs)
+    assert files(tmp_path / "1") == files(tmp_path / "2")
+
+
+def test_two_jobs_go_on_with_what_one_began(tmp_path, whole):
+    killed(tmp_path / "r", 30)
+    run(tmp_path / "r", jobs=2)
+    assert files(tmp_path / "r") == whole
+
+
+def test_an_error_of_a_worker_is_the_same_error_here(tmp_path):
+    with pytest.raises(RobotConfigError, match=r"^a setting$"):
+        run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "config"))
+
+
+def test_a_devices_failure_in_a_worker_is_the_same_error_here(tmp_path):
+    make = functools.partial(FakeRig, 3, faults={"grasp": set(range(1, 99))})
+    with pytest.raises(DeviceError, match=r"attempt 0 at round-0 failed 3 time\(s\)"):
+        run(tmp_path / "r", jobs=2, make=make)
+
+
+def test_any_other_failure_of_a_worker_is_a_robot_error_that_says_where(tmp_path):
+    with pytest.raises(
+        RobotError, match="attempt 0 at thin-1 broke off in a worker process: ValueError: not of the con"
+    ):
+        run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "value"))
+
+
+def test_a_worker_that_dies_is_told_and_the_collection_can_go_on(tmp_path, whole):
+    with pytest.raises(RobotError, match="a worker process died: it was killed, or memory ran out"):
+        run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "die"))
+    run(tmp_path / "r", jobs=2)
+    assert files(tmp_path / "r") == whole
+
+
+def test_opencv_works_in_one_thread_while_attempts_are_made_and_only_then(tmp_path, monkeypatch):
+    """GaussianBlur and others differ in their last digits with the number of threads."""
+    monkeypatch.setattr(cv2, "getNumThreads", lambda: 5)
+    told = []
+    monkeypatch.setattr(cv2, "setNumThreads", told.append)
+    run(tmp_path / "r", names=["round-0"])
+    assert told == [1, 5]
+
+
+def test_threads_are_limited_only_in_the_workers(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    run(tmp_path / "r", jobs=2, names=["round-0"])
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+ENDLESS = """
+import functools, sys
+from robot.collect import CollectSettings, collect
+from tests.fake_rig import FakeRig
+if __name__ == "__main__":
+    collect(functools.partial(FakeRig, 3), sys.argv[1], objects=10**4, seed=3, settings=CollectSettings(44), jobs=2)
+"""
+
+
+def children(pid):
+    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc, as Linux has it")
+@pytest.mark.parametrize(
+    "end",
+    [[signal.SIGKILL], [signal.SIGINT], [signal.SIGINT, signal.SIGINT]],
+    ids=["killed", "ctrl-c", "ctrl-c twice"],
+)
+def test_workers_leave_with_their_parent(tmp_path, end):
+    """A killed parent cannot end its workers; they must see to it themselves. One that is told twice to stop waits
+    for them all the same: broken off in its end, a pool of processes never ends."""
+    (tmp_path / "endless.py").write_text(ENDLESS)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "r")]
+    with running(command, env=environment, cwd=ROOT) as parent:
+        log = tmp_path / "r" / "attempts.jsonl"
+        until(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, limit_s=60.0)
+        workers = children(parent.pid)
+        assert len(workers) >= 2
+        for each in end:
+            parent.send_signal(each)
+            time.sleep(0.1)
+        said = parent.communicate(timeout=60)[1]
+        until(lambda: not any(map(is_running, workers)), limit_s=60.0)
+    if signal.SIGINT in end:
+        assert "KeyboardInterrupt" in said
+    assert read_recording(tmp_path / "r").grasps
