@@ -1,0 +1,435 @@
+"""Attack a running service and measure whether it keeps answering.
+
+    python -m benchmarks.attacks INDEX --gelsight a.png b.png [--only NAME ...] [--json results.json]
+
+Each attack gets a `retrieve serve` of its own. While the attack runs, one client asks `/healthz` twenty times a second and
+another sends an honest query four times a second. The table shows, for each attack: the slowest `/healthz`, the
+honest queries answered and the slowest of them, the peak memory of the service above idle, and how long the service takes
+to end after SIGTERM. All traffic stays on the loopback addresses.
+"""
+
+import argparse
+import base64
+import http.client
+import io
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from PIL import Image
+
+MAX_HEALTH_S, MAX_MEMORY_MB, MAX_EXIT_S = 0.5, 300, 10
+BODY_BYTES = 19_500_000
+ATTACKERS, HONEST = "127.0.0.1", "127.0.0.2"
+"""The attack and the honest clients come from two addresses."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A running service. gels: the gel images of one honest grasp, as the bytes of their files."""
+
+    port: int
+    gels: tuple[bytes, ...]
+
+    def post(self, path: str, body: bytes, kind: str = "application/json", timeout: float = 60) -> int:
+        """Send one request from the attackers' address and return the status, 0 where the connection was cut."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout, source_address=(ATTACKERS, 0))
+        try:
+            connection.request("POST", path, body, {"content-type": kind, "origin": f"http://127.0.0.1:{self.port}"})
+            return connection.getresponse().status
+        except (OSError, http.client.HTTPException):
+            return 0
+        finally:
+            connection.close()
+
+    def connect(self) -> socket.socket:
+        """Open a plain connection from the attackers' address."""
+        return socket.create_connection(("127.0.0.1", self.port), 10, (ATTACKERS, 0))
+
+
+Attack = Callable[[Target], str]
+"""Attacks the service and returns what it answered, in words."""
+
+
+def many_keys(target: Target) -> str:
+    """20 MB of small JSON keys to the path that needs no token."""
+    keys = ",".join(f'"k{number}":0' for number in range(1_400_000))
+    return _at_once(target, "/v1/session", f"{{{keys}}}".encode(), 3)
+
+
+def empty_grasps(target: Target) -> str:
+    """A query of millions of empty grasps."""
+    body = b'{"touches": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}"
+    return _at_once(target, "/v1/query", body, 3)
+
+
+def nested(target: Target) -> str:
+    """JSON arrays within arrays, a million deep."""
+    return _at_once(target, "/v1/query", b'{"touches": ' + b"[" * (BODY_BYTES // 2) + b"]" * (BODY_BYTES // 2), 3)
+
+
+def empty_objects(target: Target) -> str:
+    """A batch of millions of empty objects."""
+    return _at_once(target, "/v1/query/batch", b'{"objects": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}", 3)
+
+
+def many_parts(target: Target) -> str:
+    """A form of hundreds of thousands of empty parts."""
+    part = b"--b\r\ncontent-disposition: form-data; name=gelsight; filename=a\r\n\r\n\r\n"
+    body = part * (BODY_BYTES // len(part)) + b"--b--\r\n"
+    return _at_once(target, "/v1/query", body, 3, "multipart/form-data; boundary=b")
+
+
+def jpeg_scans(target: Target) -> str:
+    """A small JPEG file whose 40,000 scans take a minute to decode."""
+    return _pictures(target, _jpeg_of_scans(4472, 40_000), 4)
+
+
+def png_column(target: Target) -> str:
+    """A PNG picture 1 pixel wide and 20,000,000 high."""
+    return _pictures(target, _png(1, 20_000_000), 4)
+
+
+def png_pixels(target: Target) -> str:
+    """PNG pictures of the largest size that is taken, 17 kB each."""
+    return _pictures(target, _png(4472, 4472), 4)
+
+
+def jpeg_markers(target: Target) -> str:
+    """14 MB of empty JPEG segments before the picture begins."""
+    return _pictures(target, b"\xff\xd8" + b"\xff\xe0\x00\x02" * 3_500_000, 3)
+
+
+def png_chunks(target: Target) -> str:
+    """14 MB of empty PNG chunks before the picture begins."""
+    return _pictures(target, _png(64, 64)[:33] + _chunk(b"tEXt", b"") * 1_160_000, 3)
+
+
+def many_pictures(target: Target) -> str:
+    """Queries of 64 grasps of two tiny pictures."""
+    return _at_once(target, "/v1/query", _query([_png(8, 8)] * 128), 8)
+
+
+def half_headers(target: Target) -> str:
+    """600 connections that each send half of a request's headers and then wait."""
+    held = []
+    for _ in range(600):
+        try:
+            connection = target.connect()
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
+            held.append(connection)
+        except OSError:
+            continue
+    time.sleep(15)
+    open_still = sum(_is_open(connection) for connection in held)
+    for connection in held:
+        connection.close()
+    return f"{open_still} of 600 open after 15 s"
+
+
+def slow_bodies(target: Target) -> str:
+    """100 requests whose bodies come one byte a second."""
+    held = []
+    for _ in range(100):
+        connection = target.connect()
+        connection.sendall(
+            b"POST /v1/session HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
+            b"content-length: 1000\r\n\r\n"
+        )
+        held.append(connection)
+    for _ in range(15):
+        time.sleep(1)
+        for connection in held:
+            try:
+                connection.sendall(b" ")
+            except OSError:
+                continue
+    open_still = sum(_is_open(connection) for connection in held)
+    for connection in held:
+        connection.close()
+    return f"{open_still} of 100 open after 15 s"
+
+
+def header_flood(target: Target) -> str:
+    """One connection that sends header after header, up to 400 MB."""
+    lines = b"".join(b"x-%d: %s\r\n" % (number, b"a" * 1000) for number in range(1000))
+    with target.connect() as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n")
+        sent = 0
+        try:
+            for _ in range(400):
+                connection.sendall(lines)
+                sent += len(lines)
+        except OSError:
+            pass
+        return f"{sent / 1e6:.0f} MB taken"
+
+
+def many_grasps(target: Target) -> str:
+    """60 grasps of the simulated rig at once."""
+    return _at_once(target, "/v1/grasp", b"", 60)
+
+
+ATTACKS: tuple[Attack, ...] = (
+    many_keys,
+    empty_grasps,
+    nested,
+    empty_objects,
+    many_parts,
+    jpeg_scans,
+    png_column,
+    png_pixels,
+    jpeg_markers,
+    png_chunks,
+    many_pictures,
+    half_headers,
+    slow_bodies,
+    header_flood,
+    many_grasps,
+)
+
+
+def _at_once(target: Target, path: str, body: bytes, times: int, kind: str = "application/json") -> str:
+    """Send the same body several times at once, and say which statuses came."""
+    statuses: list[int] = []
+    threads = [threading.Thread(target=lambda: statuses.append(target.post(path, body, kind))) for _ in range(times)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    counts = {status: statuses.count(status) for status in sorted(set(statuses))}
+    return ", ".join(f"{count} x {status or 'cut off'}" for status, count in counts.items())
+
+
+def _pictures(target: Target, picture: bytes, times: int) -> str:
+    return _at_once(target, "/v1/query", _query([picture, target.gels[-1]]), times)
+
+
+def _query(pictures: list[bytes]) -> bytes:
+    grasps = [pictures[start : start + 2] for start in range(0, len(pictures), 2)]
+    return json.dumps({"touches": [[base64.b64encode(one).decode() for one in grasp] for grasp in grasps]}).encode()
+
+
+def _jpeg_of_scans(side: int, scans: int) -> bytes:
+    """A flat grey progressive JPEG whose shortest scan is repeated."""
+    file = io.BytesIO()
+    Image.new("L", (side, side), 128).save(file, "JPEG", progressive=True)
+    data, starts, place = file.getvalue(), [], 0
+    while (place := data.find(b"\xff\xda", place)) >= 0:
+        starts.append(place)
+        place += 2
+    segments = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data) - 2], strict=True)]
+    return data[: starts[0]] + segments[0] + min(segments, key=len) * scans + b"\xff\xd9"
+
+
+def _png(width: int, height: int) -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    pixels = zlib.compress(bytes((width + 1) * height), 9)
+    parts = ((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, content) for name, content in parts)
+
+
+def _chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def _is_open(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        while connection.recv(65536):
+            pass
+        return False
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+
+
+@dataclass
+class Measured:
+    """What honest clients and the operator saw during one attack."""
+
+    attack: str
+    answered: str = ""
+    health_s: list[float] = field(default_factory=list)
+    health_failed: int = 0
+    query_s: list[float] = field(default_factory=list)
+    query_failed: int = 0
+    memory_mb: float = 0
+    exit_s: float = 0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the service stayed within every limit."""
+        return (
+            max(self.health_s, default=99) <= MAX_HEALTH_S
+            and not self.health_failed
+            and not self.query_failed
+            and self.memory_mb <= MAX_MEMORY_MB
+            and self.exit_s <= MAX_EXIT_S
+        )
+
+    def row(self) -> str:
+        """A row of the Markdown table."""
+        return (
+            f"| {self.attack} | {self.answered} | {max(self.health_s, default=99):.2f} ({self.health_failed} failed) "
+            f"| {len(self.query_s)} of {len(self.query_s) + self.query_failed}, slowest {max(self.query_s, default=99):.2f} "
+            f"| {self.memory_mb:.0f} | {self.exit_s:.1f} | {'yes' if self.holds else '**no**'} |"
+        )
+
+
+HEAD = (
+    "| attack | answered | slowest /healthz, s | honest queries answered, s | memory above idle, MB | end after SIGTERM, s "
+    "| holds |\n|---|---|---|---|---|---|---|"
+)
+
+
+def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> Measured:
+    """Run one attack against a service of its own."""
+    measured = Measured(attack.__name__.replace("_", " "))
+    with tempfile.TemporaryDirectory() as folder, _service(index, Path(folder)) as (process, port):
+        target = Target(port, gels)
+        honest = _query(list(gels))
+        for _ in range(3):
+            target.post("/v1/query", honest)
+        idle, over = _memory_mb(process.pid), threading.Event()
+        clients = [
+            threading.Thread(target=_ask_health, args=(port, measured, over)),
+            threading.Thread(target=_ask_queries, args=(port, honest, measured, over)),
+            threading.Thread(target=_watch_memory, args=(process.pid, idle, measured, over)),
+        ]
+        for client in clients:
+            client.start()
+        time.sleep(0.5)
+        measured.answered = attack(target)
+        time.sleep(2)
+        over.set()
+        for client in clients:
+            client.join()
+        begun = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        measured.exit_s = time.monotonic() - begun
+    return measured
+
+
+@contextmanager
+def _service(index: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    command = [sys.executable, "-c", "from retrieval.commands.main import main; main()", "serve", "--port", "0"]
+    log = (folder / "log").open("w")
+    process = subprocess.Popen(
+        [*command, "--index", str(index), "--history", str(folder / "history")], stderr=log, text=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (port := _port((folder / "log").read_text())):
+            if process.poll() is not None or time.monotonic() > deadline:
+                sys.exit(f"the service did not start: {(folder / 'log').read_text()}")
+            time.sleep(0.1)
+        yield process, port
+    finally:
+        process.kill()
+        process.wait()
+        log.close()
+
+
+def _port(text: str) -> int | None:
+    """The port in a line of the service's log such as `http://127.0.0.1:8000`."""
+    after = text.partition("http://127.0.0.1:")[2]
+    digits = after[: len(after) - len(after.lstrip("0123456789"))]
+    return int(digits) if digits and len(after) > len(digits) else None
+
+
+def _ask_health(port: int, measured: Measured, over: threading.Event) -> None:
+    while not over.is_set():
+        begun = time.monotonic()
+        status = _honest(port, "GET", "/healthz", None)
+        if status == 200:
+            measured.health_s.append(time.monotonic() - begun)
+        else:
+            measured.health_failed += 1
+        time.sleep(0.05)
+
+
+def _ask_queries(port: int, body: bytes, measured: Measured, over: threading.Event) -> None:
+    """An honest client waits and asks again where it gets 429, for 10 s at most."""
+    while not over.is_set():
+        begun = time.monotonic()
+        while (status := _honest(port, "POST", "/v1/query", body)) == 429 and time.monotonic() < begun + 10:
+            time.sleep(0.2)
+        if status == 200:
+            measured.query_s.append(time.monotonic() - begun)
+        else:
+            measured.query_failed += 1
+        time.sleep(0.25)
+
+
+def _honest(port: int, method: str, path: str, body: bytes | None) -> int:
+    connection = http.client.HTTPConnection("127.0.0.1", port, 30, source_address=(HONEST, 0))
+    try:
+        connection.request(method, path, body, {"content-type": "application/json"} if body else {})
+        response = connection.getresponse()
+        response.read()
+        return response.status
+    except (OSError, http.client.HTTPException):
+        return 0
+    finally:
+        connection.close()
+
+
+def _watch_memory(pid: int, idle: float, measured: Measured, over: threading.Event) -> None:
+    while not over.wait(0.05):
+        measured.memory_mb = max(measured.memory_mb, _memory_mb(pid) - idle)
+
+
+def _memory_mb(pid: int) -> float:
+    """Proportional memory of a process and its children."""
+    total, waiting = 0.0, [pid]
+    while waiting:
+        one = waiting.pop()
+        try:
+            for line in Path(f"/proc/{one}/smaps_rollup").read_text().splitlines():
+                if line.startswith("Pss:"):
+                    total += int(line.split()[1]) / 1024
+            for task in os.listdir(f"/proc/{one}/task"):
+                waiting += map(int, Path(f"/proc/{one}/task/{task}/children").read_text().split())
+        except OSError:
+            continue
+    return total
+
+
+def main() -> None:
+    """Run the attacks; exit with 1 where one of them broke a limit."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("index", type=Path)
+    parser.add_argument("--gelsight", type=Path, nargs="+", required=True)
+    parser.add_argument("--only", nargs="+", choices=[attack.__name__ for attack in ATTACKS])
+    chosen = parser.parse_args()
+    gels = tuple(path.read_bytes() for path in chosen.gelsight)
+    print(HEAD, flush=True)
+    held = True
+    for attack in ATTACKS:
+        if not chosen.only or attack.__name__ in chosen.only:
+            measured = measure(attack, chosen.index, gels)
+            print(measured.row(), flush=True)
+            held = held and measured.holds
+    sys.exit(0 if held else 1)
+
+
+if __name__ == "__main__":
+    main()
