@@ -2,10 +2,10 @@
 
     python -m benchmarks.attacks INDEX --gelsight a.png b.png [--only NAME ...] [--json results.json]
 
-Each attack gets a `retrieve serve` of its own. While the attack runs, one client asks `/healthz` twenty times a second and
-another sends an honest query four times a second. The table shows, for each attack: the slowest `/healthz`, the
-honest queries answered and the slowest of them, the peak memory of the service above idle, and how long the service takes
-to end after SIGTERM. All traffic stays on the loopback addresses.
+Each attack gets a `retrieve serve` of its own. While the attack runs, one client asks `/healthz` twenty times a
+second and another sends an honest query four times a second. The table shows, for each attack: the slowest `/healthz`,
+the honest queries answered and the slowest of them, the peak memory of the service above idle, and how long the service
+takes to end after SIGTERM. All traffic stays on the loopback addresses.
 """
 
 import argparse
@@ -284,15 +284,15 @@ class Measured:
     def row(self) -> str:
         """A row of the Markdown table."""
         return (
-            f"| {self.attack} | {self.answered} | {max(self.health_s, default=99):.2f} ({self.health_failed} failed) "
-            f"| {len(self.query_s)} of {len(self.query_s) + self.query_failed}, slowest {max(self.query_s, default=99):.2f} "
-            f"| {self.memory_mb:.0f} | {self.exit_s:.1f} | {'yes' if self.holds else '**no**'} |"
+            f"| {self.attack} | {self.answered} | {max(self.health_s, default=99):.2f} ({self.health_failed} failed) | "
+            f"{len(self.query_s)} of {len(self.query_s) + self.query_failed}, "
+            f"slowest {max(self.query_s, default=99):.2f} | {self.memory_mb:.0f} | {self.exit_s:.1f} | {'yes' if self.holds else '**no**'} |"
         )
 
 
 HEAD = (
-    "| attack | answered | slowest /healthz, s | honest queries answered, s | memory above idle, MB | end after SIGTERM, s "
-    "| holds |\n|---|---|---|---|---|---|---|"
+    "| attack | answered | slowest /healthz, s | honest queries answered, s | memory above idle, MB "
+    "| end after SIGTERM, s | holds |\n|---|---|---|---|---|---|---|"
 )
 
 
@@ -330,7 +330,7 @@ def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> Measured:
 
 @contextmanager
 def _service(index: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    command = [sys.executable, "-c", "from retrieval.commands.main import main; main()", "serve", "--port", "0"]
+    command = [sys.executable, "-m", "retrieval", "serve", "--port", "0"]
     log = (folder / "log").open("w")
     process = subprocess.Popen(
         [*command, "--index", str(index), "--history", str(folder / "history")], stderr=log, text=True

@@ -291,8 +291,8 @@ class Searcher:
         clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
         if self.posterior is None or found.mass is None:
             return _Judged(found, len(felt.halves), None)
-        logits = [one.logit for one in found.best]
-        return _Judged(found, len(felt.halves), self.posterior.share(logits, found.mass, len(felt.halves), none_prior))
+        belief = self.posterior.share([one.logit for one in found.best], found.mass, len(felt.halves), none_prior)
+        return _Judged(found, len(felt.halves), belief)
 
     def _answer(
         self,
@@ -332,13 +332,11 @@ class Searcher:
 
     def _more_grasps(self, judged: "_Judged | None", none_prior: float) -> int | None:
         """Further grasps after which the verdict is expected to be a match; None where the ranking is not clear."""
-        if self.posterior is None or judged is None or judged.belief is None or judged.found.mass is None:
+        if not (self.posterior and judged and judged.belief and (mass := judged.found.mass)):
             return None
         if not is_clear(float(judged.belief.objects_if_present[0])):
             return None
-        return self.posterior.more_grasps(
-            judged.found.best[0].logit, judged.found.mass.objects, judged.grasps, none_prior
-        )
+        return self.posterior.more_grasps(judged.found.best[0].logit, mass.objects, judged.grasps, none_prior)
 
     def _shares(self, judged: "_Judged | None") -> dict[str, Any]:
         """For an index of several shards: how many there are, and which share of all photos could be searched."""
@@ -346,14 +344,12 @@ class Searcher:
         return {"shards": self.described.shards, "searched": searched / self.described.photos}
 
     def _ranking(self, judged: "_Judged") -> list[Match]:
-        ranking, base = [], self.catalogue.absolute()
+        ranking, base, belief = [], self.catalogue.absolute(), judged.belief
         for rank, (logit, photo, reference) in enumerate(judged.found.best, start=1):
-            belief = judged.belief
             probability = None if belief is None else float(belief.objects[rank - 1])
             if_present = None if belief is None else float(belief.objects_if_present[rank - 1])
-            path = base / photo.path
             told = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
-            ranking.append(Match(*told, path, reference, if_present))
+            ranking.append(Match(*told, base / photo.path, reference, if_present))
         return ranking
 
     def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:

@@ -43,6 +43,7 @@ def test_a_recording(tmp_path, recording):
     names = ("photo", "touch_a", "touch_b", "touch_a_before", "touch_a_after", "depth")
     with RecordingWriter(tmp_path / "recording", {"source": "drawn", "sensor": "none"}) as writer:
         writer.append("1", "mug", dict.fromkeys(names, picture))
+        writer.tell(skipped_objects={"ball": "wider than the gripper opens"})
     read = read_recording(tmp_path / "recording")
     check(0, read.info)
     numbers = dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), 1.0)
