@@ -286,7 +286,8 @@ class Measured:
         return (
             f"| {self.attack} | {self.answered} | {max(self.health_s, default=99):.2f} ({self.health_failed} failed) | "
             f"{len(self.query_s)} of {len(self.query_s) + self.query_failed}, "
-            f"slowest {max(self.query_s, default=99):.2f} | {self.memory_mb:.0f} | {self.exit_s:.1f} | {'yes' if self.holds else '**no**'} |"
+            f"slowest {max(self.query_s, default=99):.2f} | {self.memory_mb:.0f} | {self.exit_s:.1f} | "
+            f"{'yes' if self.holds else '**no**'} |"
         )
 
 
