@@ -68,7 +68,8 @@ class Decoders:
         if total > MAX_BODY_PIXELS:
             raise Problem(
                 "too-large",
-                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; large ones have {total:,}",
+                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; "
+                f"the large ones have {total:,}",
             )
         images = []
         for (name, data), one in zip(named, first, strict=True):
