@@ -68,7 +68,8 @@ class Decoders:
         if total > MAX_BODY_PIXELS:
             raise Problem(
                 "too-large",
-                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; large ones have {total:,}",
+                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; "
+                f"the large ones have {total:,}",
             )
         images = []
         for (name, data), one in zip(named, first, strict=True):
@@ -157,9 +158,13 @@ class _Process:
         return json.loads(await read(text)), await read(content)
 
     async def end(self) -> None:
-        """End it, whatever it does."""
+        """End it, whatever it does, and wait until its pipes are closed, too: the event loop may end next."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         if self._process.returncode is None:
             self._process.kill()
+        self._process.stdin.close()
+        await self._process.stdout.read()
         await self._process.wait()
 
 

@@ -240,10 +240,10 @@ def test_hostile_pictures_leave_the_service_alive_small_and_quick_to_end(index, 
         process.send_signal(signal.SIGTERM)
         process.wait(60)
         print(f"slowest healthz {slowest:.3f} s, {(peak - idle) / 1e6:.0f} MB more, {time.monotonic() - begun:.1f} s")
-        assert time.monotonic() - begun < 30
+        assert time.monotonic() - begun < 10
         assert set(honest_answers) == {200}
-        assert peak - idle < 320_000_000
-        assert slowest < 5  # on a machine that others keep busy
+        assert peak - idle < 300_000_000
+        assert slowest < 2  # on a machine that others keep busy
         for one in asking:
             one.join(60)
 
