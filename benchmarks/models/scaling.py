@@ -27,7 +27,7 @@ from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.experiment import SEEDLESS
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import summaries
-from retrieval.methods import METHODS, build_method
+from retrieval.methods import METHODS
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.metrics.measure import Measure
@@ -108,7 +108,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         folder = arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed"
         for name in arguments.methods:
             seeds = range(1 if name in SEEDLESS else arguments.seeds)
-            trained = [build_method(name, Setting(config, seed, folder)) for seed in seeds]
+            trained = [METHODS.load(name)(Setting(config, seed, folder)) for seed in seeds]
             for method in trained:
                 method.fit(train, validation)
             size = {"method": name, "objects": count, "grasps": grasps, "photographed": photographed}

@@ -26,7 +26,8 @@ class GroupNorm(nn.GroupNorm):
 
 
 class Small(Tower):
-    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features."""
+    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features, 888
+    of stages."""
 
     optional_prefixes = ("fc.",)
 
@@ -61,8 +62,3 @@ class Small(Tower):
             x = layer(x)
             if isinstance(layer, nn.ReLU):
                 yield x
-
-
-def small(output: str) -> Small:
-    """The small tower: 256 pooled features, 888 of stages."""
-    return Small(output)
