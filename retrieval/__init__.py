@@ -17,11 +17,9 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from retrieval.adaptation.recipe import adapt as adapt
     from retrieval.errors import BadInput as BadInput
     from retrieval.errors import RetrievalError as RetrievalError
     from retrieval.evaluation.real.protocol import Protocol as Protocol
-    from retrieval.evaluation.real.run import benchmark as benchmark
     from retrieval.evaluation.run import evaluate as evaluate
     from retrieval.methods.base import Method as Method
     from retrieval.methods.base import Setting as Setting
@@ -66,9 +64,7 @@ _PLACES = {
     "Searcher": "search.searcher:Searcher",
     "Setting": "methods.base:Setting",
     "Tower": "model.towers.base:Tower",
-    "adapt": "adaptation.recipe:adapt",
     "agreement": "search.agreement:agreement",
-    "benchmark": "evaluation.real.run:benchmark",
     "build_index": "search.build:build_index",
     "embed_photos": "search.embeddings:embed_photos",
     "evaluate": "evaluation.run:evaluate",

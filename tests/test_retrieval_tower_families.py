@@ -91,6 +91,7 @@ def test_pooled_features_are_what_the_model_itself_pools(made):
         torch.testing.assert_close(tower(images), model(normalised).pooler_output)
 
 
+@pytest.mark.slow
 def test_a_matcher_on_a_model_of_transformers_trains_exports_indexes_and_answers(
     made, recording, catalogue, touch, tmp_path
 ):

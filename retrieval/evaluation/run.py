@@ -62,6 +62,15 @@ def evaluate(
     where features are kept (`out`/features where None). What lies under `out` from the same settings is used again,
     so that a run which was stopped goes on; equal settings give equal results to the byte. Raises ConfigError for an
     unknown method, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> config = retrieval.load_config("tiny")
+    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
+    >>> given = {"config": config, "preset": "tiny", "methods": ["cca", "chance"], "quiet": True}
+    >>> results = retrieval.evaluate(Path("lab"), Path("report"), **given)
+    >>> list(results["methods"])
+    ['cca', 'chance']
     """
     names = [METHODS.name_of(method) for method in methods]
     if not names or seeds < 1:

@@ -86,6 +86,14 @@ def train(
     decoded images are kept (`retrieval.training.kept`), for towers that are trained. The number of fingers is the
     recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
     one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
+    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))  # a real one takes thousands
+    >>> made = retrieval.train(Path("lab"), Path("lab.safetensors"), config, quiet=True)
+    >>> made.provenance["step"], len(made.split.train)
+    (2, 7)
     """
     if cache and config.training.freeze_towers:
         raise ConfigError(

@@ -325,5 +325,5 @@ def test_the_command_writes_says_what_it_left_out_and_refuses_a_second_time(sour
 
 def test_the_command_lists_the_formats(source, tmp_path, capsys):
     assert main(["export-recording", str(source.folder), "--to", "hdf5", "--out", str(tmp_path / "out")]) == 2
-    assert "known: imagefolder, lerobot, open-x-tactile" in capsys.readouterr().err
+    assert "one of imagefolder, lerobot, open-x-tactile; got 'hdf5'" in capsys.readouterr().err
     assert not Path(tmp_path / "out").exists()
