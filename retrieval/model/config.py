@@ -214,7 +214,7 @@ class Config:
         self,
         *,
         tower: "str | type[Tower] | None" = None,
-        losses: "Mapping[str | type[Loss], float] | None" = None,
+        losses: "Mapping[str, float] | Mapping[str | type[Loss], float] | None" = None,
     ) -> "Config":
         """Return the configuration with another tower, or with other losses beside the match loss.
 

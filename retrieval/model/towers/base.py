@@ -24,7 +24,7 @@ class Tower(nn.Module):
     >>> import torch
     >>> class Average(retrieval.Tower):
     ...     def __init__(self, output):
-    ...         super().__init__()
+    ...         super().__init__(output)
     ...         self.feature_count = 8
     ...         self.linear = torch.nn.Linear(3, 8)
     ...     def _encode(self, images):
@@ -45,8 +45,11 @@ class Tower(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, output: str = "pooled") -> None:
+        """Make what every tower has; a subclass makes its layers, for this output of
+        `retrieval.model.towers.OUTPUTS`."""
         super().__init__()
+        self.output = output
         # Not persistent: the state dict holds exactly the keys that ImageNet checkpoints hold.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
@@ -98,7 +101,7 @@ class TowerFamily(Tower, ABC):
             model: What stands behind "family:".
             architecture: What `architecture(model)` returned when the training was configured.
         """
-        super().__init__()
+        super().__init__(output)
         self.model_name = model
 
     @classmethod

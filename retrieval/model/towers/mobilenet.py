@@ -61,14 +61,13 @@ class MobileNetV2(Tower):
     url = "https://download.pytorch.org/models/mobilenet_v2-b0353104.pth"
 
     def __init__(self, output: str) -> None:
-        super().__init__()
+        super().__init__(output)
         layers: list[nn.Module] = [_convolution(3, 32, 3, stride=2)]
         inputs = 32
         for expansion, outputs, blocks, first_stride in _STAGES:
             for block in range(blocks):
                 layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
                 inputs = outputs
-        self.output = output
         if output == "stages":
             self.feature_count = 3 * sum(_DESCRIBED.values())
         else:

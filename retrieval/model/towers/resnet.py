@@ -72,7 +72,7 @@ class ResNet(Tower):
     """Blocks of each stage."""
 
     def __init__(self, output: str) -> None:
-        super().__init__()
+        super().__init__(output)
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
@@ -86,7 +86,6 @@ class ResNet(Tower):
                 blocks.append(self.block(inputs, width, stride))
                 inputs = width * self.block.expansion
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
-        self.output = output
         self.fc = nn.Linear(inputs, 1000) if output == "classes" else None
         # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the one before.
         counts = {"classes": 1000, "pooled": inputs, "stages": 3 * (inputs + inputs // 2 + inputs // 4)}

@@ -32,7 +32,7 @@ class Small(Tower):
     optional_prefixes = ("fc.",)
 
     def __init__(self, output: str) -> None:
-        super().__init__()
+        super().__init__(output)
         layers: list[nn.Module] = []
         inputs = 3
         for stage, width in enumerate(_WIDTHS):
@@ -44,7 +44,6 @@ class Small(Tower):
             ]
             inputs = width
         self.stages = nn.Sequential(*layers)
-        self.output = output
         self.fc = nn.Linear(2 * inputs, 1000) if output == "classes" else None
         self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 

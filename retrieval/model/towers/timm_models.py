@@ -18,7 +18,6 @@ class TimmTower(TowerFamily):
     def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
         super().__init__(output, model, architecture)
         timm = _timm()
-        self.output = output
         if output == "stages":
             self.model = timm.create_model(model, pretrained=False, features_only=True)
             self.feature_count = 3 * sum(self.model.feature_info.channels())

@@ -28,7 +28,6 @@ class TransformersTower(TowerFamily):
         if output == "classes":
             raise ConfigError(f"transformers:{model} has no 1000-way layer; set tower_output to pooled or stages")
         models = _transformers()
-        self.output = output
         config = models.AutoConfig.for_model(**architecture["config"])
         self.model = models.AutoModel.from_config(config).float()
         takes = inspect.signature(self.model.forward).parameters
