@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -74,16 +75,23 @@ def test_a_package_outside_the_repository_trains_evaluates_builds_and_answers(wo
     assert header["config"]["training"]["proxies_weight"] == 1.0
     report = (workplace / "report" / "report.md").read_text()
     assert all(name in report for name in ("late fusion", "nearest mean", "random scores"))
+    # Without the package the tower is missing, and its loss is not missed.
+    bare = {**installed, "PYTHONPATH": str(ROOT)}
+    code, _, said = retrieve("retrieve build-index catalog/ --model model.safetensors --out other", workplace, bare)
+    assert code == 2
+    assert "tower must be one of mobilenet_v2, resnet18, resnet34, resnet50, small; got 'patches'" in said
+    assert "touch_retrieval.towers" in said
 
 
 @pytest.mark.slow
 def test_the_driver_of_the_package_is_read_by_its_table(workplace, installed):
-    code = """
+    (table,) = (tomllib.loads(block)["sensors"]["a"] for block in blocks("toml", PAGE) if "[sensors.a]" in block)
+    code = f"""
 from robot.real_rig import load_driver
-with load_driver("sensors", {"driver": "latest_file", "folder": "."}, "[sensors.a]", finger="a") as sensor:
+with load_driver("sensors", {table | {"folder": "."}}, "[sensors.a]", finger="a") as sensor:
     print(sensor.read().pixels.shape)
 try:
-    load_driver("gripper", {"driver": "latest_file"}, "[gripper]")
+    load_driver("gripper", {table}, "[gripper]")
 except Exception as error:
     print(error)
 """
@@ -91,19 +99,6 @@ except Exception as error:
     assert done == 0, error
     assert said.splitlines()[0] == "(120, 160, 3)"
     assert "[gripper]: driver 'latest_file' must be a Gripper" in said
-
-
-@pytest.mark.slow
-def test_without_the_package_the_checkpoint_says_which_tower_is_missing_and_its_loss_is_not_missed(
-    workplace, installed
-):
-    if not (workplace / "model.safetensors").exists():
-        pytest.skip("the commands of the page did not run before")
-    bare = {**installed, "PYTHONPATH": str(ROOT)}
-    code, _, said = retrieve("retrieve build-index catalog/ --model model.safetensors --out other", workplace, bare)
-    assert code == 2
-    assert "tower must be one of mobilenet_v2, resnet18, resnet34, resnet50, small; got 'patches'" in said
-    assert "touch_retrieval.towers" in said
 
 
 def test_the_page_shows_every_file_of_the_package():
