@@ -27,7 +27,6 @@ COMMANDS = PAGE.with_name("commands.md")
 DATA_SETS = PAGE.with_name("datasets.md")
 MADE_BY_HAND = (
     retrieval.Client,
-    retrieval.Protocol,
     retrieval.Setting,
     robot.Frame,
     robot.Pose,
