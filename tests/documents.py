@@ -10,7 +10,7 @@ SITE = tuple(sorted((ROOT / "docs").glob("*.md")))
 """The pages of docs/, of which `make docs` makes the site."""
 PAGES = (README, *SITE)
 RUN_TOGETHER = tuple(page for page in PAGES if page.stem != "extending")
-"""The pages whose blocks are run in one folder; tests/test_extending.py runs those of the other."""
+"""The pages whose blocks are run in one folder; tests/project/test_extending.py runs those of the other."""
 NOTEBOOKS = tuple(sorted((ROOT / "notebooks").glob("*.ipynb")))
 
 

@@ -9,7 +9,7 @@ import pytest
 from _touch_retrieval.registry import Registry
 from tests import plugins
 
-HERE = "tests.test_registry"
+HERE = "tests.project.test_registry"
 
 
 class Shape:
