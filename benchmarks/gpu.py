@@ -23,7 +23,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import default_device, encode_photos, encode_touches, to_batch, touch_batch
 from retrieval.model.fusion import Matcher, judge_of
 from retrieval.model.towers import TOWERS
-from retrieval.training.step import batch_loss
+from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 
 PHOTOS, JUDGED, REPETITIONS = 64, 1000, 5
@@ -86,7 +86,7 @@ def _step(matcher: Matcher, config: Config, photos: int, touches: int = 6) -> Ca
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
         features = matcher.touch_features(touch_batch(grasps, device)), matcher.photo_features(to_batch(own, device))
-        batch_loss(matcher, config.training, batch, *features)[0].backward()
+        batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), batch, *features)[0].backward()
         optimizer.step()
 
     return step

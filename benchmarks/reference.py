@@ -25,14 +25,21 @@ PACKAGES = (retrieval, robot, indexes)
 PAGE = Path(__file__).parents[1] / "docs" / "reference.md"
 COMMANDS = PAGE.with_name("commands.md")
 DATA_SETS = PAGE.with_name("datasets.md")
-MADE_BY_HAND = (retrieval.Client, robot.Frame, robot.Pose, robot.RecordingWriter, indexes.IndexStore)
+MADE_BY_HAND = (
+    retrieval.Client,
+    retrieval.Setting,
+    robot.Frame,
+    robot.Pose,
+    robot.RecordingWriter,
+    indexes.IndexStore,
+)
 """Classes that a user makes an object of; all others come out of a function."""
 HEAD = """# Reference
 
 The public names of the three packages, from their docstrings; `python -m benchmarks.reference` writes this page. Every
-example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `model.safetensors` and the gel
-images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported when it is used: `import retrieval` alone
-costs nothing.
+example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `lab/` (a recording of 12
+objects), `model.safetensors` and the gel images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported
+when it is used: `import retrieval` alone costs nothing.
 """
 WIDTH = 98
 """Of help in a terminal of 100 columns."""
@@ -127,7 +134,8 @@ def _below(package: Any, name: str) -> str:
     """The text that stands below a constant."""
     body = ast.parse(Path(package.__file__).read_text("utf-8")).body
     for statement, after in itertools.pairwise(body):
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == name:
+        targets = getattr(statement, "targets", None) or [getattr(statement, "target", None)]
+        if targets[0] is not None and ast.unparse(targets[0]) == name:
             assert isinstance(after, ast.Expr)
             assert isinstance(after.value, ast.Constant)
             return inspect.cleandoc(str(after.value.value))

@@ -19,7 +19,7 @@ import numpy as np
 from retrieval.commands.main import main as retrieve
 from robot.readings import Frame, Intrinsics
 from robot.recording.folder import read_info, read_recording
-from robot.rig import RIGS, load_rig
+from robot.rig import load_rig
 from robot.sight import hand_eye
 from tests.emulated_rig import HOLDING
 from tests.emulators.wsg50.gripper import EmulatedWSG50
@@ -57,7 +57,6 @@ def replayed(folder, source, grasps):
     with (
         serve_tcp(emulator) as url,
         patch("robot.rig.input", lambda: "", create=True),
-        patch.dict(RIGS, rehearsal="benchmarks.rehearsal:unknown"),
         patch("robot.rig.load_rig", partial(_load, emulator, url, folder, source)),
     ):
         yield "rehearsal"

@@ -19,7 +19,7 @@ from benchmarks.common import Line, as_text, duration, in_turns, matcher_of, ran
 from retrieval.data.dataset import PairBatch
 from retrieval.model.config import Config
 from retrieval.model.encode import to_batch, touch_batch
-from retrieval.training.step import batch_loss
+from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 
 Index = np.ndarray
@@ -39,7 +39,9 @@ def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions:
 
     def backward(touch: Tensor, photo: Tensor, batch: PairBatch, share: float = 1.0) -> None:
         features = matcher.touch_features(touch), matcher.photo_features(photo)
-        (share * batch_loss(matcher, config.training, batch, *features)[0]).backward()
+        (
+            share * batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), batch, *features)[0]
+        ).backward()
 
     def step(passes: Callable[[], None]) -> None:
         optimizer.zero_grad(set_to_none=True)

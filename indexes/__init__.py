@@ -17,6 +17,7 @@ Importing this package needs only numpy; FAISS is imported when one of its kinds
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from _touch_retrieval.registry import Registry
 from indexes.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -26,31 +27,38 @@ if TYPE_CHECKING:
     from indexes.store.folder import IndexStore as IndexStore
     from indexes.store.generation import Generation as Generation
 
-KINDS = {
-    "exact": "indexes.kinds.exact:ExactIndex",
-    "flat": "indexes.kinds.flat:FlatIndex",
-    "ivf_flat": "indexes.kinds.ivf:IVFFlatIndex",
-    "ivf_sq8": "indexes.kinds.ivf:IVFSQ8Index",
-    "ivf_pq": "indexes.kinds.ivf:IVFPQIndex",
-    "hnsw": "indexes.kinds.hnsw:HNSWIndex",
-}
-"""Name of a kind -> where its class stands, the quickest to build first. A new kind is one file and one line here; what
-others need to know of it, its class says (`indexes.kinds.base.VectorIndex`)."""
+KINDS: "Registry[type[VectorIndex]]" = Registry(
+    "kind of index",
+    "indexes",
+    {
+        "exact": "indexes.kinds.exact:ExactIndex",
+        "flat": "indexes.kinds.flat:FlatIndex",
+        "ivf_flat": "indexes.kinds.ivf:IVFFlatIndex",
+        "ivf_sq8": "indexes.kinds.ivf:IVFSQ8Index",
+        "ivf_pq": "indexes.kinds.ivf:IVFPQIndex",
+        "hnsw": "indexes.kinds.hnsw:HNSWIndex",
+    },
+    error=ParameterError,
+    base="indexes.kinds.base:VectorIndex",
+)
+"""Names of the kinds of index, the quickest to build first. What others need to know of a kind, its class says
+(`indexes.VectorIndex`)."""
 
 
 def load_kind(name: str) -> "type[VectorIndex]":
-    """The class of the kind `name`; an unknown name raises `ParameterError` listing the known ones.
+    """Return the class of the kind `name`. Raises `ParameterError` for an unknown name, with the known ones.
 
     >>> indexes.load_kind("flat").exact, indexes.load_kind("hnsw").exact
     (True, False)
     >>> indexes.load_kind("octree")
     Traceback (most recent call last):
-    indexes.errors.ParameterError: the kind of index must be one of exact, flat, ivf_flat, ...; got 'octree'
+    indexes.errors.ParameterError: kind of index must be one of exact, flat, ivf_flat, ...; got 'octree'. Give ...
     """
-    if name not in KINDS:
-        raise ParameterError(f"the kind of index must be one of {', '.join(KINDS)}; got {name!r}")
-    module, _, attribute = KINDS[name].partition(":")
-    kind: type[VectorIndex] = getattr(import_module(module), attribute)
+    kind = KINDS.load(name)
+    if kind.kind != name:
+        raise ParameterError(
+            f"the index {kind.__module__}:{kind.__qualname__} must say kind = {name!r}, got {kind.kind!r}"
+        )
     return kind
 
 

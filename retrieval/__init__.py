@@ -19,9 +19,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from retrieval.errors import BadInput as BadInput
     from retrieval.errors import RetrievalError as RetrievalError
+    from retrieval.evaluation.real.protocol import Protocol as Protocol
+    from retrieval.evaluation.run import evaluate as evaluate
+    from retrieval.methods.base import Method as Method
+    from retrieval.methods.base import Setting as Setting
     from retrieval.model.checkpoint import Checkpoint as Checkpoint
     from retrieval.model.checkpoint import load_checkpoint as load_checkpoint
+    from retrieval.model.config import Config as Config
+    from retrieval.model.config import load_config as load_config
+    from retrieval.model.losses.loss import Loss as Loss
     from retrieval.model.touches import Encoded as Encoded
+    from retrieval.model.towers.base import Tower as Tower
     from retrieval.search.agreement import Agreement as Agreement
     from retrieval.search.agreement import agreement as agreement
     from retrieval.search.answer import Match as Match
@@ -34,6 +42,7 @@ if TYPE_CHECKING:
     from retrieval.search.neighbours import nearest_photos as nearest_photos
     from retrieval.search.searcher import Searcher as Searcher
     from retrieval.serve.client import Client as Client
+    from retrieval.training.train import train as train
 
     open = Searcher.open
 
@@ -43,19 +52,28 @@ _PLACES = {
     "BuildReport": "search.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
+    "Config": "model.config:Config",
     "Encoded": "model.touches:Encoded",
+    "Loss": "model.losses.loss:Loss",
     "Match": "search.answer:Match",
+    "Method": "methods.base:Method",
     "Neighbour": "search.neighbours:Neighbour",
+    "Protocol": "evaluation.real.protocol:Protocol",
     "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.searcher:Searcher",
+    "Setting": "methods.base:Setting",
+    "Tower": "model.towers.base:Tower",
     "agreement": "search.agreement:agreement",
     "build_index": "search.build:build_index",
     "embed_photos": "search.embeddings:embed_photos",
+    "evaluate": "evaluation.run:evaluate",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
+    "load_config": "model.config:load_config",
     "nearest_photos": "search.neighbours:nearest_photos",
     "open": "search.searcher:Searcher.open",
     "shipped_model": "search.defaults:shipped_model",
+    "train": "training.train:train",
 }
 """Public name -> where it stands in this package."""
 

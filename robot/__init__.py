@@ -12,6 +12,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from robot.devices import Arm as Arm
+    from robot.devices import Camera as Camera
+    from robot.devices import Gripper as Gripper
     from robot.devices import TactileSensor as TactileSensor
     from robot.errors import RobotError as RobotError
     from robot.importers import load_importer as load_importer
@@ -26,7 +29,10 @@ if TYPE_CHECKING:
     from robot.rig import load_rig as load_rig
 
 _PLACES = {
+    "Arm": "devices",
+    "Camera": "devices",
     "Frame": "readings",
+    "Gripper": "devices",
     "Pose": "readings",
     "RecordedGrasp": "recording.grasp",
     "Recording": "recording.folder",

@@ -186,6 +186,10 @@ class Arm(Actuator):
 
     by_hand: a person moves it when asked to; no speed is kept then. can_tilt: whether the fingers may point elsewhere
     than straight down.
+
+    >>> with robot.load_rig("sim", seed=0) as rig:
+    ...     rig.arm.move_to(rig.home, speed_mm_s=100) == rig.home
+    True
     """
 
     by_hand: ClassVar[bool] = False
@@ -230,6 +234,11 @@ class Gripper(Actuator):
     """Two parallel jaws, `stroke_mm` apart at most, that clamp with `min_force_n` to `max_force_n`.
 
     A driver may learn these limits when it connects; they never rise above what it was given.
+
+    >>> with robot.load_rig("sim", seed=0) as rig:
+    ...     rig.gripper.grasp(force_n=1e6)
+    Traceback (most recent call last):
+    robot.errors.DeviceError: simulated gripper: force must be from ... to ... N, got 1e+06
     """
 
     def __init__(
@@ -329,7 +338,13 @@ def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_A
 
 class Camera(Device):
     """Looks at the table. `extrinsics` (4, 4): camera frame (x right, y down, z forward; mm) to the rig's frame, as
-    calibrated, which may be 5 to 10 mm off. has_depth: without it a grasp cannot be planned from the picture."""
+    calibrated, which may be 5 to 10 mm off. has_depth: without it a grasp cannot be planned from the picture.
+
+    >>> with robot.load_rig("sim", seed=0) as rig:
+    ...     rig.prepare(rig.object_ids(1)[0], 0)
+    ...     rig.camera.read(depth=False).colour.shape
+    (..., ..., 3)
+    """
 
     has_depth: bool = True
 

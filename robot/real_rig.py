@@ -44,12 +44,12 @@ Paths are those of the process that reads the file. Unknown keys are refused eve
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
@@ -60,31 +60,38 @@ from robot.settings import TypedSettings, build, check_type, limited
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
-DRIVERS: Mapping[str, Mapping[str, str]] = {
-    "arm": {
-        "manual": "robot.drivers.manual_arm:ManualArm",
-        "sawyer": "robot.drivers.sawyer.driver:Sawyer",
-    },
-    "gripper": {
-        "wsg50": "robot.drivers.wsg50.driver:WSG50",
-    },
-    "sensors": {
-        "gelsight": "robot.drivers.gels.opencv:GelSight",
-        "gelsight_mini": "robot.drivers.gels.opencv:GelSightMini",
-        "digit": "robot.drivers.gels.opencv:Digit",
-        "uvc": "robot.drivers.gels.opencv:OpencvTactile",
-        "video": "robot.drivers.replay:VideoSensor",
-        "images": "robot.drivers.replay:ImagesSensor",
-    },
-    "camera": {
-        "kinect2": "robot.drivers.cameras.kinect2:Kinect2",
-        "realsense": "robot.drivers.cameras.realsense:RealSense",
-        "uvc": "robot.drivers.cameras.uvc:UvcCamera",
-        "replay": "robot.drivers.replay:ReplayCamera",
-    },
+
+def _drivers(role: str, base: str, **table: str) -> "Registry[type[Device]]":
+    return Registry(f"[{role}]: driver", "drivers", table, error=UnknownName, base=f"robot.devices:{base}")
+
+
+DRIVERS: Mapping[str, Registry[type[Device]]] = {
+    "arm": _drivers(
+        "arm", "Arm", manual="robot.drivers.manual_arm:ManualArm", sawyer="robot.drivers.sawyer.driver:Sawyer"
+    ),
+    "gripper": _drivers("gripper", "Gripper", wsg50="robot.drivers.wsg50.driver:WSG50"),
+    "sensors": _drivers(
+        "sensors",
+        "TactileSensor",
+        gelsight="robot.drivers.gels.opencv:GelSight",
+        gelsight_mini="robot.drivers.gels.opencv:GelSightMini",
+        digit="robot.drivers.gels.opencv:Digit",
+        uvc="robot.drivers.gels.opencv:OpencvTactile",
+        video="robot.drivers.replay:VideoSensor",
+        images="robot.drivers.replay:ImagesSensor",
+    ),
+    "camera": _drivers(
+        "camera",
+        "Camera",
+        kinect2="robot.drivers.cameras.kinect2:Kinect2",
+        realsense="robot.drivers.cameras.realsense:RealSense",
+        uvc="robot.drivers.cameras.uvc:UvcCamera",
+        replay="robot.drivers.replay:ReplayCamera",
+    ),
 }
-"""Drivers by role and name, imported when asked for. A new device is a file with a subclass of its role's base class
-(robot.devices), whose keywords are the keys of its table, and a row here."""
+"""Drivers by role and name, imported when used. A new device is a subclass of its role's base class (robot.devices),
+whose keywords are the keys of its table. An installed package names drivers of every role in one group of entry
+points."""
 
 HAND_EYE_DAYS = 30.0
 """A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
@@ -177,14 +184,11 @@ class RealRig(Rig):
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -> Any:
     """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
-    known = DRIVERS[role]
     settings = dict(table)
     name = settings.pop("driver", None)
-    if not isinstance(name, str) or name not in known:
-        raise UnknownName(f"{where}: driver must be one of {', '.join(sorted(known))}; got {name!r}")
-    module, class_name = known[name].split(":")
-    driver: type[Device] = getattr(import_module(module), class_name)
-    return build(driver, settings, where=where, clock=time.monotonic, **given)
+    if not isinstance(name, str):
+        raise UnknownName(f"{where}: driver must be one of {', '.join(DRIVERS[role].names())}; got {name!r}")
+    return build(DRIVERS[role].resolve(name), settings, where=where, clock=time.monotonic, **given)
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:

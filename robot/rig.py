@@ -4,10 +4,10 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from _touch_retrieval.registry import Registry
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasping.planner import CylinderPlanner, GraspPlanner
@@ -17,8 +17,14 @@ from robot.settings import build
 from robot.sight.cylinder import CylinderFit
 from robot.storage import content_of
 
-RIGS = {"sim": "robot.sim.rig:SimRig", "real": "robot.real_rig:RealRig"}
-"""Rigs by name, imported when asked for. A new rig is a file with a subclass of Rig, and a row here."""
+RIGS: "Registry[type[Rig]]" = Registry(
+    "rig, where it is not a .toml file,",
+    "rigs",
+    {"real": "robot.real_rig:RealRig", "sim": "robot.sim.rig:SimRig"},
+    error=UnknownName,
+    base="robot.rig:Rig",
+)
+"""Rigs by name, imported when asked for."""
 
 
 def ask_on_terminal(sentence: str) -> None:
@@ -160,16 +166,12 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     dict_keys(['a'])
     >>> robot.load_rig("juggler", seed=0)
     Traceback (most recent call last):
-    robot.errors.UnknownName: no rig is called 'juggler'; known: real, sim, or give a .toml file
+    robot.errors.UnknownName: rig, where it is not a .toml file, must be one of real, sim; got 'juggler'. ...
     """
     name = spec
     if spec.endswith(".toml"):
         name, settings = _read_toml(Path(spec), settings)
-    if name not in RIGS:
-        raise UnknownName(f"no rig is called {name!r}; known: {', '.join(sorted(RIGS))}, or give a .toml file")
-    module, class_name = RIGS[name].split(":")
-    rig_class: type[Rig] = getattr(import_module(module), class_name)
-    rig = build(rig_class, settings, where=spec if spec.endswith(".toml") else "", seed=seed)
+    rig = build(RIGS.resolve(name), settings, where=spec if spec.endswith(".toml") else "", seed=seed)
     rig.info |= {"rig": name, "rig_settings": settings}
     return rig
 

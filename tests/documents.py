@@ -9,6 +9,8 @@ README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
 SITE = tuple(sorted((ROOT / "docs").glob("*.md")))
 """The pages of docs/, of which `make docs` makes the site."""
 PAGES = (README, *SITE)
+RUN_TOGETHER = tuple(page for page in PAGES if page.stem != "extending")
+"""The pages whose blocks are run in one folder; tests/project/test_extending.py runs those of the other."""
 NOTEBOOKS = tuple(sorted((ROOT / "notebooks").glob("*.ipynb")))
 
 
@@ -21,8 +23,12 @@ def text_of(page):
 
 
 def blocks(language, *pages):
-    """The code blocks of pages (all of them where none is named) in one language."""
-    return [block for page in pages or PAGES for block in re.findall(rf"```{language}\n(.*?)```", text_of(page), re.S)]
+    """The code blocks of pages (of all that run together, where none is named) in one language."""
+    return [
+        block
+        for page in pages or RUN_TOGETHER
+        for block in re.findall(rf"```{language}\n(.*?)```", text_of(page), re.S)
+    ]
 
 
 def table_rows(page):

@@ -24,10 +24,9 @@ from matplotlib.figure import Figure
 
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
-from retrieval.evaluation.experiment import SEEDLESS
 from retrieval.evaluation.run import DRAWS
 from retrieval.evaluation.scoring import summaries
-from retrieval.methods import METHODS, build_method
+from retrieval.methods import METHODS
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.metrics.measure import Measure
@@ -107,8 +106,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         train = felt.joined(paired) if count and photographed else felt if count else paired
         folder = arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed"
         for name in arguments.methods:
-            seeds = range(1 if name in SEEDLESS else arguments.seeds)
-            trained = [build_method(name, Setting(config, seed, folder)) for seed in seeds]
+            seeds = range(arguments.seeds if METHODS.load(name).is_seeded else 1)
+            trained = [METHODS.load(name)(Setting(config, seed, folder)) for seed in seeds]
             for method in trained:
                 method.fit(train, validation)
             size = {"method": name, "objects": count, "grasps": grasps, "photographed": photographed}

@@ -60,6 +60,7 @@ class VectorIndex(ABC):
     """
 
     kind: ClassVar[str]
+    """Its name, which the manifest of an index keeps; module:Class where a subclass says none."""
     exact: ClassVar[bool] = False
     """Whether a search always finds the true best k."""
     tried: ClassVar[bool] = False
@@ -78,6 +79,10 @@ class VectorIndex(ABC):
     fewest: ClassVar[int] = 1
     """Vectors that a build needs."""
     parameters: Parameters
+
+    def __init_subclass__(cls) -> None:
+        if "kind" not in vars(cls):
+            cls.kind = f"{cls.__module__}:{cls.__qualname__}"
 
     def __init__(self, vectors: Floats, parameters: Any, seed: int, threads: int | None) -> None:
         """Used by `build` and `load`, which check what comes here."""

@@ -88,4 +88,4 @@ def take_over(tower: Tower, known: Tower, init: str) -> None:
     *parts, beside = tower.parts
     for part, its in zip(parts, known.parts if isinstance(known, SideBySide) else [known], strict=True):
         part.load_state_dict(its.state_dict())
-    initialise_tower(beside, BESIDE, init)  # type: ignore[arg-type]
+    initialise_tower(beside, init)  # type: ignore[arg-type]

@@ -65,14 +65,14 @@ def real(
     json: Json = False,
 ) -> None:
     """Ask protocols of real data, with controls; goes on where it was stopped. Writes a report."""
-    from retrieval.evaluation.real import load_protocol
+    from retrieval.evaluation.real import PROTOCOLS
     from retrieval.evaluation.real.run import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
     for name, kind in WRITTEN.items():
         require_ours(out / name, kind)
-    asked = list(dict.fromkeys(protocols.split(","))) if protocols else list(PROTOCOLS)
-    data_set_of = {name: load_protocol(name).data_set for name in asked}
+    asked = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()
+    data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in asked}
     config = training_config(preset, iterations, init=init)
     cache = cache or out / "cache"
     try:

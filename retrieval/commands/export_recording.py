@@ -18,10 +18,10 @@ def export_recording(
     split: Annotated[Path | None, typer.Option(help=f"{SPLIT} to tell apart (default: all train)")] = None,
 ) -> None:
     """Write a recording in another format: lerobot, imagefolder, open-x-tactile."""
-    from robot.exporters import load_exporter
+    from robot.exporters import EXPORTERS
     from robot.recording.folder import read_recording
 
-    export, objects = load_exporter(to), read_split(split)
+    export, objects = EXPORTERS.resolve(to), read_split(split)
     source = read_recording(recording)
     parts = None if objects is None else {part: getattr(objects, part) for part in ("train", "validation", "test")}
     with Bar("export", len(source.grasps), "grasps") as bar:

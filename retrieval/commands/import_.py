@@ -32,13 +32,13 @@ def import_(
     ] = None,
 ) -> None:
     """Turn a public data set, or pictures of your own, into a recording."""
-    from robot.importers import load_importer, read_options
+    from robot.importers import IMPORTERS, read_options
 
     if name is None:
         for line in _list():
             show(line)
         return
-    options = read_options(load_importer(name), option or ())
+    options = read_options(IMPORTERS.resolve(name), option or ())
     if source is None or out is None:
         raise BadInput(
             f"an import needs a folder to read and one to write: retrieve import {name} SRC --out recording/"
@@ -70,8 +70,9 @@ def _list() -> list[str]:
     from robot.importers import IMPORTERS, load_importer, options_of, title_of
 
     lines = []
-    width = max(map(len, IMPORTERS)) + 2
-    for name in sorted(IMPORTERS):
+    names = sorted(IMPORTERS.names())
+    width = max(map(len, names)) + 2
+    for name in names:
         lines.append(f"{name:{width}}{title_of(name)}")
         options = [
             f"{each}={shlex.quote(str(default))}" for each, (_, default) in options_of(load_importer(name)).items()

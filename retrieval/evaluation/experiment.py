@@ -1,5 +1,8 @@
 """Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
 
+import hashlib
+import inspect
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +16,7 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries
-from retrieval.methods import build_method
+from retrieval.methods import METHODS
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.model.checkpoint import Checkpoint
@@ -21,9 +24,6 @@ from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
 from retrieval.training.features import Features
 from retrieval.version import __version__
-
-SEEDLESS = frozenset({"cca", "cca_pca", "cca_towers", "plsca", "constant"})
-"""Methods that come out alike for every seed: one is enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,9 @@ class Experiment:
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
         """The seeds that make a difference to a method."""
-        method = build_method(name, Setting(self.config))
-        comes_fitted = self.checkpoint is not None and isinstance(method, LateFusion)
-        return seeds[:1] if name in SEEDLESS or comes_fitted else seeds
+        method = METHODS.load(name)
+        comes_fitted = self.checkpoint is not None and issubclass(method, LateFusion)
+        return seeds[:1] if comes_fitted or not method.is_seeded else seeds
 
     def predict(self, name: str, seed: int) -> None:
         """Fit a method and write its predictions; nothing where these lie there already."""
@@ -88,13 +88,13 @@ class Experiment:
             "model": self.checkpoint.digest if self.checkpoint else None,
             "shuffled": self.shuffled,
             "software": __version__,
+            **code_of(METHODS.load(name)),
         }
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
         config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn
-        method = build_method(
-            name, Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach, self.kind_of)
-        )
+        setting = Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach, self.kind_of)
+        method = METHODS.load(name)(setting)
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))
@@ -112,3 +112,14 @@ def _shuffled(features: Features, seed: int) -> Features:
     """Every touch with a grasp drawn at random; photos stay where they are."""
     order = np.random.default_rng([seed, 13]).permutation(len(features))
     return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)
+
+
+def code_of(method: type[Method]) -> dict[str, str]:
+    """Return what predictions say of code that is not this project's, so that a method edited in between is fitted
+    anew: the SHA-256 of its module's source, or of the class where it was written in a notebook; nothing for our
+    own."""
+    if method.__module__.startswith("retrieval."):
+        return {}
+    module = sys.modules[method.__module__]
+    source = inspect.getsource(module if getattr(module, "__file__", None) else method)
+    return {"code": hashlib.sha256(source.encode()).hexdigest()}

@@ -25,7 +25,8 @@ from retrieval.evaluation.faint import faint_touches, score_faint
 from retrieval.evaluation.material import Material, prepare
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
-from retrieval.methods import METHODS, require_known
+from retrieval.methods import METHODS
+from retrieval.methods.base import Method
 from retrieval.metrics.intervals import compare
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread, photo_features, touch_features
@@ -46,7 +47,7 @@ def evaluate(
     *,
     config: Config,
     preset: str,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str | type[Method]] = tuple(METHODS),
     model: Path | None = None,
     seeds: int = 1,
     split: Split | None = None,
@@ -55,22 +56,32 @@ def evaluate(
 ) -> dict[str, Any]:
     """Judge methods on objects they never saw; writes results.json and timings.json under `out`, returns the results.
 
-    config: towers, heads and split (its `seed` is that of everything drawn); preset: what it is called. model: a
+    config: towers, heads and split (its `seed` is that of everything drawn); preset: what it is called. methods: names
+    (`retrieval.methods.METHODS`), or classes of one's own, which the report calls by their names. model: a
     checkpoint to judge instead of one fitted here. seeds: trainings of each method, from `config`'s seed on. cache:
     where features are kept (`out`/features where None). What lies under `out` from the same settings is used again,
     so that a run which was stopped goes on; equal settings give equal results to the byte. Raises ConfigError for an
     unknown method, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> config = retrieval.load_config("tiny")
+    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
+    >>> given = {"config": config, "preset": "tiny", "methods": ["cca", "chance"], "quiet": True}
+    >>> results = retrieval.evaluate(Path("lab"), Path("report"), **given)
+    >>> list(results["methods"])
+    ['cca', 'chance']
     """
-    require_known(*methods)
-    if not methods or seeds < 1:
-        raise BadInput(f"give one method and one seed at least; got {len(methods)} and {seeds}")
+    names = [METHODS.name_of(method) for method in methods]
+    if not names or seeds < 1:
+        raise BadInput(f"give one method and one seed at least; got {len(names)} and {seeds}")
     out.mkdir(parents=True, exist_ok=True)
     seed = config.training.seed
     wanted = list(range(seed, seed + seeds))
     try:
         material = prepare(recording, out, config, model=model, split=split, quiet=quiet)
         experiment, controls = _experiments(material, out, cache or out / "features", seed, quiet)
-        jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(methods)}
+        jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(names)}
         for name, some in jobs.items():
             for one in some:
                 experiment.predict(name, one)

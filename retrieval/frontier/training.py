@@ -15,7 +15,7 @@ from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
-from retrieval.training.step import batch_loss
+from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 
 TOLERANCE = 0.1
@@ -62,7 +62,9 @@ class _Step:
         matcher.zero_grad(set_to_none=True)
         with autocast(_CPU, precision):
             features = matcher.touch_features(self.touches), matcher.photo_features(self.photos)
-        batch_loss(matcher, self.settings, self.batch, *features)[0].backward()  # type: ignore[no-untyped-call]
+        batch_loss(
+            matcher, WeightedLosses(self.settings.weights, matcher, len(self.batch.grasps)), self.batch, *features
+        )[0].backward()  # type: ignore[no-untyped-call]
         grads = [weight.grad for weight in matcher.parameters() if weight.grad is not None]
         return torch.cat([grad.flatten() for grad in grads])
 

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ class Setting:
     all_teach: a method that can (`cca_towers`, `cca`, `cca_pca`) learns from validation objects, too, once its settings
     are chosen; what is calibrated on their scores is then too sure. kind_of: the kind of each object, where the
     recording names it: half of each kind is then held out together to choose settings.
+
+    >>> retrieval.Setting(retrieval.load_config("tiny")).seed
+    0
     """
 
     config: Config
@@ -41,7 +44,24 @@ class Method(ABC):
 
     Scores are ranked, equal ones by expected rank; only calibration gives them a unit. `chosen` says after `fit` what
     was chosen on validation objects, in JSON types. A method that comes fitted (from a checkpoint) sets `fitted`.
+
+    >>> import numpy as np
+    >>> class Brightness(retrieval.Method):
+    ...     is_seeded = False
+    ...     def _fit(self, train, validation): ...
+    ...     def _encode_touch(self, touch):
+    ...         return touch.mean((1, 2))[:, None]
+    ...     def _encode_photo(self, photo):
+    ...         return photo.mean(1)[:, None]
+    ...     def _score(self, touch_codes, photo_codes):
+    ...         return -abs(touch_codes - photo_codes.T)
+    >>> method = Brightness(retrieval.Setting(retrieval.load_config("tiny")))
+    >>> method.fitted
+    False
     """
+
+    is_seeded: ClassVar[bool] = True
+    """Whether fits differ by seed; where they do not, one is enough."""
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting

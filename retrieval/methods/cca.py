@@ -194,6 +194,8 @@ class CcaCell:
 class Cca(Method):
     """Cosine of canonical variates weighted by rho^p; ridge, components and p by ranking on validation objects."""
 
+    is_seeded = False
+
     most_directions: int | None = None
 
     def _fit(self, train: "Features", validation: "Features") -> None:

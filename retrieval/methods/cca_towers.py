@@ -229,6 +229,8 @@ class CcaTowers(Method):
     one object on validation objects say.
     """
 
+    is_seeded = False
+
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = blocks_of(self.setting.config, train)
         self._width = sum(blocks[1])
@@ -299,7 +301,8 @@ def blocks_of(config: Config, features: "Features") -> Blocks:
     import torch
 
     with torch.device("meta"):
-        widths = widths_of(build_tower(config.matcher.tower, config.matcher.tower_output))
+        matcher = config.matcher
+        widths = widths_of(build_tower(matcher.tower, matcher.tower_output, matcher.architectures))
     felt, seen = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
     wanted, got = (sum(felt), sum(seen)), (_rows(features).shape[1], features.photo.shape[1])
     shown = {sum(seen) + sum(felt): seen, sum(felt): felt, sum(seen): seen}

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 class Constant(Method):
     """Scores of 0: a check of how ties are counted."""
 
+    is_seeded = False
+
     def _fit(self, train: "Features", validation: "Features") -> None:
         pass
 

@@ -26,6 +26,8 @@ class Plsca(Method):
     its own photo the fit would lean on what the two share beyond the object, the pose of that grasp.
     """
 
+    is_seeded = False
+
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch = _Reduced(train.touch)
         self._photo = _Reduced(train.photo)

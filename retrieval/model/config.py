@@ -8,13 +8,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from indexes.store.regular import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
-from retrieval.model.losses import LOSSES
-from retrieval.model.towers import TOGETHER
+from retrieval.model.losses import LOSSES, OF_LOGITS
+from retrieval.model.towers import TOGETHER, architectures_of, tower_name
+
+if TYPE_CHECKING:
+    from retrieval.model.losses.loss import Loss
+    from retrieval.model.towers.base import Tower
 
 # How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
 
@@ -23,14 +27,16 @@ from retrieval.model.towers import TOGETHER
 class MatcherConfig:
     """Architecture of a matcher.
 
-    tower: backbone of both towers (`retrieval.model.towers.TOWERS`). tower_output: "classes" (the paper: the 1000-way
-    outputs are fused) or "pooled". fingers: gel images in one touch (training takes it from the recording).
-    hidden: width of the fusion head. standardise: centre and scale the features by their statistics over the
-    training batches, which lets towers trained from random weights leave the plateau at chance; the paper does not.
-    embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the networks that
-    make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the contrastive ones.
-    pruner_linear: how many of the embedding_dim numbers are linear in the contrastive embedding, which needs cosine.
-    cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does not.
+    tower: backbone of both towers (`retrieval.model.towers`). architectures: of those that `transformers` builds, by
+    their names, so that a checkpoint needs neither their files nor a network; `Config.using` fills it in. tower_output:
+    "classes" (the paper: the 1000-way outputs are fused) or "pooled". fingers: gel images in one touch (training takes
+    it from the recording). hidden: width of the fusion head. standardise: centre and scale the features by their
+    statistics over the training batches, which lets towers trained from random weights leave the plateau at chance; the
+    paper does not. embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the
+    networks that make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the
+    contrastive ones. pruner_linear: how many of the embedding_dim numbers are linear in the contrastive embedding,
+    which needs cosine. cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does
+    not.
     """
 
     tower: str = "resnet50"
@@ -43,6 +49,7 @@ class MatcherConfig:
     pruner_width: int = 0
     pruner_linear: int = 0
     cosine: bool = False
+    architectures: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def half(self) -> int:
@@ -72,8 +79,8 @@ class TrainingConfig:
     whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pairs`);
     both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
     pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
-    files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without "contrastive" the
-    embeddings stay untrained. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way
+    files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without one on embeddings these
+    stay untrained. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way
     round would; not in the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the
     paper; "batch" from the photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is
     "batch" where towers are trained. freeze_batch_norm: keep the batch statistics of the initial weights.
@@ -117,9 +124,9 @@ class TrainingConfig:
             _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
         _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
         for name, weight in self.weights.items():
-            _require(name in LOSSES, f"the weight of a loss must be of one of {', '.join(LOSSES)}; got {name!r}")
             _require(0 <= weight < math.inf, f"{name}_weight must be a number from 0; got {weight}")
-        object.__setattr__(self, "weights", {name: self.weights.get(name, 0.0) for name in LOSSES})
+        own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
+        object.__setattr__(self, "weights", {name: self.weights.get(name, 0.0) for name in LOSSES} | own)
         _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
@@ -141,28 +148,30 @@ class TrainingConfig:
     @property
     def trains_embeddings(self) -> bool:
         """Whether the contrastive projections learn anything."""
-        return self.weights["contrastive"] > 0
+        return any(weight > 0 for name, weight in self.weights.items() if name not in OF_LOGITS)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as in a TOML file: each weight is a setting of its own, `<loss>_weight`."""
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
             table |= (
-                {f"{loss}_weight": weight for loss, weight in value.items()} if name == "weights" else {name: value}
+                {f"{loss}{WEIGHT}": weight for loss, weight in value.items()} if name == "weights" else {name: value}
             )
         return table
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "TrainingConfig":
         """Inverse of `to_dict`; a setting left out keeps its default."""
-        weights = {loss: table[f"{loss}_weight"] for loss in LOSSES if f"{loss}_weight" in table}
-        return cls(**{name: value for name, value in table.items() if not name.endswith("_weight")}, weights=weights)
+        weights = {name.removesuffix(WEIGHT): value for name, value in table.items() if name.endswith(WEIGHT)}
+        return cls(**{name: value for name, value in table.items() if not name.endswith(WEIGHT)}, weights=weights)
 
     def of_steps(self, iterations: int) -> "TrainingConfig":
         """The same with so many optimiser steps, and at most as many to teach the pruner."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
+WEIGHT = "_weight"
+"""What ends the setting of a loss's weight."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "constant": lambda step, steps: 1.0,
     "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
@@ -175,7 +184,11 @@ PRECISIONS = ("auto", "float32", "bfloat16")
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides what a training run makes, but the recording."""
+    """Everything that decides what a training run makes, but the recording.
+
+    >>> retrieval.load_config("paper").matcher.tower
+    'resnet50'
+    """
 
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -197,12 +210,47 @@ class Config:
         matcher = dataclasses.replace(self.matcher, pruner_width=wanted.pruner_width, pruner_linear=linear)
         return dataclasses.replace(self, matcher=matcher)
 
+    def using(
+        self,
+        *,
+        tower: "str | type[Tower] | None" = None,
+        losses: "Mapping[str, float] | Mapping[str | type[Loss], float] | None" = None,
+    ) -> "Config":
+        """Return the configuration with another tower, or with other losses beside the match loss.
+
+        Args:
+            tower: A name, "module:Class", or a class.
+            losses: Of each, a name, "module:Class", or a class, with its weight; those left out weigh nothing.
+
+        Raises:
+            ConfigError: For an unknown name.
+
+        >>> config = retrieval.load_config("small").using(tower="resnet18", losses={"sigmoid": 0.5})
+        >>> config.matcher.tower, config.training.weights["sigmoid"]
+        ('resnet18', 0.5)
+        """
+        made = self
+        if tower is not None:
+            name = tower_name(tower)
+            matcher = dataclasses.replace(made.matcher, tower=name, architectures=architectures_of(name))
+            made = dataclasses.replace(made, matcher=matcher)
+        if losses is not None:
+            weights = {LOSSES.name_of(loss): weight for loss, weight in losses.items()}
+            made = dataclasses.replace(made, training=dataclasses.replace(made.training, weights=weights))
+        return made
+
     def without_paths(self) -> dict[str, Any]:
         """As `to_dict`, of files and folders the names alone: where they lay on this machine concerns nobody."""
         tables = self.to_dict()
         for name in ("init", "init_photo", "init_touch", "photos", "touches"):
             parts = tables["training"][name].split(TOGETHER)
             tables["training"][name] = TOGETHER.join(Path(part).name for part in parts)
+        matcher = tables["matcher"]
+        for part in matcher["architectures"]:
+            family, _, model = part.partition(":")
+            if Path(model).is_absolute():
+                matcher["tower"] = matcher["tower"].replace(part, f"{family}:{Path(model).name}")
+        del matcher["architectures"]
         return tables
 
     def to_dict(self) -> dict[str, Any]:
@@ -229,7 +277,14 @@ class Config:
 
 
 def load_config(name_or_path: str) -> Config:
-    """Read a named preset (`paper`, `small`, ...) or a TOML file. Raises ConfigError."""
+    """Read a named preset (`paper`, `small`, ...) or a TOML file, and import what it names. Raises ConfigError.
+
+    >>> retrieval.load_config("small").training.weights["contrastive"] > 0
+    True
+    >>> retrieval.load_config("huge")
+    Traceback (most recent call last):
+    retrieval.errors.ConfigError: --config must be one of adapt, ...
+    """
     file = Path(name_or_path)
     if name_or_path in preset_names():
         file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
@@ -238,11 +293,12 @@ def load_config(name_or_path: str) -> Config:
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )
     try:
-        return Config.from_dict(tomllib.loads(read_regular(file).decode()))
+        config = Config.from_dict(tomllib.loads(read_regular(file).decode()))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # what TOML or UTF-8 forbids
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
+    return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 
 
 def preset_names() -> list[str]:
@@ -254,8 +310,10 @@ def preset_names() -> list[str]:
 def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
-    _refuse_unknown(f"[{table_name}]", table, defaults)
-    return {name: _typed(f"{table_name}.{name}", type(defaults[name]), value) for name, value in table.items()}
+    types = {name: float for name in table if table_name == "training" and name.endswith(WEIGHT)}
+    types |= {name: type(default) for name, default in defaults.items()}
+    _refuse_unknown(f"[{table_name}]", table, types)
+    return {name: _typed(f"{table_name}.{name}", types[name], value) for name, value in table.items()}
 
 
 def _typed(name: str, wanted: type[Any], value: Any) -> Any:

@@ -24,6 +24,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from retrieval.errors import ConfigError
 from retrieval.model.fusion import Code, Matcher
 from retrieval.model.touches import TouchCodes
+from retrieval.model.towers.base import Tower
 
 T = TypeVar("T")
 Image = NDArray[np.float32]
@@ -88,6 +89,8 @@ def _prepared(tower: nn.Module) -> nn.Module:
 def _folded(module: nn.Module) -> nn.Module:
     """A twin that shares all tensors but those of convolutions, which have channels last and have taken in the batch
     normalisation that is registered right after them. Copying everything takes ten times as long."""
+    if isinstance(module, Tower) and not module.folds:
+        return module
     twin = _twin(module)
     children = list(module.named_children())
     for name, child in children:

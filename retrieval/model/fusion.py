@@ -104,8 +104,8 @@ class Matcher(nn.Module):
         self.views = views
         self.config = config
         # One set of weights for all fingers.
-        self.touch_tower = build_tower(config.tower, config.tower_output)
-        self.photo_tower = build_tower(config.tower, config.tower_output)
+        self.touch_tower = build_tower(config.tower, config.tower_output, config.architectures)
+        self.photo_tower = build_tower(config.tower, config.tower_output, config.architectures)
         touch_features = config.fingers * self.touch_tower.feature_count
         photo_features = views * self.photo_tower.feature_count
         self.head = FusionHead(touch_features, photo_features, config.hidden, config.dropout)

@@ -105,9 +105,8 @@ def _read(path: Path) -> dict[str, Any]:
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The protocols, their measures and rows in the order in which they are known; the file's is that of letters."""
     entries: Mapping[str, Entry] = results["protocols"]
-    known = list(METHODS)
 
-    def place(name: str) -> tuple[int, str]:
+    def place(name: str, known: list[str] = [*METHODS, *PROTOCOLS]) -> tuple[int, str]:  # noqa: B006
         return known.index(name) if name in known else len(known), name
 
     return {
@@ -116,7 +115,7 @@ def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
             "labels": dict(entries[name]["labels"]),
             "rows": {row: entries[name]["rows"][row] for row in sorted(entries[name]["rows"], key=place)},
         }
-        for name in sorted(entries, key=list(PROTOCOLS).index)
+        for name in sorted(entries, key=place)
     }
 
 
@@ -176,7 +175,7 @@ def verdicts(entry: Entry) -> list[str]:
 
 def _label(name: str, row: Entry) -> str:
     """What a row is called: a method as everywhere, a model by the name that it was given."""
-    return method_label(name) if row["model"] is None and name in METHODS else f"{name} (as it is)"
+    return method_label(name) if row["model"] is None else f"{name} (as it is)"
 
 
 def numbers(entry: Entry) -> Table:

@@ -92,7 +92,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def method_label(name: str) -> str:
     """What a method is called in the report."""
-    return METHODS.get(name, name.replace("_", " "))
+    return METHODS.get(name, name.rpartition(":")[2].replace("_", " "))
 
 
 def at_start(label: str) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from indexes import load_kind
 from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.kinds.base import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
@@ -48,7 +49,7 @@ def build_index(
     out: str | Path,
     *,
     objects_from: str | None = None,
-    kind: str | None = None,
+    kind: str | type[VectorIndex] | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
     verify: bool = False,
@@ -59,8 +60,8 @@ def build_index(
     * `folder`: of this machine, or a URL as `retrieval.data.sources` reads it.
     * `objects_from`: the rule that says which object a photo shows (`retrieval.data.naming`); None: the rule of the
       index that is there, else by folder.
-    * `kind`, `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.operating`); where all are None,
-      exact search.
+    * `kind` (a name or a class), `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.operating`);
+      where all are None, exact search.
     * `verify`: list every folder and read every file, also those that look as an earlier build found them, by size,
       times and inode (`indexes.store.seen_folders`, `retrieval.search.looks`).
 
@@ -74,7 +75,7 @@ def build_index(
     >>> report.photos, report.embedded  # the index was there, and no photo changed
     (4, 0)
     """
-    asked, out = Asked(kind, min_recall, max_ms), Path(out)
+    asked, out = Asked.of(kind, min_recall, max_ms), Path(out)
     naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
     wanted, seen = Wanted(naming, asked, quiet, verify, note), SeenFolders(out, known=not verify)
     report = build_listed(list_photos(folder, naming, seen), checkpoint, out, wanted)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.kinds.base import VectorIndex
 from indexes.store.cluster import (
     FOLDER,
     MOST_SHARDS,
@@ -95,7 +96,7 @@ def build_cluster(
     shards: int,
     *,
     objects_from: str | None = None,
-    kind: str | None = None,
+    kind: str | type[VectorIndex] | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
     bad_share: float = BAD_SHARE,
@@ -118,7 +119,7 @@ def build_cluster(
     own = Path(out) if stored is None else stored.work
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
-    asked = Asked(kind, min_recall, max_ms)
+    asked = Asked.of(kind, min_recall, max_ms)
     with WriterLock(own / "LOCK"):
         seen = None if stored is None else stored.manifest()
         before, note = _before(lambda: read_cluster(own) if stored is None else stored.parsed(seen))

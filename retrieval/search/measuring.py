@@ -86,7 +86,9 @@ class Bench(ABC):
 
     def tried(self) -> list[str]:
         """Kinds to try, unasked, where exact search takes too long: those that can be built, the quickest first."""
-        return [name for name in KINDS if load_kind(name).tried and load_kind(name).fewest <= len(self._vectors)]
+        return [
+            name for name in KINDS.names() if load_kind(name).tried and load_kind(name).fewest <= len(self._vectors)
+        ]
 
     @abstractmethod
     def point(self, index: VectorIndex, k: int) -> Point:

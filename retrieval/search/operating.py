@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from indexes import load_kind
+from indexes import KINDS, load_kind
 from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.scores import Floats, Slots
 from retrieval.errors import BadInput
@@ -56,6 +56,11 @@ class Asked:
             raise BadInput(f"the least winner recall must lie above 0 and be 1 at most; got {self.min_recall}")
         if self.max_ms is not None and not self.max_ms > 0:
             raise BadInput(f"the longest search must be above 0 ms; got {self.max_ms}")
+
+    @classmethod
+    def of(cls, kind: str | type[VectorIndex] | None, min_recall: float | None, max_ms: float | None) -> "Asked":
+        """What a user asks: `kind` is a name, "module:Class" or a class. Raises as the class does."""
+        return cls(None if kind is None else KINDS.name_of(kind), min_recall, max_ms)
 
     @property
     def target(self) -> float:

@@ -135,8 +135,9 @@ class ReliefTraining:
         sizes = np.array([each.learnt_sizes for each in self.pictures if not each.is_smooth])
         self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
         torch.manual_seed(seed)
-        self.tower = build_tower(config.matcher.tower, config.matcher.tower_output)
-        initialise_tower(self.tower, config.matcher.tower, config.training.init)
+        matcher = config.matcher
+        self.tower = build_tower(matcher.tower, matcher.tower_output, matcher.architectures)
+        initialise_tower(self.tower, config.training.init)
         features = self.tower.feature_count
         last = nn.Linear(features, sum(map(len, self.families)) + len(SIZES))
         nn.init.zeros_(last.weight)

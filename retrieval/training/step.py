@@ -1,21 +1,50 @@
 """One step of training: the loss of a batch from its features, and the match logits of pairs."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from retrieval.data.dataset import PairBatch
-from retrieval.model.config import TrainingConfig
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses import EncodedBatch, load_loss
+from retrieval.model.losses import LOSSES
+from retrieval.model.losses.loss import EncodedBatch, Loss
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import FeatureSource
 
 
+class WeightedLosses(nn.Module):
+    """The losses of a training whose weight is above 0, with their own parameters."""
+
+    def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
+        """Make them. Raises ConfigError for a name that no loss has.
+
+        Args:
+            weights: Name of a loss to its weight.
+            matcher: The model that they train.
+            objects: How many objects are trained on.
+        """
+        super().__init__()
+        self.weights = {name: weight for name, weight in weights.items() if weight > 0}
+        dim = matcher.config.embedding_dim
+        self.terms = nn.ModuleList(LOSSES.load(name)(dim, objects) for name in self.weights)
+
+    def forward(self, batch: EncodedBatch) -> list[Tensor]:
+        """Return the weighted losses (scalars) of a batch."""
+        return [weight * term(batch) for weight, term in zip(self.weights.values(), self.terms, strict=True)]
+
+    def clamp(self) -> None:
+        """Hold their parameters within range."""
+        for term in self.terms:
+            if isinstance(term, Loss):
+                term.clamp()
+
+
 def batch_loss(
     matcher: Matcher,
-    settings: TrainingConfig,
+    losses: WeightedLosses,
     batch: PairBatch,
     touch_features: Tensor,
     photo_features: Tensor,
@@ -26,9 +55,8 @@ def batch_loss(
     touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
     logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
     loss = match_loss(logits, labels)
-    for name, weight in settings.weights.items():
-        if weight > 0:
-            loss = loss + weight * load_loss(name)(EncodedBatch(matcher, touch, photo, *objects))
+    for term in losses(EncodedBatch(matcher, touch, photo, *objects)):
+        loss = loss + term
     return loss, logits
 
 

@@ -36,6 +36,7 @@ from retrieval.model.checkpoint import (
     Checkpoint,
     beside,
     load_checkpoint,
+    load_weights,
     read_tensors,
     require_writable,
     save_checkpoint,
@@ -53,7 +54,7 @@ from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
 from retrieval.training.fit import Plan, fit, one_ahead, optimizer_tensors, restore_optimizer
 from retrieval.training.judgement import with_verdicts
-from retrieval.training.step import batch_loss, pair_logits, shuffle_fingers
+from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 
 
 def state_path(out: Path) -> Path:
@@ -85,6 +86,14 @@ def train(
     decoded images are kept (`retrieval.training.kept`), for towers that are trained. The number of fingers is the
     recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
     one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
+    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))  # a real one takes thousands
+    >>> made = retrieval.train(Path("lab"), Path("lab.safetensors"), config, quiet=True)
+    >>> made.provenance["step"], len(made.split.train)
+    (2, 7)
     """
     if cache and config.training.freeze_towers:
         raise ConfigError(
@@ -134,10 +143,12 @@ class Trainer:
         self.unpruned = config.without_pruner()
         self.has_images = known is None
         self.matcher = build_matcher(self.unpruned).to(self.device)
-        trained = [parameter for parameter in self.matcher.parameters() if parameter.requires_grad]
+        self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
+        self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
+        learnt = [*self.matcher.parameters(), *self.losses.parameters()]
+        trained = [parameter for parameter in learnt if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).every_touch() if split.validation else None
         self.features: FeatureSource = TrainedFeatures(config, self.device)
@@ -179,7 +190,7 @@ class Trainer:
                 bar=bar,
                 done=self.step,
                 stepping=self.features.stepping,
-                before_step=lambda: distributed.average_gradients(self.matcher),
+                before_step=self._share_gradients,
                 after_step=self._stepped,
                 note=self._note,
                 validate=lambda _: self._validate_and_save(),
@@ -190,6 +201,10 @@ class Trainer:
             raise Interrupted(
                 f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
             )
+
+    def _share_gradients(self) -> None:
+        for module in (self.matcher, self.losses):
+            distributed.average_gradients(module)
 
     def _prepare(self, step: int) -> "Future[Loaded]":
         batch = self.sampler.batch(step, self.config.training.touches_per_batch)
@@ -202,7 +217,7 @@ class Trainer:
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)
-        loss, logits = batch_loss(self.matcher, settings, batch, touch, photo)
+        loss, logits = batch_loss(self.matcher, self.losses, batch, touch, photo)
         self._judged = logits.detach(), batch.labels
         return loss
 
@@ -210,6 +225,7 @@ class Trainer:
         # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
         increment_version(list(self.matcher.parameters()))
         self.matcher.clamp_scale()
+        self.losses.clamp()
         self.step = done
 
     def _note(self) -> str:
@@ -292,7 +308,9 @@ class Trainer:
         frozen = FROZEN if self.config.training.freeze_towers else ()  # these stand in the checkpoint beside it
         state = {name: tensor for name, tensor in self.matcher.state_dict().items() if not name.startswith(frozen)}
         tensors = {f"model.{name}": tensor for name, tensor in state.items()}
-        tensors |= optimizer_tensors(self.matcher, self.optimizer)
+        tensors |= {f"losses.{name}": tensor for name, tensor in self.losses.state_dict().items()}
+        for module in (self.matcher, self.losses):
+            tensors |= optimizer_tensors(module, self.optimizer)
         best = self.best if self.validation is not None else None
         write_tensors(state_path(self.out), tensors, {"step": self.step, "best": best, **self._identity()})
 
@@ -310,7 +328,11 @@ class Trainer:
         self.matcher.load_state_dict(
             {name: tensors.get(f"model.{name}", kept[name]) for name in self.matcher.state_dict()}
         )
-        restore_optimizer(self.matcher, self.optimizer, tensors)
+        load_weights(
+            self.losses, {name.removeprefix("losses."): tensors[name] for name in tensors if name.startswith("losses.")}
+        )
+        for module in (self.matcher, self.losses):
+            restore_optimizer(module, self.optimizer, tensors)
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
     def _own_checkpoint(self) -> Checkpoint:
@@ -343,7 +365,7 @@ def build_matcher(config: Config) -> Matcher:
         (matcher.photo_tower, settings.init_photo, "photo_tower"),
     ):
         shipped = partial(_shipped_tower, config.matcher.fingers, side)
-        initialise_tower(tower, config.matcher.tower, settings.first_weights(init), shipped)
+        initialise_tower(tower, settings.first_weights(init), shipped)
         tower.requires_grad_(not settings.freeze_towers)
         distributed.share_batch_statistics(tower)
     return matcher

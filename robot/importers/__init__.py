@@ -4,10 +4,10 @@ import inspect
 import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
+from _touch_retrieval.registry import Registry
 from robot.errors import ImporterError, UnknownName
 from robot.importers.base import DataSet, Progress
 from robot.recording.folder import Recording
@@ -24,21 +24,26 @@ class Importer(Protocol):
         """Raises ImporterError where `src` is not this data set, RecordingError, StorageError."""
 
 
-IMPORTERS = {
-    "billets": "robot.importers.billets:import_billets",
-    "feeling-of-success": "robot.importers.feeling_of_success:import_feeling_of_success",
-    "folder": "robot.importers.folder:import_folder",
-    "lerobot": "robot.importers.lerobot:import_lerobot",
-    "objectfolder": "robot.importers.objectfolder:import_objectfolder",
-    "open-x-tactile": "robot.importers.open_x_tactile:import_open_x_tactile",
-    "rct": "robot.importers.rct:import_rct",
-    "ssvtp": "robot.importers.ssvtp:import_ssvtp",
-    "touch-and-go": "robot.importers.touch_and_go:import_touch_and_go",
-    "tvl": "robot.importers.tvl:import_tvl",
-    "visgel": "robot.importers.visgel:import_visgel",
-    "vt60": "robot.importers.vt60:import_vt60",
-    "ycb-slide": "robot.importers.ycb_slide:import_ycb_slide",
-}
+IMPORTERS: "Registry[Importer]" = Registry(
+    "importer",
+    "importers",
+    {
+        "billets": "robot.importers.billets:import_billets",
+        "feeling-of-success": "robot.importers.feeling_of_success:import_feeling_of_success",
+        "folder": "robot.importers.folder:import_folder",
+        "lerobot": "robot.importers.lerobot:import_lerobot",
+        "objectfolder": "robot.importers.objectfolder:import_objectfolder",
+        "open-x-tactile": "robot.importers.open_x_tactile:import_open_x_tactile",
+        "rct": "robot.importers.rct:import_rct",
+        "ssvtp": "robot.importers.ssvtp:import_ssvtp",
+        "touch-and-go": "robot.importers.touch_and_go:import_touch_and_go",
+        "tvl": "robot.importers.tvl:import_tvl",
+        "visgel": "robot.importers.visgel:import_visgel",
+        "vt60": "robot.importers.vt60:import_vt60",
+        "ycb-slide": "robot.importers.ycb_slide:import_ycb_slide",
+    },
+    error=UnknownName,
+)
 
 
 def load_importer(name: str) -> Importer:
@@ -47,10 +52,7 @@ def load_importer(name: str) -> Importer:
     >>> robot.load_importer("billets").__name__
     'import_billets'
     """
-    if name not in IMPORTERS:
-        raise UnknownName(f"no importer is called {name!r}; known: {', '.join(sorted(IMPORTERS))}")
-    module, function = IMPORTERS[name].split(":")
-    return cast(Importer, getattr(import_module(module), function))
+    return IMPORTERS.load(name)
 
 
 def title_of(name: str) -> str:
@@ -60,8 +62,11 @@ def title_of(name: str) -> str:
 
 
 def data_set_of(name: str) -> DataSet:
-    """The facts of the data set that the importer called `name` reads. Raises UnknownName."""
-    return cast(DataSet, sys.modules[load_importer(name).__module__].DATA_SET)
+    """Return the facts of the data set that the importer called `name` reads. Raises UnknownName."""
+    facts = getattr(sys.modules[load_importer(name).__module__], "DATA_SET", None)
+    if not isinstance(facts, DataSet):
+        raise ImporterError(f"the module of the importer {name!r} must hold DATA_SET, a DataSet; got {facts!r}")
+    return facts
 
 
 # Options ---------------------------------------------------------------------------------------------------

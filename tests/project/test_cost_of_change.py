@@ -13,27 +13,28 @@ import indexes
 import robot
 from benchmarks import hard_cases
 from indexes.kinds.exact import ExactIndex
-from retrieval import frontier, methods
+from retrieval import frontier
 from retrieval.commands import main as command_line
 from retrieval.data import views
 from retrieval.data.dataset import PairBatch
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.evaluation import real
+from retrieval.evaluation.real import PROTOCOLS
 from retrieval.evaluation.real.protocol import Protocol, first_guess
 from retrieval.frontier.points import Row
+from retrieval.methods import METHODS
 from retrieval.methods.base import Setting
 from retrieval.methods.chance import Chance
 from retrieval.metrics import protocols, registry
 from retrieval.metrics.registry import Metric
 from retrieval.metrics.table import ScoreTable
-from retrieval.model import config, losses, towers
+from retrieval.model import config, towers
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
+from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
-from retrieval.model.towers.small import small
-from retrieval.training.step import batch_loss
-from robot import exporters, importers, real_rig
-from robot import rig as rigs
+from retrieval.model.towers.small import Small
+from retrieval.training.step import WeightedLosses, batch_loss
+from robot import real_rig
 from robot.devices import TactileSensor
 from robot.exporters.base import Exported, whole_folder
 from robot.grasping import gates
@@ -56,28 +57,27 @@ def add_a_command(monkeypatch):
 
 
 def add_a_tower(monkeypatch):
-    monkeypatch.setitem(towers.TOWERS, "mine", f"{HERE}:tower")
-    matcher = Matcher(dataclasses.replace(TINY, tower="mine")).eval()
+    matcher = Matcher(dataclasses.replace(TINY, tower=towers.tower_name(MyTower))).eval()
     assert matcher(torch.rand(1, 1, 3, 32, 32), torch.rand(1, 3, 32, 32)).shape == (1,)
 
 
-def tower(output):
-    return small(output)
+class MyTower(Small):
+    pass
 
 
 def add_a_loss(monkeypatch):
-    monkeypatch.setitem(losses.LOSSES, "mine", f"{HERE}:loss")
     matcher, labels = Matcher(TINY), np.ones(1, np.float32)
     none = np.zeros(1, np.int64)
     batch = PairBatch([], [], none, none, labels, none, none)
     features = torch.rand(1, matcher.touch_tower.feature_count)
-    settings = Config.from_dict({"training": {"mine_weight": 0.5}}).training
-    total, logits = batch_loss(matcher.eval(), settings, batch, features, features)
+    settings = Config().using(losses={MyLoss: 0.5}).training
+    total, logits = batch_loss(matcher.eval(), WeightedLosses(settings.weights, matcher, 9), batch, features, features)
     assert total.item() == pytest.approx(match_loss(logits, torch.from_numpy(labels)).item() + 0.5 * 7)
 
 
-def loss(batch):
-    return torch.tensor(7.0)
+class MyLoss(Loss):
+    def forward(self, batch):
+        return torch.tensor(7.0)
 
 
 def add_a_view_of_a_photo(monkeypatch):
@@ -88,8 +88,7 @@ def add_a_view_of_a_photo(monkeypatch):
 
 
 def add_a_method_to_compare(monkeypatch):
-    monkeypatch.setitem(methods.METHODS, "mine", f"{HERE}:Mine")
-    assert isinstance(methods.build_method("mine", Setting(Config())), Mine)
+    assert isinstance(METHODS.resolve(f"{HERE}:Mine")(Setting(Config())), Mine)
 
 
 class Mine(Chance):
@@ -106,26 +105,23 @@ def add_a_metric(monkeypatch):
 
 
 def add_a_protocol_of_real_data(monkeypatch):
-    monkeypatch.setitem(real.PROTOCOLS, "mine", f"{HERE}:MY_PROTOCOL")
-    assert real.load_protocol("mine").main == "guesses_k3"
+    assert PROTOCOLS.resolve(f"{HERE}:MY_PROTOCOL").main == "guesses_k3"
 
 
 MY_PROTOCOL = Protocol("vt60", "Mine", "Nothing is split.", lambda facts, seed: [], first_guess(3))
 
 
 def add_a_kind_of_index(monkeypatch):
-    monkeypatch.setitem(indexes.KINDS, "mine", f"{HERE}:MyIndex")
     vectors = np.eye(2, dtype=np.float32)
-    assert indexes.load_kind("mine").build(vectors).search(vectors[1:], 1)[1].tolist() == [[1]]
+    assert indexes.load_kind(indexes.KINDS.name_of(MyIndex)).build(vectors).search(vectors[1:], 1)[1].tolist() == [[1]]
 
 
 class MyIndex(ExactIndex):
-    kind = "mine"
+    pass
 
 
 def add_a_device(monkeypatch):
-    monkeypatch.setitem(real_rig.DRIVERS["sensors"], "mine", f"{HERE}:Grey")
-    sensor = real_rig.load_driver("sensors", {"driver": "mine"}, "[sensors.a]", finger="a")
+    sensor = real_rig.load_driver("sensors", {"driver": f"{HERE}:Grey"}, "[sensors.a]", finger="a")
     with sensor:
         assert sensor.read().pixels.shape == (4, 4, 3)
 
@@ -148,8 +144,7 @@ def add_a_setting_of_a_device(monkeypatch):
 
 
 def add_a_rig(monkeypatch):
-    monkeypatch.setitem(rigs.RIGS, "mine", f"{HERE}:MyRig")
-    assert isinstance(robot.load_rig("mine", seed=1), MyRig)
+    assert isinstance(robot.load_rig(f"{HERE}:MyRig", seed=1), MyRig)
 
 
 class MyRig(SimRig):
@@ -170,9 +165,10 @@ def add_a_gate(monkeypatch):
 
 
 def add_an_importer(monkeypatch, tmp_path):
-    monkeypatch.setitem(importers.IMPORTERS, "mine", f"{HERE}:imported")
     (tmp_path / "source").mkdir()
-    assert command_line.main(["import", "mine", str(tmp_path / "source"), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        command_line.main(["import", f"{HERE}:imported", str(tmp_path / "source"), "--out", str(tmp_path / "out")]) == 0
+    )
 
 
 def imported(source, out, progress=None):
@@ -183,11 +179,9 @@ def imported(source, out, progress=None):
 
 
 def add_a_format_to_export_to(monkeypatch, tmp_path):
-    monkeypatch.setitem(exporters.EXPORTERS, "mine", f"{HERE}:exported")
     imported(tmp_path, tmp_path / "r")
-    assert (
-        command_line.main(["export-recording", str(tmp_path / "r"), "--to", "mine", "--out", str(tmp_path / "o")]) == 0
-    )
+    to = ["--to", f"{HERE}:exported", "--out", str(tmp_path / "o")]
+    assert command_line.main(["export-recording", str(tmp_path / "r"), *to]) == 0
     assert (tmp_path / "o" / "mine").read_text() == "1"
 
 

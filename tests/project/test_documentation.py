@@ -20,7 +20,7 @@ from retrieval.model.towers import build_tower
 from retrieval.search.answer import EXIT_CODES
 from robot.rig import load_rig
 from tests import real_data_sets, serving, synthetic
-from tests.documents import PAGES, README, ROOT, blocks, text_of
+from tests.documents import PAGES, README, ROOT, RUN_TOGETHER, blocks, text_of
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.project.test_project import pins
 from tests.replay_rig import replay_file
@@ -89,7 +89,9 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if of_program("retrieve", page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [page for page in RUN_TOGETHER if of_program("retrieve", page)], ids=lambda page: page.stem
+)
 def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
     for line in of_program("retrieve", page):
         if line[1] == "serve":  # until it is told to end
@@ -177,4 +179,4 @@ def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, mo
 
 
 def test_programs_stand_in_the_readme_and_in_the_reference_whose_examples_run():
-    assert {page.stem for page in PAGES if blocks("python", page)} == {"README", "reference"}
+    assert {page.stem for page in PAGES if blocks("python", page)} == {"README", "reference", "extending"}

@@ -11,6 +11,7 @@ from tests.documents import CONTRIBUTING, table_rows
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("indexes", "robot", "retrieval")
+SHARED = "_touch_retrieval"
 # Only these know the rigs: the reader of recordings, what shows a rig on the page, and the commands around a rig.
 MAY_TOUCH_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/")
 # In `retrieval` the layers run one way; a module may import those of its own layer and of layers before it.
@@ -58,6 +59,11 @@ def test_indexes_and_robot_know_nothing_of_anyone(package):
 def test_retrieval_knows_neither_tests_nor_benchmarks():
     for path in modules("retrieval"):
         assert not packages_of(path) & {"tests", "benchmarks", "notebooks"}, path
+
+
+def test_what_the_packages_share_knows_none_of_them_and_needs_python_alone():
+    for path in modules(SHARED):
+        assert packages_of(path) <= {*sys.stdlib_module_names, SHARED}, path
 
 
 def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_images():

@@ -39,11 +39,10 @@ def test_everything_is_pinned_for_the_tests():
 
 
 def test_only_our_packages_are_installed():
-    assert PROJECT["tool"]["setuptools"]["packages"]["find"]["include"] == ["retrieval*", "robot*", "indexes*"]
+    ours = ["retrieval", "robot", "indexes", "_touch_retrieval"]
+    assert PROJECT["tool"]["setuptools"]["packages"]["find"]["include"] == [f"{name}*" for name in ours]
     assert {path.name for path in ROOT.iterdir() if path.is_dir() and (path / "__init__.py").exists()} == {
-        "retrieval",
-        "robot",
-        "indexes",
+        *ours,
         "tests",
         "benchmarks",
     }

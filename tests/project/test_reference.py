@@ -36,6 +36,7 @@ def folder(catalogue, touch, model, tmp_path_factory):
         for number, name in enumerate(("mug", "mug", "tin", "tin")):
             images = {"photo": root / "catalog" / name / "1.jpg", "touch_a": root / "a.png", "touch_b": root / "b.png"}
             writer.append(f"{number:06d}", name, images)
+    synthetic.write_recording(root / "lab", synthetic.make_objects(12), 2, before=False)
     shutil.copy(model, root / "model.safetensors")
     build_index(root / "catalog", load_checkpoint(root / "model.safetensors"), root / "index", quiet=True)
     return root

@@ -2,7 +2,6 @@
 
 import pytest
 
-from robot import rig as module
 from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.rig import Rig, load_rig
 from tests.fake_rig import FakeRig
@@ -96,13 +95,11 @@ def test_fingers_are_in_order_however_they_were_given():
 # By name ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def fake(monkeypatch):
-    monkeypatch.setitem(module.RIGS, "fake", "tests.fake_rig:FakeRig")
+FAKE = "tests.fake_rig:FakeRig"
 
 
-def test_a_rig_is_built_by_its_name_and_says_how(fake):
-    rig = load_rig("fake", seed=7, fingers=["a"])
+def test_a_rig_is_built_by_its_name_and_says_how():
+    rig = load_rig(FAKE, seed=7, fingers=["a"])
     assert isinstance(rig, FakeRig)
     assert rig.world.seed == 7
     assert list(rig.sensors) == ["a"]
@@ -111,24 +108,26 @@ def test_a_rig_is_built_by_its_name_and_says_how(fake):
     assert not rig.arm.is_connected
 
 
-def test_a_rig_is_built_from_a_toml_file(fake, tmp_path):
+def test_a_rig_is_built_from_a_toml_file(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text('rig = "fake"\nfingers = ["b"]\n')
+    path.write_text('rig = "tests.fake_rig:FakeRig"\nfingers = ["b"]\n')
     rig = load_rig(str(path), seed=1)
     assert list(rig.sensors) == ["b"]
     assert list(load_rig(str(path), seed=1, fingers=["a"]).sensors) == ["a"]  # what is said last counts
-    path.write_text('rig = "fake"\n')
+    path.write_text('rig = "tests.fake_rig:FakeRig"\n')
     assert list(load_rig(str(path), seed=1).sensors) == ["a", "b"]
 
 
-def test_an_unknown_rig_lists_the_known_ones(fake):
-    with pytest.raises(UnknownName, match=r"no rig is called 'sawyer'; known: fake, real, sim, or give a \.toml file"):
+def test_an_unknown_rig_lists_the_known_ones():
+    with pytest.raises(
+        UnknownName, match=r"rig, where it is not a \.toml file, must be one of real, sim; got 'sawyer'"
+    ):
         load_rig("sawyer", seed=0)
 
 
-def test_an_unknown_setting_lists_the_known_ones(fake):
+def test_an_unknown_setting_lists_the_known_ones():
     with pytest.raises(RobotConfigError, match="FakeRig has no setting 'finger'; it knows faults, fingers"):
-        load_rig("fake", seed=0, finger="a")
+        load_rig(FAKE, seed=0, finger="a")
 
 
 BAD_FILES = {
@@ -136,15 +135,15 @@ BAD_FILES = {
     "[fake]": "must say which rig it is for",
     'fingers = ["a"]': "must say which rig it is for",
     "rig = 3": "must say which rig it is for",
-    'rig = "none"': "no rig is called 'none'",
-    'rig = "fake"\ncolour = 3': "has no setting 'colour'",
-    'rig = "fake"\n[fake]\nfingers = ["a"]': "has no setting 'fake'",
+    'rig = "none"': "must be one of real, sim; got 'none'",
+    'rig = "tests.fake_rig:FakeRig"\ncolour = 3': "has no setting 'colour'",
+    'rig = "tests.fake_rig:FakeRig"\n[fake]\nfingers = ["a"]': "has no setting 'fake'",
     "rig = " + "[" * 10**5: "is not TOML",
 }
 
 
 @pytest.mark.parametrize("text", sorted(BAD_FILES))
-def test_a_wrong_file_says_what_is_wrong(fake, tmp_path, text):
+def test_a_wrong_file_says_what_is_wrong(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text)
     with pytest.raises((RobotConfigError, UnknownName), match=BAD_FILES[text]):
@@ -185,6 +184,6 @@ def test_a_seed_must_be_a_whole_number_from_0(seed):
         load_rig("sim", seed=seed)
 
 
-def test_a_file_that_is_not_there_is_named(fake):
+def test_a_file_that_is_not_there_is_named():
     with pytest.raises(RobotConfigError, match=r"nowhere\.toml cannot be read"):
         load_rig("nowhere.toml", seed=0)

@@ -1,35 +1,32 @@
 """Protocols of real data: each says how a recording of one data set is split, what is asked, what others reached."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
 if TYPE_CHECKING:
     from retrieval.evaluation.real.protocol import Protocol
 
 SCHEMA_VERSION = 2
-PROTOCOLS = {
-    "vt60-choices": "retrieval.evaluation.real.vt60:CHOICES",
-    "vt60-seen-classes": "retrieval.evaluation.real.vt60:SEEN_CLASSES",
-    "vt60-random": "retrieval.evaluation.real.vt60:RANDOM",
-    "vt60-classes": "retrieval.evaluation.real.vt60:CLASSES",
-    "vt60-references": "retrieval.evaluation.real.vt60:REFERENCE_SEEN_CLASSES",
-    "vt60-references-random": "retrieval.evaluation.real.vt60:REFERENCE_RANDOM",
-    "vt60-references-photos": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO",
-    "vt60-references-photos-random": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO_RANDOM",
-    "billets-unseen": "retrieval.evaluation.real.billets:UNSEEN",
-    "billets-places": "retrieval.evaluation.real.billets:PLACES",
-    "objectfolder": "retrieval.evaluation.real.objectfolder:PUBLISHED",
-    "rct": "retrieval.evaluation.real.rct:MATERIALS",
-    "feeling-of-success": "retrieval.evaluation.real.feeling_of_success:PAPER",
-}
-
-
-def load_protocol(name: str) -> "Protocol":
-    """The protocol called `name`. Raises ConfigError, which lists the known ones."""
-    if name not in PROTOCOLS:
-        raise ConfigError(f"protocol must be one of {', '.join(PROTOCOLS)}; got {name!r}")
-    module, attribute = PROTOCOLS[name].split(":")
-    protocol: Protocol = getattr(import_module(module), attribute)
-    return protocol
+PROTOCOLS: "Registry[Protocol]" = Registry(
+    "protocol",
+    "protocols",
+    {
+        "vt60-choices": "retrieval.evaluation.real.vt60:CHOICES",
+        "vt60-seen-classes": "retrieval.evaluation.real.vt60:SEEN_CLASSES",
+        "vt60-random": "retrieval.evaluation.real.vt60:RANDOM",
+        "vt60-classes": "retrieval.evaluation.real.vt60:CLASSES",
+        "vt60-references": "retrieval.evaluation.real.vt60:REFERENCE_SEEN_CLASSES",
+        "vt60-references-random": "retrieval.evaluation.real.vt60:REFERENCE_RANDOM",
+        "vt60-references-photos": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO",
+        "vt60-references-photos-random": "retrieval.evaluation.real.vt60:REFERENCE_AND_PHOTO_RANDOM",
+        "billets-unseen": "retrieval.evaluation.real.billets:UNSEEN",
+        "billets-places": "retrieval.evaluation.real.billets:PLACES",
+        "objectfolder": "retrieval.evaluation.real.objectfolder:PUBLISHED",
+        "rct": "retrieval.evaluation.real.rct:MATERIALS",
+        "feeling-of-success": "retrieval.evaluation.real.feeling_of_success:PAPER",
+    },
+    error=ConfigError,
+    base="retrieval.evaluation.real.protocol:Protocol",
+)

@@ -78,6 +78,13 @@ class Protocol:
     catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.references`). galleries: the gallery
     in which each test object of a split stands, where there are several. choices: every fold is another choice of test
     objects, which share objects with those of others; values are means over the folds, and intervals cover the choice.
+
+    >>> from retrieval.evaluation.real.protocol import first_guess, folds
+    >>> def halves(facts, seed):
+    ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
+    >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, first_guess(10))
+    >>> protocol.main
+    'guesses_k10'
     """
 
     data_set: str

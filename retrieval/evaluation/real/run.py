@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +15,10 @@ from indexes.store.regular import read_json
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.errors import BadInput, Interrupted
-from retrieval.evaluation.experiment import Experiment
+from retrieval.evaluation.experiment import Experiment, code_of
 from retrieval.evaluation.faint import change
 from retrieval.evaluation.queries import draw_queries
-from retrieval.evaluation.real import SCHEMA_VERSION, load_protocol
+from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.controls import CONTROL_METHOD, CONTROLS, by_clock, why_not_untouched
 from retrieval.evaluation.real.measuring import Measured, digest, joined, measure, read_measured, write_measured
 from retrieval.evaluation.real.protocol import PHOTO, Facts, Protocol, read_facts
@@ -25,7 +26,8 @@ from retrieval.evaluation.real.references import FITTED, referenced, references_
 from retrieval.evaluation.real.towers import Row, Towers
 from retrieval.evaluation.real.verdict import BySeed, Summing, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
-from retrieval.methods import KNOW_NOTHING, require_known
+from retrieval.methods import KNOW_NOTHING, METHODS
+from retrieval.methods.base import Method
 from retrieval.model.config import Config
 from retrieval.training.features import Features
 from retrieval.version import __version__
@@ -72,8 +74,8 @@ def benchmark(
     *,
     config: Config,
     preset: str,
-    protocols: Sequence[str],
-    methods: Sequence[str],
+    protocols: Sequence[str | Protocol],
+    methods: Sequence[str | type[Method]],
     models: Mapping[str, Path],
     seeds: int,
     skipped: Mapping[str, str],
@@ -82,24 +84,24 @@ def benchmark(
 ) -> dict[str, Any]:
     """Ask the protocols; writes `out`/results.json and returns its content.
 
-    recordings: by data set. protocols: names, of data sets that are there. methods: fitted on the frozen towers of
-    `config`, which is called `preset`; models: name -> checkpoint, each a row that is asked as it is. seeds: how often
-    folds are drawn and methods are fitted. skipped: protocol -> why it is not asked. What is kept under `cache` from
-    the same settings is used again. Raises ConfigError, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+    recordings: by data set. protocols: names, or protocols of one's own, of data sets that are there. methods: names or
+    classes, fitted on the frozen towers of `config`, which is called `preset`; models: name -> checkpoint, each a row
+    that is asked as it is. seeds: how often folds are drawn and methods are fitted. skipped: protocol -> why it is not
+    asked. What is kept under `cache` from the same settings is used again. Raises ConfigError, DatasetError,
+    CheckpointError, and Interrupted after Ctrl-C.
     """
-    require_known(*methods)
-    if not (methods or models) or seeds < 1:
+    fitted = [METHODS.name_of(method) for method in methods]
+    if not (fitted or models) or seeds < 1:
         raise BadInput("give one method or model and one seed at least")
     facts = {name: read_facts(folder) for name, folder in recordings.items()}
     tables: dict[str, Any] = {}
     left_out = dict(skipped)
     rows: dict[str, list[Row]] = {}
     try:
-        for name in protocols:
-            protocol = load_protocol(name)
+        for name, protocol in map(_named, protocols):
             of = protocol.data_set
             if of not in rows:
-                rows[of] = _rows(facts[of], config, methods, models, cache / "features", quiet)
+                rows[of] = _rows(facts[of], config, fitted, models, cache / "features", quiet)
             taken = [row for row in rows[of] if protocol.entry == PHOTO or row.method in FITTED]
             if not taken:
                 left_out[name] = f"it shows objects by touches, which of the methods only {', '.join(FITTED)} can take"
@@ -126,6 +128,14 @@ def benchmark(
     text = f"{json.dumps(results, sort_keys=True, indent=1, allow_nan=False)}\n"
     write_atomically(out / "results.json", text.encode())
     return results
+
+
+def _named(choice: str | Protocol) -> tuple[str, Protocol]:
+    """A protocol and its name; one of a user's own is called by its title."""
+    if isinstance(choice, Protocol):
+        return re.sub(r"[^a-z0-9]+", "-", choice.title.lower()).strip("-"), choice
+    name = PROTOCOLS.name_of(choice)
+    return name, PROTOCOLS.load(name)
 
 
 def _rows(
@@ -303,6 +313,7 @@ class _Asked:
                 "model": towers.checkpoint.digest if towers.checkpoint else None,
                 "judged": MOST,
                 "software": __version__,
+                **code_of(METHODS.load(line.method)),
             }
         )
         path = self.cache / "measures" / self.name / f"{line.key}-{seed}-{number}.safetensors"

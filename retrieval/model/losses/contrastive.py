@@ -4,17 +4,20 @@ import math
 
 from torch import Tensor
 
-from retrieval.model.losses import EncodedBatch
 from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.loss import EncodedBatch, Loss
 
 LOG_SCALE_INIT = math.log(1 / 0.07)
 LOG_SCALE_MAX = math.log(100.0)
 
 
-def of_batch(batch: EncodedBatch) -> Tensor:
-    """`contrastive_loss` of the embeddings of a batch, made by the contrastive projections."""
-    objects = batch.touch_objects, batch.photo_objects
-    return contrastive_loss(batch.touch.embedding, batch.photo.embedding, *objects, batch.matcher.log_scale)
+class Contrastive(Loss):
+    """`contrastive_loss` of the embeddings of a batch. Its learnt scale is the matcher's, which checkpoints keep."""
+
+    def forward(self, batch: EncodedBatch) -> Tensor:
+        """Return the loss (scalar) of a batch."""
+        objects = batch.touch_objects, batch.photo_objects
+        return contrastive_loss(batch.touch.embedding, batch.photo.embedding, *objects, batch.matcher.log_scale)
 
 
 def contrastive_loss(

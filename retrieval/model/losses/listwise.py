@@ -4,13 +4,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from retrieval.model.losses import EncodedBatch
+from retrieval.model.losses.loss import EncodedBatch, Loss
 
 
-def of_batch(batch: EncodedBatch) -> Tensor:
+class Listwise(Loss):
     """`listwise_loss` of the match logits of every touch of a batch with every photo of it."""
-    logits = batch.matcher.head(batch.touch.half[:, None], batch.photo.half[None])
-    return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
+
+    def forward(self, batch: EncodedBatch) -> Tensor:
+        """Return the loss (scalar) of a batch."""
+        logits = batch.matcher.head(batch.touch.half[:, None], batch.photo.half[None])
+        return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
 
 
 def listwise_loss(scores: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:

@@ -3,11 +3,33 @@
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
+
+from retrieval.model.losses.contrastive import LOG_SCALE_MAX
+from retrieval.model.losses.loss import EncodedBatch, Loss
 
 # Where it starts: with most pairs negative, a bias of 0 would begin far from their log-odds.
 SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT = math.log(10.0), -10.0
+
+
+class Sigmoid(Loss):
+    """`sigmoid_loss` of the embeddings of a batch, with its own learnt scale and bias."""
+
+    def __init__(self, embedding_dim: int, objects: int) -> None:
+        super().__init__(embedding_dim, objects)
+        self.log_scale = nn.Parameter(torch.tensor(SIGMOID_LOG_SCALE_INIT))
+        self.bias = nn.Parameter(torch.tensor(SIGMOID_BIAS_INIT))
+
+    def forward(self, batch: EncodedBatch) -> Tensor:
+        """Return the loss (scalar) of a batch."""
+        objects = batch.touch_objects, batch.photo_objects
+        return sigmoid_loss(batch.touch.embedding, batch.photo.embedding, *objects, self.log_scale, self.bias)
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        """Hold the scale at 100 at most."""
+        self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
 def sigmoid_loss(

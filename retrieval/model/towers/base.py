@@ -1,13 +1,15 @@
 """What every tower owes its callers; a backbone only writes `_encode`."""
 
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from retrieval.errors import BadInput, NumericalError
+from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.model.towers.files import State, download
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -16,17 +18,38 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 class Tower(nn.Module):
     """Encoder of one modality: RGB images to feature vectors.
 
-    `feature_count` is the length of a vector. `optional_prefixes` begin the names of weights that published
-    checkpoints hold and that some outputs of the tower do not need, the 1000-way layer first.
+    A subclass takes an output (`retrieval.model.towers.OUTPUTS`), sets `feature_count`, the length of a vector, and
+    writes `_encode`.
+
+    >>> import torch
+    >>> class Average(retrieval.Tower):
+    ...     def __init__(self, output):
+    ...         super().__init__(output)
+    ...         self.feature_count = 8
+    ...         self.linear = torch.nn.Linear(3, 8)
+    ...     def _encode(self, images):
+    ...         return self.linear(images.mean((2, 3)))
+    >>> Average("pooled")(torch.rand(2, 3, 64, 64)).shape
+    torch.Size([2, 8])
     """
 
     feature_count: int
-    optional_prefixes: tuple[str, ...]
+    optional_prefixes: ClassVar[tuple[str, ...]] = ()
+    """What the names of weights begin with that published checkpoints hold and some outputs of the tower do not need,
+    the 1000-way layer first."""
+    folds: ClassVar[bool] = True
+    """Whether a batch normalisation that is registered right after a convolution takes that one's output, so that the
+    two can be made one for inference."""
+    url: ClassVar[str | None] = None
+    """Where the published ImageNet weights are."""
     mean: Tensor
     std: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, output: str = "pooled") -> None:
+        """Make what every tower has; a subclass makes its layers, for this output of
+        `retrieval.model.towers.OUTPUTS`."""
         super().__init__()
+        self.output = output
         # Not persistent: the state dict holds exactly the keys that ImageNet checkpoints hold.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
@@ -53,10 +76,39 @@ class Tower(nn.Module):
         """Encode normalised images (B, 3, H, W) to (B, feature_count)."""
         raise NotImplementedError
 
+    def published(self) -> State:
+        """Return the weights that are published for this architecture. Raises CheckpointError where there are none."""
+        if self.url is None:
+            raise CheckpointError(f"no weights are published for {type(self).__name__}; give a file, or `random`")
+        return download(self.url)
+
     @staticmethod
-    def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    def rename_state(state: State) -> State:
         """Map the keys of a known older layout to today's; the identity unless a backbone has one."""
         return state
+
+
+class TowerFamily(Tower, ABC):
+    """A tower around any of the models that another library builds."""
+
+    folds = False
+
+    def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
+        """Build a model.
+
+        Args:
+            output: As of any tower.
+            model: What stands behind "family:".
+            architecture: What `architecture(model)` returned when the training was configured.
+        """
+        super().__init__(output)
+        self.model_name = model
+
+    @classmethod
+    @abstractmethod
+    def architecture(cls, model: str) -> dict[str, Any]:
+        """Return plain JSON from which a model can be built again, without its files. Raises ConfigError for an unknown
+        one."""
 
 
 def unrounded(images: Tensor) -> AbstractContextManager[Any]:

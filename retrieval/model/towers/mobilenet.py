@@ -52,19 +52,22 @@ class InvertedResidual(nn.Module):
 
 
 class MobileNetV2(Tower):
-    """Nineteen convolutional features, global average, and the 1000-way layer where it is asked for."""
+    """Nineteen convolutional features, global average, and the 1000-way layer where it is asked for.
+
+    1280 pooled features, 1536 of stages; 3,504,872 parameters with the 1000-way layer.
+    """
 
     optional_prefixes = ("classifier.", "features.18.")
+    url = "https://download.pytorch.org/models/mobilenet_v2-b0353104.pth"
 
     def __init__(self, output: str) -> None:
-        super().__init__()
+        super().__init__(output)
         layers: list[nn.Module] = [_convolution(3, 32, 3, stride=2)]
         inputs = 32
         for expansion, outputs, blocks, first_stride in _STAGES:
             for block in range(blocks):
                 layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
                 inputs = outputs
-        self.output = output
         if output == "stages":
             self.feature_count = 3 * sum(_DESCRIBED.values())
         else:
@@ -111,8 +114,3 @@ class MobileNetV2(Tower):
 # A flat block lists conv, bn, relu of the expansion (absent in the first block) and the depthwise step, then conv, bn.
 _NESTED = {0: "0.0", 1: "0.1", 3: "1.0", 4: "1.1", 6: "2", 7: "3"}
 _NESTED_FIRST = {0: "0.0", 1: "0.1", 3: "1", 4: "2"}
-
-
-def mobilenet_v2(output: str) -> MobileNetV2:
-    """MobileNetV2: 1280 pooled features, 1536 of stages; 3,504,872 parameters with its 1000-way layer."""
-    return MobileNetV2(output)

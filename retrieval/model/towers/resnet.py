@@ -67,23 +67,25 @@ class ResNet(Tower):
     """Stem, four stages, global average, and the 1000-way layer where it is asked for."""
 
     optional_prefixes = ("fc.",)
+    block: ClassVar[type[BasicBlock | Bottleneck]]
+    depths: ClassVar[tuple[int, ...]]
+    """Blocks of each stage."""
 
-    def __init__(self, block: type[BasicBlock | Bottleneck], depths: tuple[int, ...], output: str) -> None:
-        super().__init__()
+    def __init__(self, output: str) -> None:
+        super().__init__(output)
         self.conv1 = nn.Conv2d(3, 64, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.relu = nn.ReLU(inplace=True)
         self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
         inputs = 64
-        for stage, depth in enumerate(depths):
+        for stage, depth in enumerate(self.depths):
             width = 64 * 2**stage
             strides = [1 if stage == 0 else 2] + [1] * (depth - 1)
             blocks: list[nn.Module] = []
             for stride in strides:
-                blocks.append(block(inputs, width, stride))
-                inputs = width * block.expansion
+                blocks.append(self.block(inputs, width, stride))
+                inputs = width * self.block.expansion
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
-        self.output = output
         self.fc = nn.Linear(inputs, 1000) if output == "classes" else None
         # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the one before.
         counts = {"classes": 1000, "pooled": inputs, "stages": 3 * (inputs + inputs // 2 + inputs // 4)}
@@ -105,16 +107,22 @@ class ResNet(Tower):
         return x if self.fc is None else self.fc(x)
 
 
-def resnet18(output: str) -> ResNet:
+class ResNet18(ResNet):
     """ResNet-18: 512 pooled features."""
-    return ResNet(BasicBlock, (2, 2, 2, 2), output)
+
+    block, depths = BasicBlock, (2, 2, 2, 2)
+    url = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 
 
-def resnet34(output: str) -> ResNet:
+class ResNet34(ResNet):
     """ResNet-34: 512 pooled features."""
-    return ResNet(BasicBlock, (3, 4, 6, 3), output)
+
+    block, depths = BasicBlock, (3, 4, 6, 3)
+    url = "https://download.pytorch.org/models/resnet34-b627a593.pth"
 
 
-def resnet50(output: str) -> ResNet:
+class ResNet50(ResNet):
     """ResNet-50: 2048 pooled features; 25,557,032 parameters with its 1000-way layer."""
-    return ResNet(Bottleneck, (3, 4, 6, 3), output)
+
+    block, depths = Bottleneck, (3, 4, 6, 3)
+    url = "https://download.pytorch.org/models/resnet50-0676ba61.pth"

@@ -26,12 +26,13 @@ class GroupNorm(nn.GroupNorm):
 
 
 class Small(Tower):
-    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features."""
+    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features, 888
+    of stages."""
 
     optional_prefixes = ("fc.",)
 
     def __init__(self, output: str) -> None:
-        super().__init__()
+        super().__init__(output)
         layers: list[nn.Module] = []
         inputs = 3
         for stage, width in enumerate(_WIDTHS):
@@ -43,7 +44,6 @@ class Small(Tower):
             ]
             inputs = width
         self.stages = nn.Sequential(*layers)
-        self.output = output
         self.fc = nn.Linear(2 * inputs, 1000) if output == "classes" else None
         self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 
@@ -61,8 +61,3 @@ class Small(Tower):
             x = layer(x)
             if isinstance(layer, nn.ReLU):
                 yield x
-
-
-def small(output: str) -> Small:
-    """The small tower: 256 pooled features, 888 of stages."""
-    return Small(output)

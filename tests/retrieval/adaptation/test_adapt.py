@@ -269,7 +269,7 @@ def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
     matcher = Matcher(config.matcher, 2).eval()
     take_over(matcher.touch_tower, start.matcher.touch_tower, str(beside))
     own, published = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
-    initialise_tower(published, "mobilenet_v2", str(beside))
+    initialise_tower(published, str(beside))
     images = torch.rand(2, 3, 64, 64)
     with torch.inference_mode():
         together = torch.cat([own(images), published(images)], 1)
@@ -278,10 +278,10 @@ def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
 
 def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):
     two = build_tower("mobilenet_v2+small", "pooled")
-    initialise_tower(two, "mobilenet_v2+small", f"{beside}+random")
+    initialise_tower(two, f"{beside}+random")
     assert torch.equal(two.parts[0].features[0][0].weight, torch.load(beside, weights_only=True)["features.0.0.weight"])
     with pytest.raises(CheckpointError, match="2 towers side by side take first weights for each"):
-        initialise_tower(two, "mobilenet_v2+small", "random+random+random")
+        initialise_tower(two, "random+random+random")
 
 
 @pytest.mark.slow

@@ -168,7 +168,7 @@ WRONG_USE = {
     "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
     "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
     "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
-    "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "known: real, sim"),
+    "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "one of real, sim"),
     "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
     "too many objects": (["collect", "--objects", "100001", "--out", "rec"], "at most 100000 objects"),
@@ -465,18 +465,22 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 
 
-@pytest.fixture
-def fake_rig(monkeypatch):
-    """A rig that `collect` finds by the name of fake."""
-    from robot.rig import RIGS
+COLLECT = [
+    "collect",
+    "--rig",
+    "tests.fake_rig:FakeRig",
+    "--objects",
+    "2",
+    "--grasps",
+    "2",
+    "--seed",
+    "3",
+    "--out",
+    "rec",
+]
 
-    monkeypatch.setitem(RIGS, "fake", "tests.fake_rig:FakeRig")
 
-
-COLLECT = ["collect", "--rig", "fake", "--objects", "2", "--grasps", "2", "--seed", "3", "--out", "rec"]
-
-
-def test_a_recording_is_collected_and_its_acceptance_printed(workplace, fake_rig, capsys):
+def test_a_recording_is_collected_and_its_acceptance_printed(workplace, capsys):
     assert main(COLLECT) == 0
     said = capsys.readouterr()
     assert said.out == ""
@@ -488,14 +492,14 @@ def test_a_recording_is_collected_and_its_acceptance_printed(workplace, fake_rig
     assert main(COLLECT) == 0  # nothing is left to do
 
 
-def test_what_was_collected_with_other_options_is_not_gone_on_with(workplace, fake_rig, capsys):
+def test_what_was_collected_with_other_options_is_not_gone_on_with(workplace, capsys):
     main(COLLECT)
     capsys.readouterr()
     assert main([*COLLECT, "--seed", "4"]) == 2
     assert "rec was collected with seed 3, not 4" in capsys.readouterr().err
 
 
-def test_ctrl_c_while_collecting_says_how_to_go_on(workplace, fake_rig, capsys, monkeypatch):
+def test_ctrl_c_while_collecting_says_how_to_go_on(workplace, capsys, monkeypatch):
     from tests.fake_rig import FakeGripper
 
     def interrupted(self, force_n, speed_mm_s):
@@ -519,7 +523,7 @@ def test_the_preview_of_the_folder_one_stands_in_lies_beside_it(workplace, capsy
     assert Path("../rec-preview.png").is_file()
 
 
-def test_collecting_nothing_is_a_failure_that_says_where_to_look(workplace, fake_rig, capsys, monkeypatch):
+def test_collecting_nothing_is_a_failure_that_says_where_to_look(workplace, capsys, monkeypatch):
     monkeypatch.setattr("tests.fake_rig.FakeRig.object_ids", lambda self, count: ["wide-0"])
     assert main(COLLECT) == 1
     assert "no grasp was accepted; rec/attempts.jsonl says why" in capsys.readouterr().err
@@ -544,7 +548,7 @@ def test_meshes_that_cannot_be_grasped_are_named_and_the_others_are_collected(tm
     assert capsys.readouterr().err.splitlines()[-1].endswith("no grasp was accepted; none/attempts.jsonl says why")
 
 
-def test_a_gate_is_trained_and_decides_what_is_kept(workplace, fake_rig, capsys):
+def test_a_gate_is_trained_and_decides_what_is_kept(workplace, capsys):
     more = ["--objects", "8", "--grasps", "4"]
     assert main([*COLLECT, *more]) == 0
     gate = ["train", "rec", "--task", "grasp-success", "--out", "gate.safetensors"]

@@ -7,19 +7,17 @@ import pytest
 
 from retrieval.commands.main import main
 from robot.drivers.discover import Found
-from robot.rig import RIGS
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(RIGS, "fake", "tests.fake_rig:FakeRig")
     return tmp_path
 
 
 def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
     monkeypatch.setattr("robot.rig_check.WATCHED_S", 0.2)
-    assert main(["rig", "check", "--rig", "fake"]) == 0
+    assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [
         ["ok", "arm"],
@@ -36,7 +34,7 @@ def test_a_check_with_a_device_that_fails_leaves_with_1_and_names_it(capsys, mon
         raise OSError(2, "No such file or directory")
 
     monkeypatch.setattr("tests.fake_rig.FakeCamera._connect", missing)
-    assert main(["rig", "check", "--rig", "fake", "--json"]) == 1
+    assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig", "--json"]) == 1
     said = capsys.readouterr()
     rows = json.loads(said.out)["devices"]
     assert rows[4]["failure"] == "fake camera cannot be connected: No such file or directory"
@@ -109,7 +107,7 @@ def test_a_file_without_points_is_wrong_use(here, capsys):
 
 
 def test_a_dry_run_prints_motions_and_writes_nothing(here, capsys):
-    assert main(["collect", "--rig", "fake", "--objects", "2", "--out", "rec", "--dry-run"]) == 0
+    assert main(["collect", "--rig", "tests.fake_rig:FakeRig", "--objects", "2", "--out", "rec", "--dry-run"]) == 0
     said = capsys.readouterr()
     assert said.out.count("jaws: close with") == 2
     assert "round-1: nothing was moved, nothing was recorded" in said.err
@@ -132,10 +130,44 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
     monkeypatch.setattr(FakeGripper, "_grasp", ended)
     monkeypatch.setattr(FakeRig, "prepare", lambda self, *which: (rigs.append(self), real_prepare(self, *which))[1])
     before = signal.getsignal(signal.SIGTERM)
-    assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 1
+    assert (
+        main(
+            [
+                "collect",
+                "--rig",
+                "tests.fake_rig:FakeRig",
+                "--objects",
+                "2",
+                "--grasps",
+                "4",
+                "--seed",
+                "3",
+                "--out",
+                "rec",
+            ]
+        )
+        == 1
+    )
     assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
     assert signal.getsignal(signal.SIGTERM) is before
     assert rigs[0].world.force is None
     assert not any(device.is_connected for device in rigs[0].devices)
     monkeypatch.setattr(FakeGripper, "_grasp", real_grasp)
-    assert main(["collect", "--rig", "fake", "--objects", "2", "--grasps", "4", "--seed", "3", "--out", "rec"]) == 0
+    assert (
+        main(
+            [
+                "collect",
+                "--rig",
+                "tests.fake_rig:FakeRig",
+                "--objects",
+                "2",
+                "--grasps",
+                "4",
+                "--seed",
+                "3",
+                "--out",
+                "rec",
+            ]
+        )
+        == 0
+    )

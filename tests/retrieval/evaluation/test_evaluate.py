@@ -86,6 +86,42 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert (summary["objects"], summary["queries"], len(summary["value"])) == (6, 24, 5)
 
 
+class Loudest(Method):
+    """Every touch fits the photo with the largest features best."""
+
+    is_seeded = False
+
+    def _fit(self, train, validation):
+        pass
+
+    def _encode_touch(self, touch):
+        return np.ones((len(touch), 1), np.float32)
+
+    def _encode_photo(self, photo):
+        return photo.max(1, keepdims=True)
+
+    def _score(self, touch_codes, photo_codes):
+        return touch_codes @ photo_codes.T
+
+
+def test_a_method_of_ones_own_stands_in_the_report_beside_ours(run, tmp_path, grasped, monkeypatch):
+    out, name = tmp_path / "report", f"{__name__}:Loudest"
+    results = run(out, methods=("constant", Loudest), seeds=2)
+    assert list(results["methods"]) == ["constant", name]
+    assert (out / "predictions" / f"{name}-0.safetensors").is_file()
+    assert not (out / "predictions" / f"{name}-1.safetensors").exists()
+    write_report(out, grasped)
+    assert "Loudest" in (out / "report.md").read_text()
+    with monkeypatch.context() as patch:
+        no_fits(patch)
+        assert run(out, methods=["constant", name], seeds=2) == results
+    monkeypatch.setattr("inspect.getsource", lambda _: "edited in between")
+    fitted = []
+    monkeypatch.setattr(Method, "fit", lambda self, *_: fitted.append(self) or setattr(self, "fitted", True))
+    run(out, methods=("constant", Loudest), seeds=2)
+    assert [type(method) for method in fitted] == [Loudest]
+
+
 def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_nothing(run, cache, tmp_path):
     apart = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(5, seed=7), 1)
     training = dataclasses.replace(CONFIG.training, **label_recording(apart, tmp_path))

@@ -8,7 +8,7 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput, ConfigError, DatasetError
-from retrieval.evaluation.real import PROTOCOLS, load_protocol
+from retrieval.evaluation.real import PROTOCOLS
 from retrieval.evaluation.real.controls import by_clock, clock, why_not_untouched
 from retrieval.evaluation.real.measuring import contact_quartiles
 from retrieval.evaluation.real.protocol import Facts
@@ -59,7 +59,7 @@ MADE = {
 
 
 def folds(name, seed=0):
-    return load_protocol(name).folds(MADE[name], seed)
+    return PROTOCOLS.load(name).folds(MADE[name], seed)
 
 
 def test_there_is_a_recording_here_for_every_protocol():
@@ -78,7 +78,7 @@ def test_no_object_stands_in_two_parts_and_two_objects_at_least_in_each(name):
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_every_seed_tests_the_same_objects_each_once(name):
     tested = [Counter(each for split in folds(name, seed) for each in split.test) for seed in range(3)]
-    if load_protocol(name).choices:
+    if PROTOCOLS.load(name).choices:
         assert all(set(each) == set(tested[0]) for each in tested)  # each of them, by some choice
     else:
         assert tested[0] == tested[1] == tested[2]
@@ -98,11 +98,11 @@ def test_choices_hold_out_all_pairs_of_instance_numbers_and_then_drawn_ones():
 
 def test_two_instances_of_a_class_leave_none_to_train():
     with pytest.raises(DatasetError, match="a class has 2, give three or more"):
-        load_protocol("vt60-choices").folds(vt60(instances=2), 0)
+        PROTOCOLS.load("vt60-choices").folds(vt60(instances=2), 0)
 
 
 def test_a_choice_has_two_galleries_of_one_object_of_each_class():
-    protocol = load_protocol("vt60-choices")
+    protocol = PROTOCOLS.load("vt60-choices")
     for split in folds("vt60-choices"):
         gallery_of = protocol.gallery_of(MADE["vt60-choices"], split)
         assert set(gallery_of) == set(split.test)
@@ -113,8 +113,8 @@ def test_a_choice_has_two_galleries_of_one_object_of_each_class():
 
 def test_a_protocol_without_galleries_of_its_own_has_one_or_one_of_each_sequence():
     split = folds("vt60-random")[0]
-    assert set(load_protocol("vt60-random").gallery_of(MADE["vt60-random"], split).values()) == {""}
-    places = load_protocol("billets-places")
+    assert set(PROTOCOLS.load("vt60-random").gallery_of(MADE["vt60-random"], split).values()) == {""}
+    places = PROTOCOLS.load("billets-places")
     assert set(places.gallery_of(MADE["billets-places"], folds("billets-places")[0]).values()) == {
         f"welded{number}" for number in range(5)
     }
@@ -155,7 +155,7 @@ def test_random_folds_hold_nine_objects():
 
 def test_a_recording_that_names_no_classes_is_refused():
     with pytest.raises(DatasetError, match="retrieve import vt60"):
-        load_protocol("vt60-random").folds(facts(dict.fromkeys("ab")), 0)
+        PROTOCOLS.load("vt60-random").folds(facts(dict.fromkeys("ab")), 0)
 
 
 def test_a_billet_that_tests_is_seen_by_nothing_and_ground_ones_are_left_out():
@@ -176,7 +176,7 @@ def test_places_of_all_welded_billets_test_and_train():
 
 def test_two_billets_are_too_few():
     with pytest.raises(DatasetError, match="3 billets at least; there are 2"):
-        load_protocol("billets-unseen").folds(facts({"a-1": "a", "b-1": "b"}), 0)
+        PROTOCOLS.load("billets-unseen").folds(facts({"a-1": "a", "b-1": "b"}), 0)
 
 
 def test_the_papers_protocol_takes_98_objects_and_tests_18():
@@ -188,12 +188,12 @@ def test_objectfolder_takes_the_published_split_and_asks_for_it_where_there_is_n
     (split,) = folds("objectfolder", seed=2)
     assert (split.seed, split.train, split.validation, split.test) == (2, tuple("abcd"), tuple("ef"), tuple("gh"))
     with pytest.raises(DatasetError, match=r"split\.json"):
-        load_protocol("objectfolder").folds(facts(dict.fromkeys("ab")), 0)
+        PROTOCOLS.load("objectfolder").folds(facts(dict.fromkeys("ab")), 0)
 
 
 def test_an_unknown_protocol_lists_the_known_ones():
     with pytest.raises(ConfigError, match=r"vt60-seen-classes, .*; got 'ycb'"):
-        load_protocol("ycb")
+        PROTOCOLS.load("ycb")
 
 
 # Reference touches -----------------------------------------------------------------------------------

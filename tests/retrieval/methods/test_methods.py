@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput, ConfigError, NumericalError
-from retrieval.methods import METHODS, build_method, cca_towers
+from retrieval.methods import METHODS, cca_towers
 from retrieval.methods.base import Method, Setting
 from retrieval.methods.cca_towers import GRID, CcaSettings, blocks_of, choose, fit_codes
 from retrieval.methods.selection import Validator, judged_rows, neighbours, ranking_auc
@@ -57,7 +57,7 @@ TRAIN, VALIDATION, TEST = planted(12, 0), planted(4, 1), planted(6, 2)
 
 @lru_cache
 def fitted(name, seed=0) -> Method:
-    method = build_method(name, Setting(CONFIG, seed=seed))
+    method = METHODS.load(name)(Setting(CONFIG, seed=seed))
     method.fit(TRAIN, VALIDATION)
     return method
 
@@ -82,7 +82,7 @@ def test_every_touch_gets_a_finite_score_with_every_photo(name):
     "name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("contrastive") else ()) for name in METHODS]
 )
 def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
-    again = build_method(name, Setting(CONFIG))
+    again = METHODS.load(name)(Setting(CONFIG))
     again.fit(TRAIN, VALIDATION)
     np.testing.assert_array_equal(again.score(*codes(again)), fitted(name).score(*codes(fitted(name))))
     assert again.chosen == fitted(name).chosen
@@ -149,7 +149,7 @@ def test_five_grasps_tell_more_than_one(name):
 
 @every_method
 def test_it_must_be_fitted_before_use(name):
-    method = build_method(name, Setting(CONFIG))
+    method = METHODS.load(name)(Setting(CONFIG))
     with pytest.raises(BadInput, match="fitted before"):
         method.encode_touch(TEST.touch)
     with pytest.raises(BadInput, match="fitted before"):
@@ -183,11 +183,11 @@ def test_features_of_another_shape_than_fitted_on_are_refused(name):
 def test_too_few_objects_and_objects_in_both_parts_are_refused():
     first_object = TRAIN.select(np.arange(8))
     with pytest.raises(BadInput, match="at least 2 training objects; got 1"):
-        build_method("constant", Setting(CONFIG)).fit(first_object, VALIDATION)
+        METHODS.load("constant")(Setting(CONFIG)).fit(first_object, VALIDATION)
     with pytest.raises(BadInput, match="at least 2 validation objects; got 1"):
-        build_method("constant", Setting(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
+        METHODS.load("constant")(Setting(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
     with pytest.raises(BadInput, match="'object-0-00' is in both"):
-        build_method("constant", Setting(CONFIG)).fit(TRAIN, TRAIN)
+        METHODS.load("constant")(Setting(CONFIG)).fit(TRAIN, TRAIN)
 
 
 @pytest.mark.parametrize("sets", [np.array([0, 1]), np.zeros((2, 0), np.int64), np.array([[0.0]])])
@@ -219,7 +219,7 @@ def test_a_method_whose_scores_are_not_finite_or_of_another_shape_is_caught():
 
 def test_an_unknown_method_is_told_the_known_ones():
     with pytest.raises(ConfigError, match=r"late_fusion, set_fusion, .*, constant; got 'oracle'"):
-        build_method("oracle", Setting(CONFIG))
+        METHODS.load("oracle")(Setting(CONFIG))
 
 
 def test_the_worth_of_scores_is_what_loops_count():
@@ -269,7 +269,7 @@ def settings_of(method):
 
 def test_once_settings_are_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
     both = TRAIN.joined(VALIDATION)
-    method = build_method("cca_towers", Setting(CONFIG, all_teach=True))
+    method = METHODS.load("cca_towers")(Setting(CONFIG, all_teach=True))
     method.fit(TRAIN, VALIDATION)
     blocks = blocks_of(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES])
@@ -281,7 +281,7 @@ def test_once_settings_are_chosen_towers_side_by_side_are_fitted_on_validation_o
 
 @pytest.mark.parametrize("name", ["cca", "cca_pca"])
 def test_where_all_objects_teach_cca_is_fitted_on_validation_objects_too(name):
-    alone, taught = fitted(name), build_method(name, Setting(CONFIG, all_teach=True))
+    alone, taught = fitted(name), METHODS.load(name)(Setting(CONFIG, all_teach=True))
     taught.fit(TRAIN, VALIDATION)
     assert {**taught.chosen, "rank": None, "most_components": None} == {
         **alone.chosen, "rank": None, "most_components": None
@@ -293,7 +293,7 @@ def test_where_all_objects_teach_cca_is_fitted_on_validation_objects_too(name):
 def test_settings_are_chosen_by_objects_that_are_held_out_of_the_fit_and_by_no_others(all_teach, monkeypatch):
     calls = []
     monkeypatch.setattr(cca_towers, "choose", lambda *asked: calls.append(asked) or choose(*asked))
-    method = build_method("cca_towers", Setting(CONFIG, all_teach=all_teach))
+    method = METHODS.load("cca_towers")(Setting(CONFIG, all_teach=all_teach))
     method.fit(TRAIN, VALIDATION)
     ((features, _, folds),) = calls
     known = {*TRAIN.object_ids, *VALIDATION.object_ids}
@@ -324,7 +324,7 @@ def with_references(features):
 
 def test_a_reference_touch_behind_a_photo_is_encoded_as_a_touch_and_weighed_by_validation_objects():
     train, validation, test = (with_references(part) for part in (TRAIN, VALIDATION, TEST))
-    method = build_method("cca_towers", Setting(CONFIG))
+    method = METHODS.load("cca_towers")(Setting(CONFIG))
     method.fit(train, validation)
     alone = fitted("cca_towers")
     assert method.chosen["ridge"] == alone.chosen["ridge"]

@@ -49,7 +49,7 @@ def test_the_preset_paper_holds_the_papers_numbers():
     assert (training.positives_per_touch, training.negatives_per_touch) == (4, 4)
     assert training.touches_per_batch * (4 + 4) == 48
     assert (training.learning_rate, training.schedule) == (1e-4, "constant")
-    assert training.weights == {"contrastive": 0.0, "listwise": 0.0}
+    assert training.weights == dict.fromkeys(LOSSES, 0.0)
     assert not training.freeze_batch_norm
     assert not training.freeze_towers
     assert round(98 * training.test_fraction) == 18
@@ -196,14 +196,26 @@ def test_a_value_out_of_range_is_refused_and_named(table, name, value):
     assert str(value) in str(caught.value)
 
 
-def test_a_weight_is_of_a_loss_that_there_is():
-    with pytest.raises(ConfigError, match="must be of one of contrastive, listwise; got 'triplet'"):
-        TrainingConfig(weights={"triplet": 1.0})
+def test_a_weight_is_of_a_loss_that_there_is(tmp_path):
+    with pytest.raises(ConfigError, match="loss must be one of contrastive, listwise, sigmoid; got 'triplet'"):
+        Config().using(losses={"triplet": 1.0})
+    (tmp_path / "mine.toml").write_text("[training]\ntriplet_weight = 1.0\n")
+    with pytest.raises(ConfigError, match="got 'triplet'"):
+        load_config(str(tmp_path / "mine.toml"))
+
+
+def test_what_a_checkpoint_was_trained_by_need_not_be_installed_to_use_it():
+    config = Config.from_dict({"training": {"triplet_weight": 1.0, "contrastive_weight": 0.5}})
+    assert {name: weight for name, weight in config.training.weights.items() if weight} == {
+        "contrastive": 0.5,
+        "triplet": 1.0,
+    }
+    assert Config.from_dict(config.to_dict()) == config
 
 
 def test_a_weight_stands_in_a_file_under_the_name_of_its_loss():
     config = Config.from_dict({"training": {"listwise_weight": 1}})
-    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0}
+    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0, "sigmoid": 0.0}
     table = config.to_dict()["training"]
     assert (table["contrastive_weight"], table["listwise_weight"]) == (0.0, 1.0)
     assert "weights" not in table
@@ -220,7 +232,7 @@ def test_the_parts_held_out_must_leave_something_to_train_on():
     [
         (MatcherConfig, {"fingers": 1, "hidden": 1, "embedding_dim": 1, "dropout": 0.0}),
         (TrainingConfig, {"validation_fraction": 0.0, "test_fraction": 0.0}),
-        (TrainingConfig, {"weights": {"contrastive": 0.0, "listwise": 1e9}}),
+        (TrainingConfig, {"weights": {"contrastive": 0.0, "listwise": 1e9, "sigmoid": 0.0}}),
         (TrainingConfig, {"iterations": 1, "touches_per_batch": 1, "validate_every": 1, "seed": 2**32 - 1}),
         (Preprocessing, {"touch_px": 1, "photo_px": 4096}),
     ],

@@ -9,9 +9,10 @@ import torch
 from torch import nn
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
-from retrieval.model.towers import TOWERS, build_tower
-from retrieval.model.towers.base import stage_statistics
-from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
+from retrieval.model.towers import TOWERS, build_tower, tower_name
+from retrieval.model.towers.base import Tower, stage_statistics
+from retrieval.model.towers.files import read_state
+from retrieval.model.towers.weights import initialise_tower, load_tower_state
 from tests.data import touch_data
 
 # ResNet-18 and -50 are made of the two kinds of block that there are.
@@ -162,8 +163,37 @@ def test_weights_come_back_from_a_file(tmp_path):
     source = build_tower("resnet18", "classes")
     torch.save(source.state_dict(), tmp_path / "weights.pth")
     target = build_tower("resnet18")
-    initialise_tower(target, "resnet18", str(tmp_path / "weights.pth"))
+    initialise_tower(target, str(tmp_path / "weights.pth"))
     assert torch.equal(target.conv1.weight, source.conv1.weight)
+
+
+def test_a_tower_without_optional_weights_takes_those_of_a_file(tmp_path):
+    torch.save(Plain("pooled").state_dict(), tmp_path / "weights.pth")
+    target = Plain("pooled")
+    initialise_tower(target, str(tmp_path / "weights.pth"))
+    with pytest.raises(CheckpointError, match=r"has an unknown layer\.other; name the tower"):
+        load_tower_state(target, {**target.state_dict(), "layer.other": torch.zeros(1)}, "w.pth")
+    with pytest.raises(CheckpointError, match="no weights are published for Plain; give a file"):
+        initialise_tower(target, "imagenet")
+
+
+class Plain(Tower):
+    def __init__(self, output):
+        super().__init__()
+        self.feature_count = 2
+        self.layer = nn.Linear(3, 2)
+
+    def _encode(self, images):
+        return self.layer(images.mean((2, 3)))
+
+
+def test_a_class_of_ones_own_is_a_tower_by_its_name():
+    name = tower_name(Plain)
+    assert name == f"{__name__}:Plain"
+    assert build_tower(name)(torch.rand(2, 3, 8, 8)).shape == (2, 2)
+    assert build_tower(f"{name}+small").feature_count == 2 + 256
+    with pytest.raises(ConfigError, match="must be a Tower; got"):
+        tower_name(nn.Linear)
 
 
 def test_weights_of_another_architecture_are_refused_by_name():
@@ -210,7 +240,7 @@ def test_without_network_the_error_says_which_file_to_put_where(tmp_path, monkey
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
     with pytest.raises(CheckpointError, match=re.escape(str(tmp_path / "checkpoints" / "resnet18-f37072fd.pth"))):
-        initialise_tower(build_tower("resnet18"), "resnet18", "imagenet")
+        initialise_tower(build_tower("resnet18"), "imagenet")
 
 
 def _no_network(*arguments, **settings):
@@ -224,14 +254,14 @@ def test_imagenet_weights_are_taken_from_the_cache(tmp_path, monkeypatch):
     (tmp_path / "checkpoints").mkdir()
     torch.save(source.state_dict(), tmp_path / "checkpoints" / "resnet18-f37072fd.pth")
     target = build_tower("resnet18")
-    initialise_tower(target, "resnet18", "imagenet")
+    initialise_tower(target, "imagenet")
     assert torch.equal(target.conv1.weight, source.conv1.weight)
 
 
 def test_real_imagenet_weights_load_in_their_older_key_layout():
     path = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     tower = build_tower("mobilenet_v2")
-    initialise_tower(tower, "mobilenet_v2", str(path))
+    initialise_tower(tower, str(path))
     state = read_state(path)
     assert torch.equal(tower.features[0][0].weight, state["features.0.0.weight"])
     assert torch.equal(tower.features[1].conv[1].weight, state["features.1.conv.3.weight"])
@@ -273,7 +303,7 @@ def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_p
     source = build_tower("mobilenet_v2", "classes")
     torch.save(source.state_dict(), tmp_path / "weights.pth")
     tower = build_tower("mobilenet_v2", "stages")
-    initialise_tower(tower, "mobilenet_v2", str(tmp_path / "weights.pth"))
+    initialise_tower(tower, str(tmp_path / "weights.pth"))
     assert not any(key.startswith("features.18") for key in tower.state_dict())
     torch.testing.assert_close(tower.features[17].conv[2].weight, source.features[17].conv[2].weight)
 

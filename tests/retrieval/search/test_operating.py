@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexes import KINDS, load_kind
+from indexes import load_kind
 from indexes.errors import ParameterError
 from indexes.kinds.flat import FlatIndex
 from indexes.store.folder import IndexStore
@@ -25,6 +25,7 @@ from retrieval.search.operating import (
     settle,
     settle_by_neighbours,
 )
+from tests import plugins
 from tests.conftest import TINY
 
 PHOTOS, TOUCHES = 70, 40
@@ -320,8 +321,8 @@ class Newcomer(FlatIndex):
     kind, exact, tried, fewest = "newcomer", False, True, 5
 
 
-def test_a_new_kind_is_a_class_and_a_row_of_the_table(monkeypatch, tmp_path):
-    monkeypatch.setitem(KINDS, "newcomer", f"{__name__}:Newcomer")
+def test_a_new_kind_is_a_class_that_an_installed_package_names(monkeypatch, tmp_path):
+    plugins.install(tmp_path / "site", monkeypatch, indexes={"newcomer": f"{__name__}:Newcomer"})
     assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw", "newcomer"]
     assert Asked("newcomer").kind == "newcomer"
     rows = [{"id": str(number)} for number in range(20)]

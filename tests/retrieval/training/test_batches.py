@@ -11,7 +11,7 @@ from retrieval.data.dataset import PairSampler, load_grasps
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import TrainedFeatures
-from retrieval.training.step import batch_loss
+from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 from tests.conftest import TINY
 
@@ -53,7 +53,7 @@ def difference(one, other):
 def shared_images(matcher, loaded):
     """What a training step does: each distinct image through its tower once."""
     touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
-    batch_loss(matcher, PAPER.training, loaded.batch, touch, photo)[0].backward()
+    batch_loss(matcher, WeightedLosses(PAPER.training.weights, matcher, 9), loaded.batch, touch, photo)[0].backward()
 
 
 def pair_by_pair(matcher, loaded):

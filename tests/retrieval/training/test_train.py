@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
+from torch.nn import functional
 
 from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
@@ -16,11 +18,12 @@ from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.judgement import with_verdicts
-from retrieval.training.step import batch_loss, shuffle_fingers
+from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
 from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
 from tests.conftest import TINY
 from tests.labelled import label_recording
@@ -80,7 +83,12 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording
     sampler = PairSampler(load_grasps(recording), seed=0)
     with TrainedFeatures(config, CPU) as source:
         loaded = source.prepare(matcher, sampler.batch(0, 3)).result()
-        loss, logits = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
+        loss, logits = batch_loss(
+            matcher,
+            WeightedLosses(config.training.weights, matcher, 9),
+            loaded.batch,
+            *source.train_features(matcher, loaded),
+        )
     batch = loaded.batch
     one_by_one = torch.cat(
         [
@@ -101,13 +109,59 @@ def test_each_loss_of_the_table_is_added_with_its_weight(recording):
         loaded = source.prepare(matcher, PairSampler(load_grasps(recording), seed=0).batch(0, 3)).result()
         features = [part.detach() for part in source.train_features(matcher, loaded)]
     matcher.eval()
-    loss, logits = batch_loss(matcher, config.training, loaded.batch, *features)
+    loss, logits = batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), loaded.batch, *features)
     touch, photo = matcher.touch_code(features[0]), matcher.photo_code(features[1])
     objects = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
     expected = match_loss(logits, torch.from_numpy(loaded.batch.labels))
     expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
     expected = expected + 0.7 * listwise_loss(matcher.head(touch.half[:, None], photo.half[None]), *objects)
     assert loss.item() == expected.item()
+
+
+class Proxies(Loss):
+    """A loss whose parameters are matrices, drawn at random."""
+
+    def __init__(self, embedding_dim, objects):
+        super().__init__(embedding_dim, objects)
+        self.proxies = nn.Embedding(objects, embedding_dim)
+
+    def forward(self, batch):
+        return functional.cross_entropy(batch.touch.embedding @ self.proxies.weight.T, batch.touch_objects)
+
+
+OWN = TINY.using(losses={"sigmoid": 0.5, Proxies: 0.5})
+
+
+def test_the_parameters_of_a_loss_are_trained_with_the_model_and_stay_out_of_its_checkpoint(recording, tmp_path):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", OWN)
+    assert list(trainer.losses.weights) == ["sigmoid", f"{__name__}:Proxies"]
+    first = {name: tensor.clone() for name, tensor in trainer.losses.state_dict().items()}
+    assert first["terms.1.proxies.weight"].shape == (len(trainer.split.train), 16)
+    trainer.run(quiet=True)
+    assert all(not torch.equal(first[name], now) for name, now in trainer.losses.state_dict().items())
+    tensors, header = read_tensors(tmp_path / "m.safetensors")
+    assert not [name for name in tensors if "proxies" in name or "terms" in name]
+    assert header["config"]["training"][f"{__name__}:Proxies_weight"] == 0.5
+    assert load_checkpoint(tmp_path / "m.safetensors").config.has_embeddings
+
+
+def test_a_loss_with_parameters_resumes_bit_for_bit(recording, tmp_path):
+    whole, parts = trainer_for(recording, tmp_path / "a.safetensors", OWN), tmp_path / "b.safetensors"
+    whole.run(quiet=True)
+    broken = trainer_for(recording, parts, OWN)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(broken, 3)
+    resumed = trainer_for(recording, parts, OWN)
+    resumed.resume()
+    resumed.run(quiet=True)
+    assert same_weights(whole.losses.state_dict(), resumed.losses.state_dict())
+    assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
+
+
+def test_a_loss_that_nobody_has_is_refused_before_an_image_is_read(recording, tmp_path):
+    config = with_training(TINY, weights={"triplet": 1.0})
+    with pytest.raises(ConfigError, match="loss must be one of contrastive, listwise, sigmoid; got 'triplet'"):
+        train(recording, tmp_path / "m.safetensors", config, quiet=True)
 
 
 def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording, tmp_path):
@@ -376,7 +430,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import PairSampler, load_grasps
 from retrieval.model.losses.contrastive import contrastive_loss
-from retrieval.training.step import batch_loss
+from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY
 from tests.labelled import label_recording
@@ -409,7 +463,8 @@ with TrainedFeatures(config, torch.device("cpu")) as source:
             matcher.touch_code(touch).embedding, matcher.photo_code(photo).embedding, *labels, matcher.log_scale
         )
     else:
-        loss, _ = batch_loss(matcher, config.training, loaded.batch, *source.train_features(matcher, loaded))
+        losses = WeightedLosses(config.training.weights, matcher, 9)
+        loss, _ = batch_loss(matcher, losses, loaded.batch, *source.train_features(matcher, loaded))
 loss.backward()
 distributed.average_gradients(matcher)
 if distributed.rank() == 0:

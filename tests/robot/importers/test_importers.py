@@ -188,7 +188,7 @@ def test_the_page_of_data_sets_is_that_of_the_importers():
 
 
 def test_an_unknown_name_lists_the_known_ones(capsys):
-    with pytest.raises(UnknownName, match=r"'bilets'; known: billets") as caught:
+    with pytest.raises(UnknownName, match=r"one of billets, .*; got 'bilets'") as caught:
         load_importer("bilets")
     assert caught.value.exit_code == 2
     assert main(["import", "bilets", "src", "--out", "out"]) == 2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from robot.errors import ImporterError
-from robot.exporters import load_exporter
+from robot.exporters import EXPORTERS
 from robot.importers.episodes import Episode
 from robot.importers.lerobot import import_lerobot
 from robot.recording.folder import read_recording
@@ -97,7 +97,7 @@ def test_a_recording_comes_back_from_its_export(tmp_path, monkeypatch):
     first = read_recording(tmp_path / "r")
     objects = sorted({grasp.object_id for grasp in first.grasps})
     parts = {"train": objects[:2], "validation": [], "test": objects[2:]}
-    load_exporter("lerobot")(first, tmp_path / "exported", parts=parts)
+    EXPORTERS.load("lerobot")(first, tmp_path / "exported", parts=parts)
     again = import_lerobot(tmp_path / "exported", tmp_path / "back")
     plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n")
     before = {grasp.grasp_id: grasp for grasp in first.grasps}

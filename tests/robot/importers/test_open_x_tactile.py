@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from robot.errors import ImporterError, RobotError
-from robot.exporters import load_exporter
+from robot.exporters import EXPORTERS
 from robot.importers.open_x_tactile import import_open_x_tactile
 from robot.importers.zarr_store import Store
 from robot.recording.folder import read_recording
@@ -69,7 +69,7 @@ def test_a_recording_comes_back_from_its_export_as_it_was(tmp_path):
     first = read_recording(tmp_path / "r")
     objects = sorted({grasp.object_id for grasp in first.grasps})
     parts = {"train": objects[:2], "validation": [], "test": objects[2:]}
-    load_exporter("open-x-tactile")(first, tmp_path / "zarr", parts=parts)
+    EXPORTERS.load("open-x-tactile")(first, tmp_path / "zarr", parts=parts)
     again = import_open_x_tactile(tmp_path / "zarr", tmp_path / "back")
     plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n")
     before = {grasp.grasp_id: grasp for grasp in first.grasps}
