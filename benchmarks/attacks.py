@@ -149,7 +149,7 @@ def slow_bodies(target: Target) -> str:
             b"content-length: 1000\r\n\r\n"
         )
         held.append(connection)
-    for _ in range(15):
+    for _ in range(18):
         time.sleep(1)
         for connection in held:
             try:
@@ -159,7 +159,7 @@ def slow_bodies(target: Target) -> str:
     open_still = sum(_is_open(connection) for connection in held)
     for connection in held:
         connection.close()
-    return f"{open_still} of 100 open after 15 s"
+    return f"{open_still} of 100 open after 18 s"
 
 
 def header_flood(target: Target) -> str:

@@ -20,6 +20,7 @@ from retrieval.search.opening import OpenShards
 from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
+from retrieval.serve.health import SessionBody
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
 from retrieval.serve.keeping import Keeping
@@ -51,6 +52,7 @@ _BODIES: tuple[type[BaseModel], ...] = (
     FeedbackBody,
     NewRun,
     ChoiceBody,
+    SessionBody,
     errors.ProblemDocument,
 )
 

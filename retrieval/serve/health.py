@@ -1,12 +1,13 @@
 """Whether the service lives, whether it is ready, and its numbers; and the page's cookie."""
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from retrieval.serve.documents import Health
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.security import COOKIE, same_token
 from retrieval.serve.service import Parts
+from retrieval.serve.uploads import json_body, read_json
 
 router = APIRouter(tags=["health"])
 
@@ -39,10 +40,16 @@ class SessionBody(BaseModel):
     token: str = Field(max_length=1000)
 
 
-@router.post("/v1/session", status_code=204, responses=problems("bad-input"))
-async def session(body: SessionBody, parts: Parts) -> Response:
+@router.post(
+    "/v1/session",
+    status_code=204,
+    responses=problems("bad-input", "too-large", "too-slow", "unsupported-type"),
+    openapi_extra=json_body("SessionBody"),
+)
+async def session(request: Request, parts: Parts) -> Response:
     """For the page of a service with a token: the token becomes a cookie that scripts cannot read, for pictures cannot
     send a header."""
+    body = await read_json(request, SessionBody)
     wanted = parts.settings.token
     if wanted is not None and not same_token(body.token, wanted):
         raise Problem("no-token", "this is not the service's token", {"www-authenticate": "Bearer"})
