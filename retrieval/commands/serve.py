@@ -168,6 +168,8 @@ def _recorder(folder: Path, index: str | Path, closed: ExitStack) -> "RecordingW
     from retrieval.search.defaults import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
 
+    if folder.exists() and not folder.is_dir():
+        raise BadInput(f"the history must be a folder, but {folder} is a file; name another one with --history")
     stored = read_stored(model_of(manifest_of(index)))
     info = {"source": "what people said of queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
     say(f"queries and what is said of them are kept in {folder}")
