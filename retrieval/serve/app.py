@@ -120,12 +120,13 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     if not parts.generations.ready:
         await asyncio.to_thread(parts.generations.open)
+    await parts.decoders.start()
     queues = (parts.queue, parts.grasps, *parts.frames.values())
     for queue in queues:
         queue.start()
     if parts.keeping:
         parts.keeping.start()
-    running = [asyncio.ensure_future(one) for one in (parts.decoders.start(), parts.generations.watch())]
+    watching = asyncio.ensure_future(parts.generations.watch())
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
             yield
@@ -133,9 +134,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         parts.stopping.set()
         if parts.keeping:
             await parts.keeping.written()
-        for task in running:
-            task.cancel()
-        await asyncio.wait([*running, asyncio.ensure_future(parts.decoders.close())], timeout=_CLOSING_S)
+        watching.cancel()
+        await asyncio.wait([watching, asyncio.ensure_future(parts.decoders.close())], timeout=_CLOSING_S)
         closing: list[Callable[[], None]] = [partial(queue.close, _CLOSING_S) for queue in queues]
         if parts.keeping:
             closing.append(parts.keeping.close)
