@@ -36,12 +36,16 @@ from retrieval.model.towers.small import Small
 from retrieval.training.step import WeightedLosses, batch_loss
 from robot import real_rig
 from robot.devices import TactileSensor
+from robot.errors import PlanError
 from robot.exporters.base import Exported, whole_folder
 from robot.grasping import gates
+from robot.grasping.attempt import Attempter, AttemptSettings
+from robot.grasping.planner import GraspPlanner
 from robot.readings import Frame
 from robot.sim.objects import draw, materials, relief, shapes
 from robot.sim.rig import SimRig
 from tests.documents import CONTRIBUTING, ROOT, table_rows
+from tests.fake_rig import FakeRig
 from tests.hard_case import HardCase
 from tests.retrieval.methods import hard_linear as linear
 
@@ -141,6 +145,19 @@ class Grey(TactileSensor):
 def add_a_setting_of_a_device(monkeypatch):
     with pytest.raises(robot.RobotError, match="timeout_s"):
         real_rig.load_driver("gripper", {"driver": "wsg50", "port": "/dev/null", "timeout_s": -1.0}, "[gripper]")
+
+
+def add_a_grasp_planner(monkeypatch):
+    class Nowhere(GraspPlanner):
+        needs_depth = False
+
+        def plan(self, rig, image, settings, rng):
+            raise PlanError("there is no such place")
+
+    rig = FakeRig(3)
+    rig.planner = Nowhere()
+    with rig:
+        assert Attempter(rig, 3, AttemptSettings()).run("round-0", 0).reason == "there is no such place"
 
 
 def add_a_rig(monkeypatch):
