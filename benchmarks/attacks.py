@@ -11,24 +11,21 @@ takes to end after SIGTERM. All traffic stays on the loopback addresses.
 import argparse
 import base64
 import http.client
-import io
 import json
 import os
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from PIL import Image
+from tests.hostile_pictures import jpeg_of_scans, png_chunk, png_of_zeros
 
 MAX_HEALTH_S, MAX_MEMORY_MB, MAX_EXIT_S = 0.5, 300, 10
 BODY_BYTES = 19_500_000
@@ -94,17 +91,17 @@ def many_parts(target: Target) -> str:
 
 def jpeg_scans(target: Target) -> str:
     """A small JPEG file whose 40,000 scans take a minute to decode."""
-    return _pictures(target, _jpeg_of_scans(4472, 40_000), 4)
+    return _pictures(target, jpeg_of_scans(4472, 40_000), 4)
 
 
 def png_column(target: Target) -> str:
     """A PNG picture 1 pixel wide and 20,000,000 high."""
-    return _pictures(target, _png(1, 20_000_000), 4)
+    return _pictures(target, png_of_zeros(1, 20_000_000), 4)
 
 
 def png_pixels(target: Target) -> str:
     """PNG pictures of the largest size that is taken, 17 kB each."""
-    return _pictures(target, _png(4472, 4472), 4)
+    return _pictures(target, png_of_zeros(4472, 4472), 4)
 
 
 def jpeg_markers(target: Target) -> str:
@@ -114,12 +111,12 @@ def jpeg_markers(target: Target) -> str:
 
 def png_chunks(target: Target) -> str:
     """14 MB of empty PNG chunks before the picture begins."""
-    return _pictures(target, _png(64, 64)[:33] + _chunk(b"tEXt", b"") * 1_160_000, 3)
+    return _pictures(target, png_of_zeros(64, 64)[:33] + png_chunk(b"tEXt", b"") * 1_160_000, 3)
 
 
 def many_pictures(target: Target) -> str:
     """Queries of 64 grasps of two tiny pictures."""
-    return _at_once(target, "/v1/query", _query([_png(8, 8)] * 128), 8)
+    return _at_once(target, "/v1/query", _query([png_of_zeros(8, 8)] * 128), 8)
 
 
 def half_headers(target: Target) -> str:
@@ -220,29 +217,6 @@ def _pictures(target: Target, picture: bytes, times: int) -> str:
 def _query(pictures: list[bytes]) -> bytes:
     grasps = [pictures[start : start + 2] for start in range(0, len(pictures), 2)]
     return json.dumps({"touches": [[base64.b64encode(one).decode() for one in grasp] for grasp in grasps]}).encode()
-
-
-def _jpeg_of_scans(side: int, scans: int) -> bytes:
-    """A flat grey progressive JPEG whose shortest scan is repeated."""
-    file = io.BytesIO()
-    Image.new("L", (side, side), 128).save(file, "JPEG", progressive=True)
-    data, starts, place = file.getvalue(), [], 0
-    while (place := data.find(b"\xff\xda", place)) >= 0:
-        starts.append(place)
-        place += 2
-    segments = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data) - 2], strict=True)]
-    return data[: starts[0]] + segments[0] + min(segments, key=len) * scans + b"\xff\xd9"
-
-
-def _png(width: int, height: int) -> bytes:
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    pixels = zlib.compress(bytes((width + 1) * height), 9)
-    parts = ((b"IHDR", header), (b"IDAT", pixels), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, content) for name, content in parts)
-
-
-def _chunk(name: bytes, content: bytes) -> bytes:
-    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
 
 def _is_open(connection: socket.socket) -> bool:

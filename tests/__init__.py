@@ -12,7 +12,7 @@
     fake_video, wsg50_bench, wsg50_packets      cameras and a gripper that are not there
     oracle, documents, pages                    what must come out; texts and pages taken apart
     hard_case                                   one stiff or extreme input
-    hostile_pictures, decoding                  pictures that are expensive to decode; processes that hang while they decode
+    hostile_pictures, decoding                  pictures that are slow to decode; processes that hang
     plugins                                     entry points of a package that is not installed
     serving, browser, s3, on_ray, waiting       other processes, and waits that end
 
