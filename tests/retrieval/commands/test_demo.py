@@ -79,10 +79,11 @@ def test_a_demo_that_serves_opens_a_page_that_asks_its_index(finished, capsys, m
 
 
 def test_a_command_that_is_used_wrongly_ends_the_demo_with_its_exit_code(tmp_path, capsys):
-    assert main(["demo", "--objects", "0", "--out", str(tmp_path / "demo")]) == 2
+    (tmp_path / "recording").write_text("not a folder")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err.splitlines()
-    assert said[-2].startswith("$ retrieve collect --rig sim --objects 0 ")
-    assert said[-1] == "retrieve demo: at least one object must be collected, got none"
+    assert said[-2].startswith("$ retrieve collect --rig sim --objects 20 ")
+    assert said[-1] == f"retrieve demo: a recording must be a folder, and {tmp_path / 'recording'} is a file"
 
 
 def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):

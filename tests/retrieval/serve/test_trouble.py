@@ -22,7 +22,7 @@ from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Answered
 from retrieval.serve.service import Grasped, LiveRig
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.uploads import Asked, Options
+from retrieval.serve.uploads import Asked, Options, pictures_of
 from robot.recording.folder import RecordingWriter
 from tests.retrieval.serve.test_connections import opened
 from tests.retrieval.serve.test_history import INFO
@@ -96,7 +96,7 @@ def test_the_writer_survives_a_thousand_unforeseen_exceptions(index, folder, gra
             patch.setattr(keeping.store, "keep", fail)
             for _ in range(1_000):
                 until(lambda: len(keeping._waiting) < WAITING)
-                names.append(keeping.keep(Asked([grasp], None, Options()), Answered(None, "m")))
+                names.append(keeping.keep(Asked(pictures_of([[grasp]], None), Options()), Answered(None, "m")))
             until(lambda: len(raised) == 1_000)
         assert client.get("/v1/history").json()["total"] == 0
         assert "could not be stored: 'x'" in problem(client.get(f"/v1/history/{names[1]}"), 404, "unknown")
