@@ -230,7 +230,7 @@ def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
 
 
 def test_a_checkpoint_is_not_written_where_its_model_card_goes(tmp_path):
-    with pytest.raises(CheckpointError, match=r"where the model card goes; name the checkpoint m\.safetensors"):
+    with pytest.raises(CheckpointError, match=r"must be named \*\.safetensors, such as m\.safetensors"):
         save(tmp_path / "m.md")
     assert os.listdir(tmp_path) == []
 
