@@ -44,11 +44,11 @@ class Decoders:
 
     async def close(self) -> None:
         """End all processes; what is being read fails."""
-        running = [*self._running, *self._ending]
         for task in self._running:
             task.cancel()
-        await asyncio.gather(*running, *(process.end() for process in self._idle), return_exceptions=True)
-        self._idle.clear()
+        await asyncio.gather(*self._running, return_exceptions=True)
+        idle, self._idle = self._idle, []
+        await asyncio.gather(*self._ending, *(process.end() for process in idle))
 
     async def read(self, named: Sequence[tuple[str, bytes]], px: int, compares: bool) -> list[GelImage]:
         """Read pictures, each with its name, at the sizes of a model whose `touch_px` is px.

@@ -129,6 +129,7 @@ def test_who_leaves_while_small_pictures_are_read_ends_no_process_and_leaves_not
                 await asyncio.wait([asked])
             assert len(both._running) <= 2
             assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+            await asyncio.gather(*both._running)
             assert {process._process.pid for process in both._idle} == before
         for process in before:
             assert not is_running(process)
