@@ -229,9 +229,10 @@ def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
     assert "Check of gel images" not in card
 
 
-def test_a_checkpoint_is_not_written_where_its_model_card_goes(tmp_path):
-    with pytest.raises(CheckpointError, match=r"must be named \*\.safetensors, such as m\.safetensors"):
-        save(tmp_path / "m.md")
+@pytest.mark.parametrize("name", ["m.md", "m.txt", "m"])
+def test_a_checkpoint_is_not_written_to_a_file_of_another_kind_such_as_its_model_card(tmp_path, name):
+    with pytest.raises(CheckpointError, match=r"must be named \*\.safetensors, such as m\.safetensors; got "):
+        save(tmp_path / name)
     assert os.listdir(tmp_path) == []
 
 
