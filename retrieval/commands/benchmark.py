@@ -78,10 +78,11 @@ def real(
     try:
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
         skipped = {name: missing[of] for name, of in data_set_of.items() if of in missing}
+        if protocols or len(skipped) < len(asked):
+            for name, why in skipped.items():
+                say(f"{name}: left out, {why}; with it: {_command(data, out, name, data_set_of[name])}")
         if len(skipped) == len(asked):
             raise BadInput(f"{data} must hold data of a protocol; {'; '.join(dict.fromkeys(missing.values()))}")
-        for name, why in skipped.items():
-            say(f"{name}: left out, {why}; with it: {_command(data, out, name, data_set_of[name])}")
         results = benchmark(
             recordings,
             out,

@@ -281,7 +281,7 @@ def contact(entry: Entry) -> Table | None:
     names = [quartile_name(entry["main"], quartile) for quartile in range(1, QUARTILES + 1)]
     rows = []
     for name, row in entry["rows"].items():
-        if not row["verdict"] or names[0] not in row["measures"]:
+        if not row["verdict"] or not set(names) <= set(row["measures"]):  # objects of few touches lack some
             continue
         rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
         rows.append((BLURRED, *(with_interval(row["blurred"][key]) for key in names)))

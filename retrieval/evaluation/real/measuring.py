@@ -114,7 +114,7 @@ def measure(
                 found.setdefault(name, []).append(taken)
         if levels is not None:
             quartiles = contact_quartiles(levels[mine[whole.touch_owner]], gallery.touch_owner)
-            for quartile in range(1, QUARTILES + 1):
+            for quartile in np.unique(quartiles):  # objects of fewer touches leave some out
                 part = dataclasses.replace(
                     scored, test=gallery.select(quartiles == quartile, np.arange(len(gallery.photo_owner)))
                 )

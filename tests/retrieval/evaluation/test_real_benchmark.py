@@ -221,7 +221,7 @@ def test_a_recording_of_a_data_set_is_as_good_as_its_own_folder(out, tmp_path):
         (["--protocols", "ycb"], "protocol must be one of"),
         (["--methods", "mine"], "method must be one of"),
         (["--model", "alone"], "NAME=FILE"),
-        (["--seeds", "0"], "one seed at least"),
+        (["--seeds", "0"], "0 is not from 1"),
     ],
 )
 def test_wrong_use_is_one_line(data, tmp_path, options, said, capsys):

@@ -179,12 +179,12 @@ def test_settings_in_a_pipe_are_refused_without_waiting(tmp_path):
 
 
 def test_a_training_asks_before_it_would_write_over_another_file(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    (tmp_path / "a.safetensors").write_bytes(b"\x89PNG")
     (tmp_path / "model.md").write_text("# My notes\n")
-    for name, what in (("a.png", "a checkpoint"), ("model.safetensors", "a model card")):
+    for name, what in (("a.safetensors", "a checkpoint"), ("model.safetensors", "a model card")):
         with pytest.raises(BadInput, match=f"is not {what} that this program wrote"):
             require_writable(tmp_path / name)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "model.md"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "model.md"]
 
 
 # Rows of an index -------------------------------------------------------------------------------------------
