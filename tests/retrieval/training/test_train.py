@@ -650,7 +650,9 @@ def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(re
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
     monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
-    with pytest.raises(CheckpointError, match=r"is a folder; name the file|must be named \*.safetensors|cannot be written"):
+    with pytest.raises(
+        CheckpointError, match=r"is a folder; name the file|must be named \*.safetensors|cannot be written"
+    ):
         train(recording, tmp_path / name, TINY, quiet=True)
 
 
