@@ -100,8 +100,9 @@ def test_a_large_picture_keeps_no_small_one_waiting_and_its_process_ends_when_it
         names = [str(tmp_path / "first"), str(tmp_path / "second")]
         async with opened() as both:
             hanging = [asyncio.ensure_future(both.read([(name, LARGE)], 32, False)) for name in names]
-            while not (found := list(tmp_path.iterdir())) or not found[0].read_text():
-                await asyncio.sleep(0.01)
+            async with asyncio.timeout(60):
+                while not (found := list(tmp_path.iterdir())) or not found[0].read_text():
+                    await asyncio.sleep(0.01)
             assert len(await both.read([("a", SMALL)] * 10, 32, False)) == 10
             (file,) = tmp_path.iterdir()  # large ones are decoded one at a time
             process = int(file.read_text())
