@@ -3,7 +3,8 @@
     app          puts the parts together; `create_app` is all that others need
     settings     what an operator may choose
     security     who may ask: this machine, or who knows the token; headers of every response
-    uploads      bodies of requests: how large, how long, what pictures
+    uploads      bodies of requests: how large, how long, what pictures; forms takes multipart bodies apart
+    decoders     pictures of requests, decoded in processes of their own (decode_process)
     queue        who waits, for how long, and who is answered together
     generations  which generation of the index answers
     queries, catalogue, history, trials, rig, health    the paths
