@@ -65,7 +65,6 @@ def real(
     json: Json = False,
 ) -> None:
     """Ask protocols of real data, with controls; goes on where it was stopped. Writes a report."""
-    from retrieval.evaluation.real import PROTOCOLS
     from retrieval.evaluation.real.run import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
