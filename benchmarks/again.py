@@ -37,9 +37,9 @@ from indexes.store.tables import Block
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.model.stored import fingerprint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
+from retrieval.search.build.operating import Asked
 from retrieval.search.defaults import shipped_model
-from retrieval.search.operating import Asked
 
 PHOTOS, ROUNDS = 10_000, 3
 OLD_S = 3600

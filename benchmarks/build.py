@@ -23,9 +23,9 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpo
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
 from retrieval.model.photo_encoder import fastest
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
+from retrieval.search.build.embed import BATCH, MANY, ahead
 from retrieval.search.defaults import shipped_model
-from retrieval.search.embed import BATCH, MANY, ahead
 from tests import synthetic
 
 PHOTOS = {"small": 256}

@@ -34,11 +34,11 @@ def step(name, function):
     value = function()
     ms[name] = 1e3 * (time.perf_counter() - start)
     return value
-names = ("numpy", "PIL.Image", "retrieval.commands.main", "retrieval.search.searcher", backend, "indexes.kinds.flat")
-for name in names:
+ours = ("retrieval.commands.main", "retrieval.search.query.searcher")
+for name in ("numpy", "PIL.Image", *ours, backend, "indexes.kinds.flat"):
     step("import " + name, lambda: import_module(name))
 from pathlib import Path
-import retrieval.search.searcher as search
+import retrieval.search.query.searcher as search
 generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
 encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))

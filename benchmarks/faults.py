@@ -35,9 +35,9 @@ from indexes.errors import NoIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import RetrievalError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build_cluster import build_cluster
-from retrieval.search.object_store import folder_with, read_cluster
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.sharding.build_cluster import build_cluster
+from retrieval.search.sharding.object_store import folder_with, read_cluster
 from tests import on_ray, s3, serving, synthetic
 
 PHOTOS, OBJECTS, SHARDS, BLOCKS = 240, 40, 4, 8

@@ -23,8 +23,8 @@ from retrieval.model.posterior import Posterior
 from retrieval.model.stored import fingerprint, read_judge
 from retrieval.model.touches import Encoder
 from retrieval.search.defaults import shipped_model
-from retrieval.search.searcher import Searcher
-from retrieval.search.shard import FolderShard
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import FolderShard
 
 PHOTOS, CANDIDATES = 10_000, 132
 """As many candidates as benchmarks.scale finds needed for so many photos; build-index writes them down."""

@@ -33,7 +33,7 @@ import numpy as np
 
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.serve.app import create_app
 from retrieval.serve.run import Server, configured

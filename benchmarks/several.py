@@ -25,9 +25,9 @@ from indexes.store.generation import Generation
 from retrieval.data.dataset import load_grasps
 from retrieval.methods.selection import neighbours
 from retrieval.metrics.binomial import binomial_interval
+from retrieval.search.build.measuring import FIRST
 from retrieval.search.defaults import shipped_model
-from retrieval.search.measuring import FIRST
-from retrieval.search.shard import together
+from retrieval.search.query.shard import together
 from retrieval.training.distil import feature_halves
 from retrieval.training.features import encode_recording
 

@@ -43,8 +43,8 @@ from retrieval.model.fusion import judge_of
 from retrieval.model.stored import fingerprint, read_stored
 from retrieval.search.defaults import shipped_model
 from retrieval.search.embeddings import embed_photos
-from retrieval.search.opening import folder_shard, open_cluster
-from retrieval.search.shard import Felt, FolderShard, Shard
+from retrieval.search.query.opening import folder_shard, open_cluster
+from retrieval.search.query.shard import Felt, FolderShard, Shard
 from tests import synthetic
 
 TOUCHES, OPENINGS = 200, 21
@@ -56,7 +56,7 @@ import sys, time
 from pathlib import Path
 from indexes.store.cluster import read_cluster
 from retrieval.model.stored import read_stored
-from retrieval.search.opening import described_cluster
+from retrieval.search.query.opening import described_cluster
 start = time.process_time()
 manifest = read_cluster(Path(sys.argv[1]))
 described = described_cluster(manifest)
@@ -66,13 +66,13 @@ print(time.process_time() - start, described.photos)
 HELD = """
 import sys
 from pathlib import Path
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 def anonymous():
     return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1])
 searcher = Searcher.open(sys.argv[1], verify=False)
 searcher.encoder = searcher.reader = None
 import numpy as np, gc
-from retrieval.search.shard import Felt
+from retrieval.search.query.shard import Felt
 codes = np.load(sys.argv[2])
 before = anonymous()
 searcher.shard.ask(Felt(codes["embeddings"][:1], codes["halves"][:1]), 10, None, searcher.posterior)

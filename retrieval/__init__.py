@@ -30,48 +30,48 @@ if TYPE_CHECKING:
     from retrieval.model.losses.loss import Loss as Loss
     from retrieval.model.touches import Encoded as Encoded
     from retrieval.model.towers.base import Tower as Tower
-    from retrieval.search.agreement import Agreement as Agreement
-    from retrieval.search.agreement import agreement as agreement
-    from retrieval.search.answer import Match as Match
-    from retrieval.search.answer import QueryResult as QueryResult
-    from retrieval.search.build import build_index as build_index
-    from retrieval.search.build_report import BuildReport as BuildReport
+    from retrieval.search.build.build_index import build_index as build_index
+    from retrieval.search.build.build_report import BuildReport as BuildReport
     from retrieval.search.defaults import shipped_model as shipped_model
     from retrieval.search.embeddings import embed_photos as embed_photos
-    from retrieval.search.neighbours import Neighbour as Neighbour
-    from retrieval.search.neighbours import nearest_photos as nearest_photos
-    from retrieval.search.searcher import Searcher as Searcher
+    from retrieval.search.query.agreement import Agreement as Agreement
+    from retrieval.search.query.agreement import agreement as agreement
+    from retrieval.search.query.answer import Match as Match
+    from retrieval.search.query.answer import QueryResult as QueryResult
+    from retrieval.search.query.neighbours import Neighbour as Neighbour
+    from retrieval.search.query.neighbours import nearest_photos as nearest_photos
+    from retrieval.search.query.searcher import Searcher as Searcher
     from retrieval.serve.client import Client as Client
     from retrieval.training.train import train as train
 
     open = Searcher.open
 
 _PLACES = {
-    "Agreement": "search.agreement:Agreement",
+    "Agreement": "search.query.agreement:Agreement",
     "BadInput": "errors:BadInput",
-    "BuildReport": "search.build_report:BuildReport",
+    "BuildReport": "search.build.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
     "Config": "model.config:Config",
     "Encoded": "model.touches:Encoded",
     "Loss": "model.losses.loss:Loss",
-    "Match": "search.answer:Match",
+    "Match": "search.query.answer:Match",
     "Method": "methods.base:Method",
-    "Neighbour": "search.neighbours:Neighbour",
+    "Neighbour": "search.query.neighbours:Neighbour",
     "Protocol": "evaluation.real.protocol:Protocol",
-    "QueryResult": "search.answer:QueryResult",
+    "QueryResult": "search.query.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
-    "Searcher": "search.searcher:Searcher",
+    "Searcher": "search.query.searcher:Searcher",
     "Setting": "methods.base:Setting",
     "Tower": "model.towers.base:Tower",
-    "agreement": "search.agreement:agreement",
-    "build_index": "search.build:build_index",
+    "agreement": "search.query.agreement:agreement",
+    "build_index": "search.build.build_index:build_index",
     "embed_photos": "search.embeddings:embed_photos",
     "evaluate": "evaluation.run:evaluate",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
     "load_config": "model.config:load_config",
-    "nearest_photos": "search.neighbours:nearest_photos",
-    "open": "search.searcher:Searcher.open",
+    "nearest_photos": "search.query.neighbours:nearest_photos",
+    "open": "search.query.searcher:Searcher.open",
     "shipped_model": "search.defaults:shipped_model",
     "train": "training.train:train",
 }

@@ -154,7 +154,7 @@ def checkpoint(model: Path) -> Any:
 def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search.build import build_index
+    from retrieval.search.build.build_index import build_index
 
     out = tmp_path_factory.mktemp("search") / "index"
     build_index(catalogue, load_checkpoint(model), out, quiet=True)
@@ -172,7 +172,7 @@ def grasps(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Path, ..
 def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The catalogue in four shards. Not to be changed."""
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search.build_cluster import build_cluster
+    from retrieval.search.sharding.build_cluster import build_cluster
 
     out = tmp_path_factory.mktemp("cluster") / "cluster"
     build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
@@ -182,7 +182,7 @@ def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def searcher(index: Path) -> Iterator[Any]:
     """The index, opened."""
-    from retrieval.search.searcher import Searcher
+    from retrieval.search.query.searcher import Searcher
 
     with Searcher.open(index) as opened:
         yield opened

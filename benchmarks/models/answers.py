@@ -22,11 +22,11 @@ import numpy as np
 from benchmarks.models.verdicts import interval, redrawn
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.answer import is_clear
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
-from retrieval.search.searcher import Searcher
-from retrieval.search.shard import Felt
+from retrieval.search.query.answer import is_clear
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import Felt
 
 OBJECTS = 30
 BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)

@@ -18,9 +18,9 @@ import numpy as np
 
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 
 SIZES, GRASPS, DRAWS = (20, 100), (1, 2, 3), 8
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.files import finish
+from _touch_retrieval.files import finish
 
 
 class ArrayFile:

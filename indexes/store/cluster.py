@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from _touch_retrieval.files import encoded, file_digest, naming, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex
-from indexes.store.files import encoded, file_digest, naming, write_atomically
 from indexes.store.folder import GENERATION, IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import NAME as GENERATION_MANIFEST

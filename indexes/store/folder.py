@@ -30,14 +30,15 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from _touch_retrieval import files
+from _touch_retrieval.files import read_regular
 from indexes import load_kind
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, ParameterError, RowError, WriteFailed
 from indexes.kinds.base import MOST, Parameters, check_seed, check_threads, is_whole
 from indexes.kinds.scores import Floats
-from indexes.store import files
 from indexes.store.generation import Generation, read_generation
 from indexes.store.locking import WriterLock
-from indexes.store.regular import read_regular
+from indexes.store.rows import json_of
 from indexes.store.tables import Block, check_documents
 from indexes.store.writing import Job, Settle, write_generation
 
@@ -258,7 +259,7 @@ def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> Non
     odd = [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]
     if odd:
         raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
-    files.json_of(dict(about), "about")
+    json_of(dict(about), "about")
 
 
 def _discard(folder: Path) -> None:

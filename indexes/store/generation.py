@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.files import MAX_JSON_BYTES, read_json
 from indexes import load_kind
 from indexes.errors import (
     AGAIN,
@@ -24,7 +25,6 @@ from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
 from indexes.store.older import joined, table_files
-from indexes.store.regular import MAX_JSON_BYTES, read_json
 from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"

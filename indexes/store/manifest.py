@@ -9,9 +9,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from _touch_retrieval.files import durable, encoded, file_digest, open_regular, read_json
 from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
-from indexes.store.files import durable, encoded, file_digest
-from indexes.store.regular import open_regular, read_json
 
 FORMAT, OLDER = 3, 2
 """Of what is written; also read."""

@@ -1,5 +1,6 @@
 """Rows on the disk: text that is parsed when somebody looks, and a table of what searching needs of each."""
 
+import json
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from hashlib import blake2b
@@ -8,9 +9,10 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.errors import AGAIN, CorruptIndex
+from _touch_retrieval import files
+from _touch_retrieval.files import parse_json
+from indexes.errors import AGAIN, CorruptIndex, RowError
 from indexes.kinds.scores import Slots
-from indexes.store.regular import parse_json
 
 FEW = 32
 """Keys that are looked for one by one: sorting all, to find many of them, takes as long."""
@@ -199,3 +201,19 @@ def _found(wanted: NDArray[np.bytes_], known: _Places) -> Slots:
 def _agreeing(same: NDArray[np.bool_]) -> int:
     """How many are true before the first that is not."""
     return len(same) if same.all() else int(np.argmin(same))
+
+
+def json_of(document: Any, what: str, row: str | None = None, checked: bytes = b"") -> bytes:
+    """`document` as JSON that reads back the same, or `RowError` naming `what`. `checked` is JSON that is known to."""
+    try:
+        text = files.encoded(document)
+        if text == checked:
+            return text
+        if files.is_deep(document):
+            raise RowError(f"{what} must not be nested deeper than {files.DEEPEST} levels", row)
+        same = json.loads(text) == document
+    except (ValueError, TypeError, RecursionError) as error:
+        raise RowError(f"{what} must be JSON of finite numbers; {error}", row) from error
+    if not same:
+        raise RowError(f"{what} must read back from JSON as it is: text keys, lists rather than tuples", row)
+    return text

@@ -13,8 +13,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store import files
-from indexes.store.regular import read_regular
+from _touch_retrieval import files
+from _touch_retrieval.files import read_regular
 from indexes.store.rows import first_equal
 
 NAME = "seen.records"

@@ -15,8 +15,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from indexes.store import files
-from indexes.store.regular import read_regular
+from _touch_retrieval import files
+from _touch_retrieval.files import read_regular
 from indexes.store.seen import SETTLED_NS
 
 NAME = "seen.folders"

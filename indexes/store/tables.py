@@ -11,14 +11,14 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.files import finish
 from indexes.errors import MismatchedIndex, RowError, VectorError
 from indexes.kinds.checks import BLOCK_ROWS, check_unit
 from indexes.kinds.scores import Floats, Slots
 from indexes.store.arrays import ArrayFile, mapped, write_array
 from indexes.store.equal import first_of_equals
-from indexes.store.files import finish, json_of
 from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
-from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, keys_of
+from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_of, keys_of
 
 MOST_TOMBSTONES = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""

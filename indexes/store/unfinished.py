@@ -20,8 +20,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval import files
 from indexes.errors import WriteFailed
-from indexes.store import files
 from indexes.store.rows import key_of, keys_of
 from indexes.store.tables import Layouts
 

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from _touch_retrieval import files
 from indexes import load_kind
 from indexes.errors import RowError
 from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.kinds.scores import Floats
-from indexes.store import files
 from indexes.store.arrays import write_array
 from indexes.store.generation import STRUCTURE, Generation, max_document_bytes
 from indexes.store.manifest import Counts, Manifest, sealed, write_manifest
+from indexes.store.rows import json_of
 from indexes.store.tables import Block, Tables, TableWriter
 
 RECALL_AT = 10
@@ -130,7 +131,7 @@ def _serves(parent: Generation, slots: int, job: Job) -> bool:
 
 def _settled(job: Job, chosen: Chosen) -> Job:
     kind = load_kind(chosen.kind)
-    files.json_of(dict(chosen.about), "about")
+    json_of(dict(chosen.about), "about")
     return replace(job, kind=kind, asked=kind.asked(chosen.parameters), about={**job.about, **chosen.about})
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.files import write_atomically
+from _touch_retrieval.files import write_atomically
 from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, measure
 from retrieval.adaptation.material import Material
 from retrieval.adaptation.start import AsItIs

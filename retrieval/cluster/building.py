@@ -20,7 +20,7 @@ from retrieval.console.output import say
 from retrieval.errors import RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import default_device
-from retrieval.search.build_cluster import Run, ShardBuilt, ShardJob, build_shard
+from retrieval.search.sharding.build_cluster import Run, ShardBuilt, ShardJob, build_shard
 
 ENDING_S, FAILURES = 60.0, 3
 """Within which a process that was given up lets go of its shard; how often all may fail without a shard between."""

@@ -28,9 +28,9 @@ from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError, Unanswered
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import Stored, fingerprint, read_stored
-from retrieval.search.object_store import folder_with
-from retrieval.search.opening import described_cluster, folder_shard
-from retrieval.search.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
+from retrieval.search.query.opening import described_cluster, folder_shard
+from retrieval.search.query.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
+from retrieval.search.sharding.object_store import folder_with
 
 T = TypeVar("T")
 HOLDERS = "touch-retrieval"
@@ -202,7 +202,7 @@ class Deployments:
         self._delete_of_killed()
 
     def open(self, cluster: str | Path, manifest: ClusterManifest, stored: Stored) -> RayShards:
-        """As `retrieval.search.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
+        """As `retrieval.search.query.opening.open_cluster`, of shards that Ray Serve holds: returns when all answer."""
         require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
         names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._own}" for entry in manifest.shards}
         self._end_handles()

@@ -15,7 +15,7 @@ from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
     from retrieval.model.checkpoint import Checkpoint
-    from retrieval.search.build_report import BuildReport
+    from retrieval.search.build.build_report import BuildReport
 
 PREVIEWED = 16
 """Photos of the catalogue, evenly chosen, that a preview shows."""
@@ -86,8 +86,10 @@ def build_index(
     from retrieval.data.catalogue import require_apart
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
-    from retrieval.search import build, build_cluster, defaults
-    from retrieval.search.object_store import StoredCluster
+    from retrieval.search import defaults
+    from retrieval.search.build import build_index as build
+    from retrieval.search.sharding import build_cluster
+    from retrieval.search.sharding.object_store import StoredCluster
 
     if not is_url(out):
         require_apart(catalogue, out)
@@ -155,7 +157,7 @@ def _shards(asked: int | None, out: str, *, of_shards: bool) -> int | None:
     of_shards: whether an option was given that shards alone have. Raises BadInput where there are none then.
     """
     from indexes.errors import NoIndex
-    from retrieval.search.object_store import is_cluster, read_cluster
+    from retrieval.search.sharding.object_store import is_cluster, read_cluster
 
     if asked is None and is_cluster(out):
         with suppress(NoIndex):

@@ -133,7 +133,7 @@ def _load_gate(path: Path | None) -> tuple[Any, str | None]:
     """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
     if path is None:
         return None, None
-    from indexes.store.files import file_digest
+    from _touch_retrieval.files import file_digest
     from retrieval.training.grasp_success import load_gate
 
     gate = load_gate(path)

@@ -110,8 +110,8 @@ def example(queries: "Mapping[str, Sequence[Grasp]]") -> str:
 
 def _first_places(index: Path, queries: "dict[str, list[Grasp]]") -> str:
     """How often the true object comes first, and among the first five; and what the verdicts were worth."""
-    from retrieval.search.answer import MATCH
-    from retrieval.search.searcher import Searcher
+    from retrieval.search.query.answer import MATCH
+    from retrieval.search.query.searcher import Searcher
 
     with Searcher.open(index) as searcher:
         gallery = searcher.objects.count

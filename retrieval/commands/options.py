@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 from typer.core import TyperCommand
 
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:

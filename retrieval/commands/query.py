@@ -57,8 +57,8 @@ def query(
     path, why = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({why})")
-    from retrieval.search.answer import EXIT_CODES, in_words
-    from retrieval.search.searcher import Searcher
+    from retrieval.search.query.answer import EXIT_CODES, in_words
+    from retrieval.search.query.searcher import Searcher
 
     if html:
         require_ours(html, PAGE)

@@ -14,7 +14,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.search.opening import OpenShards
+    from retrieval.search.query.opening import OpenShards
     from retrieval.serve.service import LiveRig
     from robot.recording.folder import RecordingWriter
 
@@ -151,7 +151,7 @@ def _held(index: str | Path, closed: ExitStack, how: Mapping[str, Any], verify: 
     where there is no cluster to hold."""
     from retrieval.cluster.serving import Deployments, Held
     from retrieval.cluster.session import connected
-    from retrieval.search.object_store import is_cluster
+    from retrieval.search.sharding.object_store import is_cluster
 
     if not is_cluster(index):
         raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
@@ -179,7 +179,7 @@ def _recorder(folder: Path, index: str | Path, closed: ExitStack) -> "RecordingW
 def _token(file: Path | None) -> str | None:
     if file is None:
         return os.environ.get(TOKEN)
-    from indexes.store.regular import read_regular
+    from _touch_retrieval.files import read_regular
 
     try:
         return read_regular(file).decode("ascii").strip()

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from indexes.store.files import naming, write_atomically
-from indexes.store.regular import open_regular
+from _touch_retrieval.files import naming, open_regular, write_atomically
 from retrieval.errors import BadInput
 
 GENERATOR = "touch-retrieval"

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
 
-from indexes.store.regular import read_regular
+from _touch_retrieval.files import read_regular
 from indexes.store.seen_folders import SeenFolders
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming

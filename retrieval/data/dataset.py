@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.regular import read_regular
+from _touch_retrieval.files import read_regular
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
 from robot.recording.folder import read_info, read_recording

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError, features
 
-from indexes.store.regular import read_regular
+from _touch_retrieval.files import read_regular
 from retrieval.data.picture_structure import check_structure, png_chunks
 from retrieval.data.resize import RgbImage, Samples, to_unit
 from retrieval.errors import BadInput, ImageError

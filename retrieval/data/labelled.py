@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from indexes.store.regular import read_json, read_regular
+from _touch_retrieval.files import read_json, read_regular
 from retrieval.errors import DatasetError
 
 KINDS = ("photo", "touch")

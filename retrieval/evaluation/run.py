@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from indexes.store.files import write_atomically
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted

@@ -13,8 +13,8 @@ from indexes.kinds.base import VectorIndex
 from retrieval.frontier.clock import timed
 from retrieval.frontier.points import Panel, Row, Tradeoff, missed
 from retrieval.frontier.sample import Array, Sample
-from retrieval.search.measuring import FEWER, FIRST, candidate_steps
-from retrieval.search.operating import TARGET
+from retrieval.search.build.measuring import FEWER, FIRST, candidate_steps
+from retrieval.search.build.operating import TARGET
 
 TOLERANCE = 100 * (1 - TARGET)
 """Percent of winners that `build-index` lets candidates miss unless it is told otherwise."""

@@ -7,8 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from indexes.store.files import file_digest, write_atomically
-from indexes.store.regular import read_json
+from _touch_retrieval.files import file_digest, read_json, write_atomically
 from retrieval.console.output import say
 from retrieval.frontier import APPROXIMATIONS, load_approximation
 from retrieval.frontier.clock import machine

@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from indexes.store.files import write_atomically
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from indexes.store.files import write_atomically
+from _touch_retrieval.files import write_atomically
 from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError

@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from indexes.store.regular import read_regular
+from _touch_retrieval.files import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.losses import LOSSES, OF_LOGITS

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from indexes.store.files import write_atomically
+from _touch_retrieval.files import write_atomically
 from retrieval.console.files import EXPORT, make_cache_folder, require_folder, require_ours, require_private
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint

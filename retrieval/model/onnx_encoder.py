@@ -18,7 +18,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.regular import MOST_BYTES, open_regular
+from _touch_retrieval.files import MOST_BYTES, open_regular
 from retrieval.console.files import SEAL, cache_folder, require_private
 from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput, CheckpointError

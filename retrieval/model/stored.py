@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from indexes.store.files import file_digest
-from indexes.store.regular import open_regular, parse_json
+from _touch_retrieval.files import file_digest, open_regular, parse_json
 from retrieval.console.files import HEADER
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from indexes.store.files import write_atomically
+from _touch_retrieval.files import write_atomically
 from retrieval.errors import RetrievalError
 
 Figure = Any

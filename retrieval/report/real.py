@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json
 from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.console.output import show
 from retrieval.data.dataset import Grasp, load_grasps

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.methods import KNOW_NOTHING

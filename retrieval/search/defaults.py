@@ -12,8 +12,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from indexes.store.files import file_digest, write_atomically
-from indexes.store.regular import read_json
+from _touch_retrieval.files import file_digest, read_json, write_atomically
 from retrieval.data.storage import is_url, place_of
 from retrieval.errors import BadInput, CheckpointError
 
@@ -81,7 +80,7 @@ def manifest_of(index: str | Path) -> "Manifest | ClusterManifest":
     StorageError of what lies behind a URL."""
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
-    from retrieval.search.object_store import is_cluster, read_cluster
+    from retrieval.search.sharding.object_store import is_cluster, read_cluster
 
     return read_cluster(index) if is_cluster(index) else read_manifest(Path(index) / IndexStore(index).current())
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from threadpoolctl import threadpool_limits
 
-from retrieval.search.opening import OpenShards
+from retrieval.search.query.opening import OpenShards
 from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations

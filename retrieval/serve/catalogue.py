@@ -11,8 +11,8 @@ from retrieval.data.images import read_bytes
 from retrieval.data.text import utf8_of
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
-from retrieval.search.neighbours import nearest_photos
-from retrieval.search.objects import ListedPhoto, listed_photo
+from retrieval.search.query.neighbours import nearest_photos
+from retrieval.search.query.objects import ListedPhoto, listed_photo
 from retrieval.serve.documents import (
     CatalogueDocument,
     IndexDocument,

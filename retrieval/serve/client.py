@@ -17,7 +17,7 @@ from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage
 from retrieval.model.touches import AnyImage, AnyTouches, GivenImage, read_grasps
-from retrieval.search.answer import Match, QueryResult
+from retrieval.search.query.answer import Match, QueryResult
 
 try:
     import httpx

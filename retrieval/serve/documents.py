@@ -1,5 +1,6 @@
 """The documents of the service as OpenAPI says them, and those that the service makes itself. The answer to a query is
-made by `QueryResult.to_dict` (`retrieval.search.answer`), sent as it is: its form stands here, and a test compares."""
+made by `QueryResult.to_dict` (`retrieval.search.query.answer`), sent as it is: its form stands here, and a test
+compares."""
 
 from typing import Any
 

@@ -9,8 +9,8 @@ from threading import Lock
 
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.defaults import manifest_of
-from retrieval.search.opening import OpenShards
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.opening import OpenShards
+from retrieval.search.query.searcher import Searcher
 from retrieval.serve.errors import Problem
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings

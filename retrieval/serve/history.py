@@ -18,8 +18,8 @@ from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
-from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
-from retrieval.search.objects import listed_photo
+from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
+from retrieval.search.query.objects import listed_photo
 from retrieval.serve.catalogue import SHOWN
 from retrieval.serve.documents import QueryDocument
 from retrieval.serve.errors import Problem, problems

@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from retrieval.search.objects import listed_photo
+from retrieval.search.query.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened

@@ -3,8 +3,8 @@
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from retrieval.search.agreement import agreement
-from retrieval.search.answer import QueryResult
+from retrieval.search.query.agreement import agreement
+from retrieval.search.query.answer import QueryResult
 from retrieval.serve.catalogue import photo_of
 from retrieval.serve.documents import AgreementDocument, BatchDocument, GrowingDocument, QueryDocument
 from retrieval.serve.errors import DocumentResponse, problems

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from starlette.requests import Request
 
-from retrieval.search.answer import QueryResult
+from retrieval.search.query.answer import QueryResult
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.errors import Problem
 from retrieval.serve.generations import Generations, Opened

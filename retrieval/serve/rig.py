@@ -19,7 +19,7 @@ from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
 from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
-from retrieval.search.objects import listed_photo
+from retrieval.search.query.objects import listed_photo
 from retrieval.serve.service import Grasped, LiveRig
 from robot.devices import TactileSensor
 from robot.rig import load_rig

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.regular import open_regular
+from _touch_retrieval.files import open_regular
 from retrieval.data.text import utf8_of
 from retrieval.errors import BadInput, RetrievalError
-from retrieval.search.answer import QueryResult
+from retrieval.search.query.answer import QueryResult
 
 RIGHT, OBJECT, NONE = "right", "object", "none"
 SAID = (RIGHT, OBJECT, NONE)

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes.store.files import file_digest, naming, replacing
-from indexes.store.regular import open_regular
+from _touch_retrieval.files import file_digest, naming, open_regular, replacing
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.errors import BadInput, DatasetError

@@ -4,9 +4,9 @@ import pytest
 
 from benchmarks.rehearsal import rehearse
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 from robot.recording.folder import read_info, read_recording
 
 

@@ -12,8 +12,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
+from _touch_retrieval import files
 from indexes.errors import LockedIndex, NoIndex, WriteFailed
-from indexes.store import files, locking
+from indexes.store import locking
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit

@@ -7,9 +7,9 @@ import faiss
 import numpy as np
 import pytest
 
+from _touch_retrieval.files import file_digest
 from indexes import KINDS, load_kind
 from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
-from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import own_digest
 from tests.indexes.test_store import FINGERPRINT, filled, unit

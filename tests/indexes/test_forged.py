@@ -13,11 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from _touch_retrieval.files import DEEPEST, file_digest, read_regular
 from indexes.errors import CorruptIndex, IndexesError, LockedIndex, NoIndex, RowError, WriteFailed
-from indexes.store.files import file_digest
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import own_digest
-from indexes.store.regular import DEEPEST, read_regular
 from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit
 
 

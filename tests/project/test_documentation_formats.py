@@ -10,7 +10,7 @@ import pytest
 
 from retrieval.commands.main import main
 from retrieval.model.stored import read_header
-from retrieval.search.answer import EXIT_CODES
+from retrieval.search.query.answer import EXIT_CODES
 from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter, read_recording
 from tests import real_data_sets

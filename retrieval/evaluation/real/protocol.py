@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.metrics.registry import METRICS, Metric, guesses

@@ -10,8 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from indexes.store.files import write_atomically
-from indexes.store.regular import read_json
+from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.errors import BadInput, Interrupted

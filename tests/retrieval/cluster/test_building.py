@@ -13,9 +13,9 @@ import torch
 
 from indexes.store.cluster import read_cluster
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search import measuring
-from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster
+from retrieval.search.build import measuring
+from retrieval.search.build.build_index import build_index
+from retrieval.search.sharding.build_cluster import build_cluster
 from tests import referenced
 from tests.retrieval.search.test_operating import checkpoint_of
 

@@ -25,10 +25,10 @@ from indexes.store.folder import IndexStore
 from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import BadInput, TooManyBad, Unanswered
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster
-from retrieval.search.opening import stored_for
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.opening import stored_for
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.sharding.build_cluster import build_cluster
 from tests import on_ray, referenced, serving, synthetic
 from tests.waiting import first_line, running, until
 
@@ -186,7 +186,7 @@ HOLDING = """
 import sys, time
 from retrieval.cluster.serving import Deployments, Held
 from retrieval.cluster.session import connected
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 with connected() as ray:
     searcher = Searcher.open(sys.argv[1], shards=Deployments(ray, Held(cpus=0.1)).open)
     print("held", flush=True)
@@ -347,7 +347,7 @@ import sys, time
 from concurrent.futures import ThreadPoolExecutor
 from retrieval.cluster.serving import Deployments, Held
 from retrieval.cluster.session import connected
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 with connected(2) as ray:
     held = Deployments(ray, Held(cpus=0.1, wait_s=240.0, most_replicas=2))
     with Searcher.open(sys.argv[1], shards=held.open) as searcher, ThreadPoolExecutor(12) as threads:

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from indexes.store import files
-from indexes.store.files import write_atomically
+from _touch_retrieval import files
+from _touch_retrieval.files import write_atomically
 from retrieval.console.files import (
     CARD,
     CHECKPOINT,

@@ -9,8 +9,8 @@ from retrieval.data.photo_resize import resize_photo
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resized, to_unit
 from retrieval.data.views import VIEWS, find_object
-from retrieval.search import embed
-from retrieval.search.build import build_index
+from retrieval.search.build import embed
+from retrieval.search.build.build_index import build_index
 from tests.retrieval.data.test_views import photo
 
 SIZES = [((64, 64), (16, 16)), ((61, 83), (20, 20)), ((83, 61), (20, 20)), ((20, 20), (31, 31)), ((9, 70), (30, 30))]

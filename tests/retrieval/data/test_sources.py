@@ -15,9 +15,9 @@ from retrieval.data.sources import list_photos
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, DatasetError, StorageError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.sharding.build_cluster import build_cluster
 from tests import s3
 
 pyarrow = pytest.importorskip("pyarrow")

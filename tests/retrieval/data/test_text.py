@@ -12,8 +12,8 @@ from retrieval.data.sources import list_photos
 from retrieval.data.text import is_utf8, utf8_of
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
-from retrieval.search.objects import listed_photo
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.objects import listed_photo
 from retrieval.serve.errors import Problem
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording

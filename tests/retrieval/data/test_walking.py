@@ -12,7 +12,7 @@ from indexes.store import seen_folders
 from indexes.store.seen_folders import NAME, SeenFolders
 from retrieval.data import walking
 from retrieval.data.walking import Walk
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 
 HOUR_NS = 3600 * 10**9
 

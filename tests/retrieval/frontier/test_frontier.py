@@ -19,8 +19,8 @@ from retrieval.frontier.sample import Sample, Scale, blend
 from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.search.measuring import WinnerBench
-from retrieval.search.operating import Asked, settle
+from retrieval.search.build.measuring import WinnerBench
+from retrieval.search.build.operating import Asked, settle
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -196,7 +196,7 @@ def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
 
 def test_an_index_keeps_halves_in_the_default_format(catalogue, model, tmp_path):
     from indexes.store.folder import IndexStore
-    from retrieval.search.build import build_index
+    from retrieval.search.build.build_index import build_index
 
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
     kept = IndexStore(tmp_path / "index").open().arrays["halves"]

@@ -96,7 +96,7 @@ def test_the_harness_trains_what_the_command_line_trains(recording, split, fitte
 
 
 def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue, tmp_path):
-    from retrieval.search.build import build_index
+    from retrieval.search.build.build_index import build_index
 
     report = build_index(
         catalogue, load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors"), tmp_path / "index"

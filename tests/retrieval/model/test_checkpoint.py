@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 import indexes
 import retrieval
 import robot
-from indexes.store.files import file_digest
+from _touch_retrieval.files import file_digest
 from retrieval.data.dataset import Split
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (

@@ -25,8 +25,8 @@ from retrieval.model.export import export
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, sealed, unsealed
 from retrieval.model.towers import OUTPUTS, TOWERS
-from retrieval.search.build import build_index
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
 from tests.project.test_imports import run_blocked
 from tests.project.test_project import PROJECT
 
@@ -458,7 +458,7 @@ def test_the_process_that_queries_by_onnx_never_loads_torch(own, index, touch, o
     export(load_checkpoint(own))
     files = [str(path) for path in touch]
     code = (
-        f"import sys\nfrom retrieval.search.searcher import Searcher\n"
+        f"import sys\nfrom retrieval.search.query.searcher import Searcher\n"
         f"Searcher.open({str(index)!r}).query([{files!r}])\n"
         "print(sorted({name.split('.')[0] for name in sys.modules} & {'torch', 'scipy', 'cv2', 'robot'}))"
     )

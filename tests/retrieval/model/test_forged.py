@@ -19,7 +19,7 @@ from retrieval.errors import BadInput, CheckpointError, ConfigError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
 from retrieval.model.config import load_config
 from retrieval.model.stored import read_judge, read_stored
-from retrieval.search.objects import listed_photo
+from retrieval.search.query.objects import listed_photo
 from retrieval.training.gate import load_gate
 from tests.retrieval.model.test_checkpoint import rewrite, save
 

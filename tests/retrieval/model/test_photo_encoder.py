@@ -7,7 +7,7 @@ from indexes.store.folder import IndexStore
 from retrieval.model import photo_encoder
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.photo_encoder import PhotoCodes, fastest, on_onnx, on_torch
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 
 
@@ -49,8 +49,8 @@ def test_a_long_build_by_either_gives_the_same_index(catalogue, model, tmp_path,
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
     asked = []
-    monkeypatch.setattr("retrieval.search.embed.MANY", 1)
-    monkeypatch.setattr("retrieval.search.embed.fastest", lambda made: asked.append(1) or on_onnx(made))
+    monkeypatch.setattr("retrieval.search.build.embed.MANY", 1)
+    monkeypatch.setattr("retrieval.search.build.embed.fastest", lambda made: asked.append(1) or on_onnx(made))
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
     assert asked == [1]  # once a build
     ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))

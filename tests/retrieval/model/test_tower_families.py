@@ -17,8 +17,8 @@ from retrieval.model.encode import encode_touches
 from retrieval.model.onnx_encoder import OnnxEncoder, sealed
 from retrieval.model.towers import architectures_of, build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.search.build import build_index
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
 from retrieval.training.train import train
 from tests.conftest import TINY
 

@@ -15,9 +15,9 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.answer import Match, NearestReference, QueryResult, in_words
-from retrieval.search.build import build_index
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.answer import Match, NearestReference, QueryResult, in_words
+from retrieval.search.query.searcher import Searcher
 from tests.pages import Page
 
 SCRIPT = "<script>alert(1)</script>"

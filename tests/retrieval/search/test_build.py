@@ -18,11 +18,12 @@ from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import encode_photos, for_inference
 from retrieval.model.fusion import Matcher
-from retrieval.search import build, measuring, operating
-from retrieval.search.build import build_index
-from retrieval.search.embed import ahead
-from retrieval.search.measuring import NeighbourBench, WinnerBench
-from retrieval.search.searcher import Searcher
+from retrieval.search.build import build_index as build
+from retrieval.search.build import measuring, operating
+from retrieval.search.build.build_index import build_index
+from retrieval.search.build.embed import ahead
+from retrieval.search.build.measuring import NeighbourBench, WinnerBench
+from retrieval.search.query.searcher import Searcher
 from retrieval.version import __version__
 from tests import synthetic
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexes.store.files import file_digest
+from _touch_retrieval.files import file_digest
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.stored import read_stored

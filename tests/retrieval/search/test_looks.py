@@ -10,9 +10,9 @@ import pytest
 from indexes.store.folder import IndexStore
 from indexes.store.seen import NAME, Seen
 from retrieval.data.catalogue import list_catalogue, read_photo
-from retrieval.search import embed, looks
-from retrieval.search.build import UNNOTED, build_index
-from retrieval.search.build_cluster import build_cluster
+from retrieval.search.build import embed, looks
+from retrieval.search.build.build_index import UNNOTED, build_index
+from retrieval.search.sharding.build_cluster import build_cluster
 from tests.retrieval.search.test_build import first_photo, other_picture, rows_of
 
 HOUR_NS = 3600 * 10**9

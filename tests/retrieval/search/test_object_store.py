@@ -18,11 +18,11 @@ from retrieval.console.files import cache_folder
 from retrieval.data import storage
 from retrieval.errors import BadInput, StorageError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search import build_cluster as building
-from retrieval.search import object_store
-from retrieval.search.build_cluster import build_cluster
-from retrieval.search.object_store import StoredCluster
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.sharding import build_cluster as building
+from retrieval.search.sharding import object_store
+from retrieval.search.sharding.build_cluster import build_cluster
+from retrieval.search.sharding.object_store import StoredCluster
 from tests import s3
 from tests.retrieval.search.test_shards import same_answers
 

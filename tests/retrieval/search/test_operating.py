@@ -14,9 +14,9 @@ from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import Matcher
-from retrieval.search import measuring
-from retrieval.search.measuring import NeighbourBench, Point, WinnerBench, can_measure, query_codes
-from retrieval.search.operating import (
+from retrieval.search.build import measuring
+from retrieval.search.build.measuring import NeighbourBench, Point, WinnerBench, can_measure, query_codes
+from retrieval.search.build.operating import (
     Asked,
     all_judged,
     carried_over,

@@ -13,11 +13,11 @@ from retrieval.errors import BadInput
 from retrieval.model.references import SHARPNESS, ReferenceWorth, touch_codes
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.answer import QueryResult
-from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster
-from retrieval.search.searcher import Searcher
-from retrieval.search.shard import FolderShard
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.answer import QueryResult
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import FolderShard
+from retrieval.search.sharding.build_cluster import build_cluster
 from tests import synthetic
 from tests.documents import ROOT, text_of
 from tests.referenced import MEANING, NAMES, WORTH, a_model

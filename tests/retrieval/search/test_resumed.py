@@ -14,8 +14,8 @@ from indexes.store.folder import IndexStore
 from indexes.store.unfinished import FOLDER
 from retrieval.commands.main import main
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search import embed
-from retrieval.search.build import build_index
+from retrieval.search.build import embed
+from retrieval.search.build.build_index import build_index
 
 PHOTOS, BATCH = 24, 4
 
@@ -23,8 +23,8 @@ KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
 from retrieval.model import photo_encoder
-from retrieval.search import embed
-from retrieval.search.build import build_index
+from retrieval.search.build import embed
+from retrieval.search.build.build_index import build_index
 from retrieval.model.checkpoint import load_checkpoint
 
 catalogue, model, index, fatal, batch = sys.argv[1:]

@@ -18,10 +18,10 @@ from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
 from retrieval.search import defaults
-from retrieval.search.build import build_index
-from retrieval.search.objects import JudgedObjects
-from retrieval.search.searcher import Searcher
-from retrieval.search.shard import together
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.objects import JudgedObjects
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import together
 from tests import synthetic
 
 HALF_STEP = 2**-11
@@ -288,7 +288,7 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
 ):
     """Plain loops: the best sums of inner products, the full network on these, and on the other photos of the objects
     that come first by them."""
-    monkeypatch.setattr("retrieval.search.shard.COMPLETED", completed)
+    monkeypatch.setattr("retrieval.search.query.shard.COMPLETED", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, products = checkpoint.config.preprocessing.load_touch, np.zeros(24)
     for grasp in grasps:

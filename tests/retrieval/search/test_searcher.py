@@ -21,8 +21,8 @@ from retrieval.model import touches as model_touches
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import graph_of
 from retrieval.model.onnx_encoder import sealed
-from retrieval.search.build import build_index
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
 from tests import synthetic
 
 

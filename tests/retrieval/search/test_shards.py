@@ -17,11 +17,11 @@ from indexes.store.manifest import own_digest
 from retrieval.errors import BadInput, RetrievalError, TooManyBad
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Mass, Posterior
-from retrieval.search.build import build_index
-from retrieval.search.build_cluster import build_cluster, build_shard
-from retrieval.search.objects import ListedPhoto
-from retrieval.search.searcher import Searcher
-from retrieval.search.shard import Judged, Ranked, merged
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.objects import ListedPhoto
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import Judged, Ranked, merged
+from retrieval.search.sharding.build_cluster import build_cluster, build_shard
 
 NUMBERS = ("logit", "probability", "probability_if_present")
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
@@ -83,7 +83,7 @@ def test_with_as_many_candidates_in_each_shard_the_winner_is_found_at_least_as_o
 
 
 def test_probabilities_add_up_to_one_whatever_was_judged(divided, grasps, monkeypatch):
-    monkeypatch.setattr("retrieval.search.shard.COMPLETED", 1)
+    monkeypatch.setattr("retrieval.search.query.shard.COMPLETED", 1)
     for candidates in (1, 2, 3, 100):
         answer = divided.query(grasps[0], top=8, candidates=candidates)
         shown = math.fsum(match.probability for match in answer.results)
@@ -234,7 +234,7 @@ class Killed(Exception):
 def test_killed_between_shards_the_cluster_is_as_it_was_and_the_next_build_embeds_what_is_missing(
     after, catalogue, model, tmp_path, embedded, monkeypatch
 ):
-    from retrieval.search import build_cluster as module
+    from retrieval.search.sharding import build_cluster as module
 
     made, build = [], module.build_shard
 
@@ -257,7 +257,7 @@ def test_killed_between_shards_the_cluster_is_as_it_was_and_the_next_build_embed
 
 def test_killed_before_the_switch_the_old_generations_answer_however_often(own, model, touch, monkeypatch):
     """Each time a shard has another photo, so that its folder goes through many generations."""
-    from retrieval.search import build_cluster as module
+    from retrieval.search.sharding import build_cluster as module
 
     catalog, cluster = own
     with Searcher.open(cluster) as searcher:

@@ -12,7 +12,7 @@ from retrieval.data import preprocessing
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.fusion import pruner_of
 from retrieval.model.stored import HALVES_OF, fingerprint
-from retrieval.search.build import TAUGHT_AGAIN, build_index
+from retrieval.search.build.build_index import TAUGHT_AGAIN, build_index
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_model_whose_pruner_alone_was_taught_again_gives_old_halves_new_embedd
     from_photos = build_index(own, other, tmp_path / "whole", quiet=True)
     assert from_photos.embedded == 24
     embedded.clear()
-    monkeypatch.setattr("retrieval.search.embed.decode_photo", None)  # whoever decodes one, fails
+    monkeypatch.setattr("retrieval.search.build.embed.decode_photo", None)  # whoever decodes one, fails
     report = build_index(own, other, index, quiet=True)
     assert (embedded, report.embedded, report.remade, report.reused, report.renamed) == ([], 0, 24, 24, 0)
     assert report.reason.startswith(TAUGHT_AGAIN)

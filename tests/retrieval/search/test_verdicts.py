@@ -12,9 +12,9 @@ from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored import read_stored
-from retrieval.search.answer import EXIT_CODES, in_words
 from retrieval.search.defaults import SHIPPED, shipped_model
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.answer import EXIT_CODES, in_words
+from retrieval.search.query.searcher import Searcher
 from robot.collect import CollectSettings, collect
 from robot.rig import load_rig
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 import retrieval
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.search.answer import Match, QueryResult
+from retrieval.search.query.answer import Match, QueryResult
 from tests.serving import listening
 
 TOKEN = "a token of some length"

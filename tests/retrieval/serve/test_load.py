@@ -15,7 +15,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.serve.service import LiveRig
 from retrieval.serve.settings import ServiceSettings
 from tests import synthetic

@@ -8,8 +8,8 @@ import shutil
 import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
-from retrieval.search.searcher import Searcher
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
 from retrieval.serve.service import Grasped, LiveRig
 from tests import synthetic
 from tests.browser import address, ask, choose, chromium, gel_files, page, serious

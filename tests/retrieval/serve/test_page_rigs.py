@@ -8,7 +8,7 @@ import pytest
 
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from retrieval.serve.rig import of_index, of_rig
 from retrieval.training.train import train
 from robot.recording.folder import RecordingWriter

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.models.next_grasp import another_grasp
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.browser import address, ask, chromium, gel_files, page, serious

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data.dataset import load_grasps
-from retrieval.search.build import build_index
+from retrieval.search.build.build_index import build_index
 from robot.recording.folder import RecordingWriter
 from tests.browser import address, ask, chromium, page, serious
 from tests.referenced import NAMES, a_model

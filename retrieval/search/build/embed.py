@@ -34,7 +34,7 @@ from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, one_thread
 from retrieval.model.photo_encoder import fastest, on_torch
-from retrieval.search.looks import Looked, row_of, runs
+from retrieval.search.build.looks import Looked, row_of, runs
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -8,9 +8,9 @@ from indexes.store.generation import Generation, require_made_by
 from indexes.store.manifest import Manifest
 from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
 from retrieval.search import defaults
-from retrieval.search.object_store import folder_with
-from retrieval.search.objects import require_usable
-from retrieval.search.shard import Described, FolderShard, Shard, Shards
+from retrieval.search.query.objects import require_usable
+from retrieval.search.query.shard import Described, FolderShard, Shard, Shards
+from retrieval.search.sharding.object_store import folder_with
 
 
 def stored_for(manifest: Manifest | ClusterManifest, model: str | Path | None) -> Stored:

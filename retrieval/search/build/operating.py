@@ -26,7 +26,7 @@ from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.scores import Floats, Slots
 from retrieval.errors import BadInput
 from retrieval.metrics.binomial import binomial_interval
-from retrieval.search.measuring import FEWER, Bench, NeighbourBench, Point, candidate_steps
+from retrieval.search.build.measuring import FEWER, Bench, NeighbourBench, Point, candidate_steps
 
 TARGET = 0.99
 """Winner recall where none is asked for."""

@@ -12,7 +12,7 @@ from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.touches import AnyImage, AnyTouches, read_image
 from retrieval.search.embeddings import embed_photos
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.searcher import Searcher
 
 LONGER_SIDE = 640
 """Pixels of the photo that squares are hidden in: more than any view shows of it."""

@@ -5,7 +5,7 @@ in it, in the shards of another division, or by a build that was cut off, is not
 is written when every shard is on the disk. Killed at any moment, a build leaves the cluster as it was.
 
 A cluster in an object store is made in a folder of this machine, each shard put into the store as soon as it is made
-(`retrieval.search.object_store`).
+(`retrieval.search.sharding.object_store`).
 """
 
 from collections import Counter
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from _touch_retrieval.files import remove_folder
 from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
 from indexes.kinds.base import VectorIndex
 from indexes.store.cluster import (
@@ -32,7 +33,6 @@ from indexes.store.cluster import (
     shard_of,
     write_cluster,
 )
-from indexes.store.files import remove_folder
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
@@ -45,11 +45,11 @@ from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.stored import fingerprint
-from retrieval.search.build import Wanted, build_listed, naming_by
-from retrieval.search.build_report import BuildReport
-from retrieval.search.object_store import StoredCluster, folder_with, names
-from retrieval.search.operating import Asked
-from retrieval.search.references import ROWS, WORTH
+from retrieval.search.build.build_index import Wanted, build_listed, naming_by
+from retrieval.search.build.build_report import BuildReport
+from retrieval.search.build.operating import Asked
+from retrieval.search.query.references import ROWS, WORTH
+from retrieval.search.sharding.object_store import StoredCluster, folder_with, names
 from retrieval.version import __version__
 
 BAD_SHARE = 0.05

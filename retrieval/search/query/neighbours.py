@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from retrieval.errors import BadInput
-from retrieval.search.objects import ListedPhoto, listed_photo
-from retrieval.search.searcher import Searcher
+from retrieval.search.query.objects import ListedPhoto, listed_photo
+from retrieval.search.query.searcher import Searcher
 
 
 class Neighbour(NamedTuple):

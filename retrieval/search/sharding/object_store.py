@@ -22,10 +22,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+from _touch_retrieval.files import file_digest, remove_folder, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
 from indexes.store import cluster as folders
 from indexes.store.cluster import FOLDER, ClusterManifest, ShardEntry, cluster_file
-from indexes.store.files import file_digest, remove_folder, write_atomically
 from indexes.store.folder import IndexStore
 from indexes.store.locking import one_at_a_time
 from indexes.store.manifest import NAME as MANIFEST

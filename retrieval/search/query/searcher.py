@@ -27,12 +27,12 @@ from retrieval.model.touches import (
     TouchReader,
     read_grasps,
 )
-from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
-from retrieval.search.object_store import is_cluster, read_cluster
-from retrieval.search.objects import Objects
-from retrieval.search.opening import OpenShards, folder_shard, open_cluster, stored_for
-from retrieval.search.references import ROWS, told_of
-from retrieval.search.shard import Felt, FolderShard, Judged, Shard
+from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
+from retrieval.search.query.objects import Objects
+from retrieval.search.query.opening import OpenShards, folder_shard, open_cluster, stored_for
+from retrieval.search.query.references import ROWS, told_of
+from retrieval.search.query.shard import Felt, FolderShard, Judged, Shard
+from retrieval.search.sharding.object_store import is_cluster, read_cluster
 
 Floats = NDArray[np.float32]
 

@@ -13,8 +13,8 @@ from retrieval.data.storage import is_inside
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import Floats, Numbers, ReferenceWorth, nearness, touch_codes
-from retrieval.search.answer import NearestReference
-from retrieval.search.objects import JudgedObjects, Objects
+from retrieval.search.query.answer import NearestReference
+from retrieval.search.query.objects import JudgedObjects, Objects
 
 ROWS, CODES, WORTH = "references", "touches", "reference_worth"
 """Names in a generation: of the document of its touches (and in the manifest of how many there are), of their halves,

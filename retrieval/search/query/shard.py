@@ -22,9 +22,9 @@ from retrieval.errors import BadInput
 from retrieval.model.judge import Judge
 from retrieval.model.posterior import Mass, Posterior
 from retrieval.model.touches import Stopwatch
-from retrieval.search.answer import NearestReference
-from retrieval.search.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
-from retrieval.search.references import Near, by_both, open_references
+from retrieval.search.query.answer import NearestReference
+from retrieval.search.query.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
+from retrieval.search.query.references import Near, by_both, open_references
 
 DEFAULT_CANDIDATES = 1000
 COMPLETED = 20

@@ -27,7 +27,7 @@ from retrieval.model.fusion import judge_of
 from retrieval.model.judge import CONTACT
 from retrieval.model.posterior import JudgedTouches
 from retrieval.model.references import FeltTouches, ReferenceWorth, fit_references, touch_codes
-from retrieval.search.references import CODES, ROWS
+from retrieval.search.query.references import CODES, ROWS
 
 Halves = NDArray[np.float16]
 FEWEST = 10

@@ -24,12 +24,12 @@ from retrieval.data.sources import Fetched, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.stored import fingerprint, halves_kept
-from retrieval.search.build_report import BuildReport
-from retrieval.search.embed import Embedder, Part, layouts
-from retrieval.search.embed_touches import MadeReferences, make_references, worth_of
-from retrieval.search.looks import Looked
-from retrieval.search.measuring import WinnerBench, can_measure, query_codes
-from retrieval.search.operating import (
+from retrieval.search.build.build_report import BuildReport
+from retrieval.search.build.embed import Embedder, Part, layouts
+from retrieval.search.build.embed_touches import MadeReferences, make_references, worth_of
+from retrieval.search.build.looks import Looked
+from retrieval.search.build.measuring import WinnerBench, can_measure, query_codes
+from retrieval.search.build.operating import (
     Asked,
     Settled,
     all_judged,
@@ -39,7 +39,7 @@ from retrieval.search.operating import (
     settle,
     settle_by_neighbours,
 )
-from retrieval.search.references import ROWS, WORTH
+from retrieval.search.query.references import ROWS, WORTH
 from retrieval.version import __version__
 
 
@@ -60,10 +60,10 @@ def build_index(
     * `folder`: of this machine, or a URL as `retrieval.data.sources` reads it.
     * `objects_from`: the rule that says which object a photo shows (`retrieval.data.naming`); None: the rule of the
       index that is there, else by folder.
-    * `kind` (a name or a class), `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.operating`);
+    * `kind` (a name or a class), `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.build.operating`);
       where all are None, exact search.
     * `verify`: list every folder and read every file, also those that look as an earlier build found them, by size,
-      times and inode (`indexes.store.seen_folders`, `retrieval.search.looks`).
+      times and inode (`indexes.store.seen_folders`, `retrieval.search.build.looks`).
 
     Nothing is written where neither photos, nor their objects, nor what is asked for has changed. Photos that cannot be
     read are skipped and reported. What was embedded until an error, or until the process was killed, is not embedded

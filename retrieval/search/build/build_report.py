@@ -25,10 +25,10 @@ class BuildReport:
       `resumed` had been embedded by a build that was cut off.
     * `removed`: photos that the index held before and the catalogue no longer does.
     * `unread`: photos whose files were not read, for they look as they did when an earlier build read them
-      (`retrieval.search.looks`).
+      (`retrieval.search.build.looks`).
     * `skipped`: pictures that could not be read. `ignored`: files that are no pictures by name. `left_out`: how many of
       both for each reason. `without_photo`: objects all of whose pictures were skipped. `notes`: remarks on metadata.
-    * `kind`, `reason`, `recall`, `candidates`: how the index is searched and why (`retrieval.search.operating`);
+    * `kind`, `reason`, `recall`, `candidates`: how the index is searched and why (`retrieval.search.build.operating`);
       `candidates` is None where the checkpoint has nothing to measure them with.
     * `half_error`: largest rounding of a stored half. `seconds`: time of decoding and encoding alone.
     * `shards`: those of a cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.

@@ -1,0 +1,1 @@
+"""From gel images to ranked objects."""

@@ -1,0 +1,1 @@
+"""Indexes in several shards, in a folder or in an object store."""
