@@ -1,0 +1,93 @@
+"""Plain documents, as JSON and TOML give them, as typed values: msgspec checks, this words its refusals."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
+
+import msgspec
+
+T = TypeVar("T")
+
+_WORDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "a text in quotes",
+    "array": "a list",
+    "object": "a table",
+    "null": "nothing",
+}
+_EXPECTED = re.compile(r"Expected (?P<kind>.*?)(?:, got (?P<got>.*))?")
+_PLACE = re.compile(r" - at `\$(?P<place>.*)`$")
+_STEP = re.compile(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]")
+
+
+def typed(document: Any, kind: type[T], name: str = "") -> T:
+    """Return a plain document as a value of a type.
+
+    Lists become tuples and whole numbers become floats where the type says so; nothing else is converted. A table with
+    a key that its dataclass does not have is refused, and so is a number that is not finite or not within 64 bits.
+
+    Args:
+        document: What `json.loads` or `tomllib.loads` returns, or a part of it.
+        kind: Any type that msgspec checks, often a dataclass. `Annotated[int, msgspec.Meta(ge=1)]` states a range.
+        name: What messages call the document, such as the table of a file.
+
+    Raises:
+        ValueError: Says which value must be what, and what it is.
+
+    >>> typed({"low": 1, "high": 2}, dict[str, float])
+    {'low': 1.0, 'high': 2.0}
+    """
+    _require_known(document, kind, name)
+    _require_finite(document, name)
+    try:
+        return msgspec.convert(document, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(_refusal(str(error), document, name)) from error
+
+
+def _require_known(document: Any, kind: Any, name: str) -> None:
+    if not (is_dataclass(kind) and isinstance(document, Mapping)):
+        return
+    hints, known = get_type_hints(kind), [each.name for each in fields(kind) if each.init]
+    for key, value in document.items():
+        if key not in known:
+            raise ValueError(f"{name or 'it'} has no setting {key!r}; it knows {', '.join(sorted(known))}")
+        _require_known(value, hints[key], f"{name}.{key}" if name else key)
+
+
+def _require_finite(document: Any, name: str) -> None:
+    if isinstance(document, int | float):
+        if not abs(document) < 2**63:  # also refuses NaN
+            raise ValueError(f"{name or 'it'} must be a finite number, within 64 bits, got {str(document)[:40]}")
+    elif isinstance(document, Mapping):
+        for key, value in document.items():
+            _require_finite(value, f"{name}.{key}" if name else str(key))
+    elif isinstance(document, list | tuple):
+        for value in document:
+            _require_finite(value, name)
+
+
+def _refusal(said: str, document: Any, name: str) -> str:
+    place = _PLACE.search(said)
+    reason = said[: place.start()] if place else said
+    where = (name + place["place"].replace("[...]", "") if place else name).lstrip(".") or "it"
+    expected = _EXPECTED.fullmatch(reason)
+    if expected is None:  # such as a missing field
+        return f"{where}: {reason[0].lower()}{reason[1:]}"
+    kind = re.sub("`([^`]*)`", _in_words, expected["kind"])
+    return f"{where} must be {kind}, got {_got(document, place['place'] if place else '', expected['got'])}"
+
+
+def _in_words(kinds: re.Match[str]) -> str:
+    return " or ".join(_WORDS.get(kind, kind) for kind in kinds[1].split(" | "))
+
+
+def _got(document: Any, place: str, otherwise: str | None) -> str:
+    for key, number, several in _STEP.findall(place):
+        if several:
+            return otherwise or "another"
+        document = document[key] if key else document[int(number)]
+    return repr(document)[:80]
