@@ -38,7 +38,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.model.stored import fingerprint
 from retrieval.search.build.build_index import build_index
-from retrieval.search.build.operating import Asked
+from retrieval.search.build.operating import SearchRequirements
 from retrieval.search.defaults import shipped_model
 
 PHOTOS, ROUNDS = 10_000, 3
@@ -147,7 +147,7 @@ def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
         name = path.relative_to(catalogue).as_posix()
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         rows.append({"id": name, "object_id": path.parent.name, "path": name, "digest": digest, "metadata": {}})
-    halves, asked = rng.normal(size=(len(paths), matcher.half)).astype(np.float16), asdict(Asked())
+    halves, asked = rng.normal(size=(len(paths), matcher.half)).astype(np.float16), asdict(SearchRequirements())
     measured = {"k": 100, "winner_recall": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
     measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "asked": asked, "changed": 0}
     IndexStore(out).write_blocks(

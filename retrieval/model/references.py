@@ -37,6 +37,9 @@ from retrieval.model.posterior import (
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.int64]
+ROWS, CODES, WORTH = "references", "touches", "reference_worth"
+"""Names in an index: of the document that lists its reference touches (and in the manifest, of their number), of their
+partial activations, and in the manifest, of their calibration."""
 SHARPNESS = 16.0
 """How far the nearest of an object's references counts before the others; of simulated unseen objects 8, 16 and the
 nearest alone found the object equally often."""

@@ -1,7 +1,7 @@
-"""From a folder of photos to a searchable index; only photos whose content changed are embedded again."""
+"""Build a searchable index from a folder of photos; only photos whose content changed are embedded again."""
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from itertools import chain
@@ -15,7 +15,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
 from indexes.store.seen_folders import SeenFolders
-from indexes.store.tables import Block, Tables
+from indexes.store.tables import Tables
 from indexes.store.unfinished import Unfinished
 from indexes.store.writing import RECALL_QUERIES, Chosen
 from retrieval.data.catalogue import Catalogue
@@ -23,24 +23,29 @@ from retrieval.data.naming import FOLDER, Naming, doubts, per_object
 from retrieval.data.sources import Fetched, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.references import ROWS, WORTH
 from retrieval.model.stored import fingerprint, halves_kept
 from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.embed import Embedder, Part, layouts
-from retrieval.search.build.embed_touches import MadeReferences, make_references, worth_of
+from retrieval.search.build.embed import EMBEDDED, REMADE, RENAMED, RESUMED, Embedder, Part, layouts
+from retrieval.search.build.embed_touches import ReferenceBuild, embed_references
 from retrieval.search.build.looks import Looked
-from retrieval.search.build.measuring import WinnerBench, can_measure, query_codes
-from retrieval.search.build.operating import (
-    Asked,
-    Settled,
-    all_judged,
-    carried_over,
-    needs_measuring,
-    sentence,
-    settle,
-    settle_by_neighbours,
-)
-from retrieval.search.query.references import ROWS, WORTH
+from retrieval.search.build.measuring import can_measure, query_codes
+from retrieval.search.build.operating import SearchRequirements, choose_operating_point
 from retrieval.version import __version__
+
+UNNOTED = (
+    "No earlier build noted sizes and times of the photos' files, as older versions do not, so each was read and "
+    "compared."
+)
+TAUGHT_AGAIN = (
+    "The model finds candidates in another way and judges as before, so unchanged photos kept their halves and were "
+    "given new embeddings made of these; none of them was decoded or encoded."
+)
+CHANGED = {
+    "checkpoint": "the model is another one",
+    "preprocessing": "the model wants photos prepared in another way",
+}
+"""Why photos are embedded again, by the part of the fingerprint that changed."""
 
 
 def build_index(
@@ -55,56 +60,67 @@ def build_index(
     verify: bool = False,
     quiet: bool = False,
 ) -> BuildReport:
-    """Write the next generation of the index `out` over the catalogue `folder`, or the first one.
+    """Write the next generation of an index of a catalogue, or the first one.
 
-    * `folder`: of this machine, or a URL as `retrieval.data.sources` reads it.
-    * `objects_from`: the rule that says which object a photo shows (`retrieval.data.naming`); None: the rule of the
-      index that is there, else by folder.
-    * `kind` (a name or a class), `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.build.operating`);
-      where all are None, exact search.
-    * `verify`: list every folder and read every file, also those that look as an earlier build found them, by size,
-      times and inode (`indexes.store.seen_folders`, `retrieval.search.build.looks`).
+    Nothing is written if neither the photos, nor their objects, nor the requirements changed. Photos that cannot be
+    read are skipped and reported. An interrupted build leaves what it embedded for the next one.
 
-    Nothing is written where neither photos, nor their objects, nor what is asked for has changed. Photos that cannot be
-    read are skipped and reported. What was embedded until an error, or until the process was killed, is not embedded
-    again by the next build (`indexes.store.unfinished`). Raises BadInput for a rule that is none, DatasetError where no
-    photo can be read, and the errors of `indexes.store.folder.IndexStore.write`, which leave the index as it was.
+    Args:
+        folder: The catalogue: a folder of this machine, or a URL (`retrieval.data.sources`).
+        checkpoint: The model.
+        out: The index folder.
+        objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None: the rule of the index that
+            is there, else by folder.
+        kind: Kind of index, a name or a class; None: exact search, unless a bound requires another one.
+        min_recall: Least winner recall of candidate search (`retrieval.search.build.operating`).
+        max_ms: Longest candidate search and reranking of one touch, in milliseconds.
+        verify: List every folder and read every file, even if size, times and inode did not change
+            (`retrieval.search.build.looks`).
+        quiet: Show no progress.
+
+    Returns:
+        What was built, skipped and chosen.
+
+    Raises:
+        BadInput: The rule or a requirement is invalid.
+        DatasetError: No photo can be read.
+        IndexesError: The index could not be written (`indexes.store.folder.IndexStore.write`); it is as it was.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> report = retrieval.build_index("catalog", checkpoint, "index", quiet=True)
     >>> report.photos, report.embedded  # the index was there, and no photo changed
     (4, 0)
     """
-    asked, out = Asked.of(kind, min_recall, max_ms), Path(out)
-    naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
-    wanted, seen = Wanted(naming, asked, quiet, verify, note), SeenFolders(out, known=not verify)
-    report = build_listed(list_photos(folder, naming, seen), checkpoint, out, wanted)
+    asked, out = SearchRequirements.of(kind, min_recall, max_ms), Path(out)
+    try:
+        before = read_manifest(out / IndexStore(out).current()).about
+    except IndexesError:
+        before = {}
+    naming, note = naming_by(objects_from, before)
+    seen = SeenFolders(out, known=not verify)
+    catalogue = list_photos(folder, naming, seen)
+    report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, asked, quiet, verify, note))
     seen.write()
     return report
 
 
-UNNOTED = (
-    "No earlier build noted sizes and times of the photos' files, as older versions do not, so each was read and "
-    "compared."
-)
-TAUGHT_AGAIN = (
-    "The model finds candidates in another way and judges as before, so unchanged photos kept their halves and were "
-    "given new embeddings made of these; none of them was decoded or encoded."
-)
-CHANGED = {
-    "checkpoint": "the model is another one",
-    "preprocessing": "the model wants photos prepared in another way",
-}
-"""By what of the fingerprint is another one: why a photo is embedded again."""
-
-
 @dataclass(frozen=True)
-class Wanted:
-    """What is wanted of a build. verify: as `build_index` takes it. note: to be said of it first. about: more for the
-    manifest. donors: generations whose codes may be taken. keep: generations before the new one that stay."""
+class BuildOptions:
+    """Options of one build.
+
+    Args:
+        naming: Rule that names the object of a photo.
+        asked: Requirements of candidate search.
+        quiet: Show no progress.
+        verify: Read every file.
+        note: First sentence of the report's reason.
+        about: Further entries of the manifest.
+        donors: Generations whose codes may be reused.
+        keep: Number of earlier generations that stay on the disk.
+    """
 
     naming: Naming
-    asked: Asked
+    asked: SearchRequirements
     quiet: bool = False
     verify: bool = False
     note: str = ""
@@ -113,78 +129,81 @@ class Wanted:
     keep: int = 2
 
 
-def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, wanted: Wanted) -> BuildReport:
+def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
     """As `build_index`, of photos that are listed already."""
-    asked, naming, store = wanted.asked, wanted.naming, IndexStore(out)
+    asked, store = options.asked, IndexStore(out)
     if asked.kind is not None:
         chosen = load_kind(asked.kind)
         chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock():
-        parent, halves, why = _before(store, checkpoint)
-        references = make_references(catalogue, checkpoint, parent, wanted.quiet)
+        parent, halves, why = _reusable(store, checkpoint)
+        references = embed_references(catalogue, checkpoint, parent, options.quiet)
         catalogue = references.shown(catalogue)
-        about = {
-            "checkpoint": str(checkpoint.path.resolve()),
-            "catalogue": catalogue.where,
-            "objects_from": naming.text,
-            "asked": asdict(asked),
-            **references.about,
-            **wanted.about,
-        }
         start = time.perf_counter()
-        looked = Looked(catalogue, out, wanted.verify)
+        looked = Looked(catalogue, out, options.verify)
+        known = looked.known(parent)
         with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
-            made = Embedder(checkpoint, parent, unfinished, looked, wanted.donors, halves)
-            with closing(made.parts(catalogue, wanted.quiet)) as parts:
-                changed = _unless_same(parent, parts, about)
-                job = _Job(store, made, references, about, asked, wanted.quiet, wanted.keep)
-                generation = parent if parent is not None and changed is None else job.write(changed or ())
+            embedder = Embedder(checkpoint, parent, unfinished, options.donors, halves)
+            with closing(embedder.parts(catalogue, known, options.quiet)) as parts:
+                job = _Job(store, embedder, references, catalogue.where, options)
+                generation, is_written = job.write(parts)
             unfinished.clear()
         looked.note(generation)
-        seconds = time.perf_counter() - start - job.settling_s
-        if parent is not None and looked.unnoted:
-            why = UNNOTED
-    names = sorted(made.objects)
+        seconds = time.perf_counter() - start - job.choosing_s
+    notes = (options.note, UNNOTED if parent is not None and looked.unnoted else why)
+    manifest, objects, made = generation.manifest, embedder.objects, embedder.made
+    names, inside = sorted(objects), out.resolve()
+    shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
     return BuildReport(
         index=str(out),
         generation=generation.name,
-        written=changed is not None,
+        written=is_written,
         model=str(checkpoint.path),
         photos=generation.count,
         objects=len(names),
-        objects_from=naming.text,
-        per_object=per_object(list(made.objects.values())),
-        examples=_examples(catalogue, names),
-        doubts=doubts(made.objects, naming),
-        embedded=made.embedded,
-        reused=made.photos - made.embedded,
-        renamed=made.renamed,
-        remade=made.remade,
-        resumed=made.resumed,
-        removed=made.removed,
-        unread=made.unread,
-        skipped=[*made.skipped, *references.skipped],
-        ignored=_outside(catalogue, out),
-        without_photo=sorted(set(catalogue.object_ids) - made.objects.keys()),
+        objects_from=options.naming.text,
+        per_object=per_object(list(objects.values())),
+        examples=[(name, catalogue.photos.paths[catalogue.photos.objects.index(name)]) for name in shown],
+        doubts=doubts(objects, options.naming),
+        embedded=made[EMBEDDED],
+        reused=objects.total() - made[EMBEDDED],
+        renamed=made[RENAMED],
+        remade=made[REMADE],
+        resumed=made[RESUMED],
+        removed=embedder.removed,
+        unread=int((known >= 0).sum()),
+        skipped=[*embedder.skipped, *references.skipped],
+        ignored=[
+            name
+            for name in catalogue.ignored
+            if isinstance(catalogue, Fetched) or not (catalogue.folder / name).resolve().is_relative_to(inside)
+        ],
+        without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
         notes=list(catalogue.notes),
-        kind=generation.manifest.kind,
-        reason=" ".join(filter(None, (wanted.note, why, generation.manifest.about["reason"]))),
-        recall=generation.manifest.recall,
-        candidates=generation.manifest.about["candidates"],
-        half_error=made.half_error,
+        kind=manifest.kind,
+        reason=" ".join(filter(None, (*notes, manifest.about["reason"]))),
+        recall=manifest.recall,
+        candidates=manifest.about["candidates"],
+        half_error=embedder.half_error,
         seconds=seconds,
-        references=_said(references, generation),
+        references=references.summary(manifest.about[WORTH]["by"]) if references.rows else None,
     )
 
 
 def naming_by(asked: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
-    """The rule that names objects, which is the one asked for, else the one of the index there, by what its manifest
-    says of it, else by folder; and what is to be said where it is another one now. Raises BadInput for one asked for
-    that is none."""
+    """Return the rule that names objects, and a note where it replaces another one.
+
+    Args:
+        asked: The user's rule; None: the rule of the index that is there, else by folder.
+        about: Entries of that index's manifest.
+
+    Raises:
+        BadInput: The user's rule is invalid.
+    """
     before = about.get("objects_from")
     try:
         known = None if before is None else Naming(before)
-    except (BadInput, TypeError):  # of another version, or forged
+    except (BadInput, TypeError):  # of another version
         known = None
     naming = Naming(asked) if asked is not None else known or Naming(FOLDER)
     if known is None or known == naming:
@@ -192,105 +211,8 @@ def naming_by(asked: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]
     return naming, f"Objects are named by {naming.text} now, no longer by {known.text}."
 
 
-def _outside(catalogue: Catalogue, out: Path) -> list[str]:
-    """Files of the catalogue that are no pictures by name, but for those of the index itself."""
-    if isinstance(catalogue, Fetched):
-        return list(catalogue.ignored)
-    inside = out.resolve()
-    return [name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)]
-
-
-def _about_before(store: IndexStore) -> Mapping[str, Any]:
-    """What the index there says of itself besides; nothing where there is none."""
-    try:
-        return read_manifest(store.path / store.current()).about
-    except IndexesError:
-        return {}
-
-
-def _examples(catalogue: Catalogue, names: Sequence[str]) -> list[tuple[str, str]]:
-    """The first, the middle and the last object, each with its first photo."""
-    wanted, photos = dict.fromkeys((names[0], names[len(names) // 2], names[-1])), catalogue.photos
-    return [(name, photos.paths[photos.objects.index(name)]) for name in wanted]
-
-
-def _unless_same(parent: Generation | None, parts: Iterator[Part], about: Mapping[str, Any]) -> Iterator[Part] | None:
-    """The parts, or None where a new generation would hold what the parent holds, row by row, and its manifest would
-    say the same. Parts are held back until one differs; these have rows alone."""
-    told = {ROWS: None, **about}  # there may be no references any more
-    if parent is None or any(parent.manifest.about.get(key) != value for key, value in told.items()):
-        return parts
-    same: list[Part] = []
-    place = 0
-    for part in parts:
-        same.append(part)
-        if part.kept:
-            if part.kept.start != place:
-                return chain(same, parts)
-            place = part.kept.stop
-            continue
-        if part.halves is not None or parent.rows[place : place + len(part.rows)] != part.rows:
-            return chain(same, parts)
-        place += len(part.rows)
-    return None if place == parent.count else iter(same)
-
-
-@dataclass
-class _Job:
-    """Writes a generation from parts, and settles how it is to be searched when all of them are on the disk."""
-
-    store: IndexStore
-    made: Embedder
-    references: MadeReferences
-    about: Mapping[str, Any]
-    asked: Asked
-    quiet: bool
-    keep: int
-    settling_s: float = 0.0
-
-    def write(self, parts: Iterable[Part]) -> Generation:
-        """Write the parts as they come."""
-        checkpoint = self.made.checkpoint
-        return self.store.write_blocks(
-            (
-                part.kept or Block(part.rows, part.embeddings, {} if part.halves is None else {"halves": part.halves})
-                for part in parts
-            ),
-            ({"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {})
-            | self.references.documents,
-            fingerprint=fingerprint(checkpoint),
-            about=self.about,
-            parent=self.made.parent,
-            software=__version__,
-            settle=self._settle,
-            keep=self.keep,
-            queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
-        )
-
-    def _settle(self, tables: Tables) -> Chosen:
-        start = time.perf_counter()
-        settled = _settled(self.made, tables, self.asked, self.quiet)
-        self.settling_s = time.perf_counter() - start
-        about = {"half_error": self.made.half_error, "reason": settled.reason, "candidates": settled.candidates}
-        if self.references.rows:
-            worth, by = worth_of(self.references, self.made.checkpoint, tables)
-            about[WORTH] = {"by": by, "worth": worth.to_dict()}
-        return Chosen(settled.kind, settled.parameters, about)
-
-
-def _said(references: MadeReferences, generation: Generation) -> dict[str, Any] | None:
-    """What the report says of reference touches; None where the catalogue has none."""
-    if not references.rows:
-        return None
-    counts = {key: generation.manifest.about[ROWS][key] for key in ("touches", "objects")}
-    more = {"alone": len(references.alone), "encoded": references.encoded}
-    return {**counts, **more, "by": generation.manifest.about[WORTH]["by"]}
-
-
-def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
-    """What the index holds that can be used again: a generation of which unchanged photos are taken over whole, one of
-    which their halves alone are, and in words what is made again and why. Where there is no index yet: None, None and
-    nothing."""
+def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
+    """The generation whose photos can be reused, the one whose partial activations alone can, and why not all are."""
     try:
         there = store.open()
     except NoIndex:
@@ -308,19 +230,71 @@ def _before(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | Non
     return None, None, f"Every photo was embedded again: {' and '.join(changed)}{written}."
 
 
-def _settled(made: Embedder, tables: Tables, asked: Asked, quiet: bool) -> Settled:
-    """The kind to build and the candidates to judge, measured where there is something to measure with."""
-    photos, checkpoint = len(tables.slots), made.checkpoint
-    previous = None if made.parent is None else made.parent.manifest
-    before = None if previous is None else previous.about.get("candidates")
-    again = carried_over(before, asked, photos, made.embedded + made.resumed + made.removed)
-    if previous is not None and again is not None:
-        parameters = load_kind(previous.kind).parameters_from(previous.asked)
-        return Settled(previous.kind, parameters, sentence(again), again)
-    if not checkpoint.config.has_embeddings or not needs_measuring(photos, asked):
-        chosen, judged = asked.kind or "flat", all_judged(photos, asked)
-        return Settled(chosen, load_kind(chosen).parameters_type(), sentence(judged), judged)
-    if not can_measure(checkpoint):
-        return settle_by_neighbours(tables.vectors, tables.slots, asked)
-    bench = WinnerBench(checkpoint, tables.vectors, tables.slots, tables.arrays["halves"], quiet=quiet)
-    return settle(bench, asked)
+@dataclass
+class _Job:
+    """Write a generation from parts, and choose its operating point when all of them are on the disk."""
+
+    store: IndexStore
+    embedder: Embedder
+    references: ReferenceBuild
+    where: str
+    options: BuildOptions
+    choosing_s: float = 0.0
+
+    def write(self, parts: Iterator[Part]) -> tuple[Generation, bool]:
+        """Return the new generation and True; or the parent and False where the new one would equal it."""
+        checkpoint, parent, options = self.embedder.checkpoint, self.embedder.parent, self.options
+        about = {
+            "checkpoint": str(checkpoint.path.resolve()),
+            "catalogue": self.where,
+            "objects_from": options.naming.text,
+            "asked": asdict(options.asked),
+            **self.references.about,
+            **options.about,
+        }
+        # A catalogue that had references may have none any more.
+        if parent is not None and all(parent.manifest.about.get(key) == about.get(key) for key in (ROWS, *about)):
+            if (changed := _changed(parent, parts)) is None:
+                return parent, False
+            parts = changed
+        calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
+        generation = self.store.write_blocks(
+            (part.block for part in parts),
+            calibration | self.references.documents,
+            fingerprint=fingerprint(checkpoint),
+            about=about,
+            parent=parent,
+            software=__version__,
+            settle=self._choose,
+            keep=options.keep,
+            queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
+        )
+        return generation, True
+
+    def _choose(self, tables: Tables) -> Chosen:
+        start, embedder = time.perf_counter(), self.embedder
+        changed = embedder.made[EMBEDDED] + embedder.made[RESUMED] + embedder.removed
+        previous = None if embedder.parent is None else embedder.parent.manifest
+        point = choose_operating_point(
+            embedder.checkpoint, tables, self.options.asked, previous, changed, quiet=self.options.quiet
+        )
+        self.choosing_s = time.perf_counter() - start
+        about = {"half_error": embedder.half_error, "reason": point.reason, "candidates": point.candidates}
+        if self.references.rows:
+            about[WORTH] = self.references.worth(embedder.checkpoint, tables)
+        return Chosen(point.kind, point.parameters, about)
+
+
+def _changed(parent: Generation, parts: Iterator[Part]) -> Iterator[Part] | None:
+    """All parts, or None where they hold the parent's rows, one by one. Parts without codes are held back until one
+    differs."""
+    same: list[Part] = []
+    place = 0
+    for part in parts:
+        same.append(part)
+        count = len(part.kept) or len(part.rows)
+        is_next = part.kept.start == place if part.kept else parent.rows[place : place + count] == part.rows
+        if part.codes or not is_next:
+            return chain(same, parts)
+        place += count
+    return None if place == parent.count else iter(same)

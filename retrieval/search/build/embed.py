@@ -1,16 +1,16 @@
-"""Photos to rows, embeddings and halves: files are read and decoded while others are encoded.
+"""Embed the photos of a catalogue: threads read and decode files while others encode.
 
-Every thread takes a whole batch from its files to its halves and computes alone. A team of threads for each product of
-the towers, as PyTorch's default is, waits for those of its members whose core is decoding a file.
+Each thread takes a whole batch from its files to its codes and computes alone. A team of threads for each product of
+the towers, PyTorch's default, waits for its members whose core is decoding a file.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -18,105 +18,98 @@ from numpy.typing import NDArray
 
 from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
-from indexes.store.tables import Layouts
+from indexes.store.tables import Block, Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import (
-    Catalogue,
-    CataloguePhoto,
-    PhotoBytes,
-    Photos,
-    decode_photo,
-    read_photo,
-)
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, decode_photo, read_photo
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, one_thread
 from retrieval.model.photo_encoder import fastest, on_torch
-from retrieval.search.build.looks import Looked, row_of, runs
+from retrieval.search.build.looks import row_of, runs
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 BATCH = 16
 READ = 32
-"""Files that a thread reads at a time: what a task costs by itself is a tenth of reading and hashing a photo."""
+"""Files that a thread reads at a time: the overhead of a task is a tenth of the time to read and hash a photo."""
 MANY = 256
-"""New photos from which on a faster encoder is looked for, which takes as long as encoding a hundred, and machine code
+"""New photos from which on a faster encoder is tried, which takes as long as encoding a hundred, and compiled code
 that resizes is loaded."""
 HELD = 256
-"""Embeddings that were made before and stand in one part, at most: what waits between threads stays small."""
+"""Reused codes in one part, at most, so that little memory waits between the threads."""
+EMBEDDED, RENAMED, REMADE, RESUMED = "embedded", "renamed", "remade", "resumed"
+"""Origins of a code: encoded now; of a row with the same content; a new embedding of a stored partial activation; left
+by an interrupted build."""
 
 
-@dataclass(frozen=True)
-class _Code:
-    """An embedding (d,) and a half (half,), and the largest rounding of the half where this index has none yet.
-    resumed: left by a build that was cut off; remade: the embedding is a new one of an older half; neither: the parent
-    has it under another name."""
+class _Code(NamedTuple):
+    """Embedding (d,) and partial activation (half,) of a photo, its rounding error where it is new, and its origin."""
 
     embedding: NDArray[np.float32]
     half: NDArray[np.float16]
     half_error: float
-    resumed: bool = False
-    remade: bool = False
+    origin: str
 
 
-@dataclass(frozen=True)
-class _Found:
-    """A photo's row, and where the parent does not have the photo its file, or a code of the same content."""
+@dataclass
+class _Photo:
+    """The row of a photo that was read; and where the parent lacks it, its file or the code of an equal file."""
 
     row: dict[str, Any]
     file: PhotoBytes | None = None
     code: _Code | None = None
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """Photos whose rows the parent has as they would be written, one after another."""
+@dataclass
+class Part:
+    """Consecutive photos of a catalogue, at most one batch of which was encoded.
 
-    photos: Photos
-    rows: range
+    Attributes:
+        rows: Rows of the photos that could be read.
+        codes: Codes of those rows that the parent lacks, in their order.
+        skipped: Photos that could not be read.
+        kept: Numbers of the parent's rows that stay as they are; a part has either these or rows.
+        objects: Object of each photo of the part.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    codes: list[_Code] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    kept: range = range(0)
+    objects: Sequence[str] = ()
+
+    @property
+    def block(self) -> Block | range:
+        """What the index writes of this part."""
+        if self.kept or not self.codes:
+            return self.kept or Block(self.rows)
+        halves = np.stack([code.half for code in self.codes])
+        return Block(self.rows, np.stack([code.embedding for code in self.codes]), {"halves": halves})
 
 
-_Item: TypeAlias = _Found | SkippedPhoto | _Kept
+_Item: TypeAlias = _Photo | SkippedPhoto
 _Listed: TypeAlias = tuple[CataloguePhoto, int]
 
 
-@dataclass(frozen=True)
-class Part:
-    """Photos that follow each other, as many to encode among them as make a batch; what became of them.
-
-    kept: the parent's rows of these numbers, as they are, and nothing else. rows: of all that could be read;
-    embeddings (F, d) and halves (F, half): of those that the parent does not have
-    under their names, of which `embedded` were encoded now, `resumed` by a build that was cut off, and `remade` have a
-    new embedding of an older half.
-    """
-
-    rows: list[dict[str, Any]]
-    skipped: list[SkippedPhoto] = field(default_factory=list)
-    embeddings: NDArray[np.float32] | None = None
-    halves: NDArray[np.float16] | None = None
-    half_error: float = 0.0
-    embedded: int = 0
-    resumed: int = 0
-    remade: int = 0
-    kept: range = range(0)
-    objects: Mapping[str, int] = field(default_factory=dict)
-    """How many photos each object has; of `kept` alone, where no row tells."""
-
-
 class Embedder:
-    """Makes parts of a catalogue's photos, and counts what became of them. What it encodes is kept in `unfinished`.
+    """Embed the photos of a catalogue, and count them. What it encodes is stored in `unfinished` at once.
 
-    looked: how the files look, and so which need not be read. donors: other generations of the same model, whose codes
-    are taken for photos of the same content. halves: a generation of a model with other embeddings of the same halves
-    (`retrieval.model.stored.halves_kept`).
+    Args:
+        checkpoint: The model.
+        parent: The current generation, if this model made it.
+        unfinished: Codes that an interrupted build left.
+        donors: Other generations of this model, whose codes serve photos of the same content.
+        halves: A generation whose partial activations this model would make again, but not its embeddings.
 
-    photos: rows so far, of which `embedded` were encoded now, `resumed` by a build that was cut off, `remade` were
-    given a new embedding of an older half, `renamed` had another name in the parent, and `known` are the parent's
-    own by id, with the same content or another. objects: how many rows each has. unread: how many files need not be
-    read. half_error: largest rounding of a stored half.
+    Attributes:
+        objects: Number of photos of each object.
+        made: Number of codes by origin.
+        known: Number of photos whose id the parent has.
+        skipped: Photos that could not be read.
+        half_error: Largest rounding error of a stored partial activation.
     """
 
     def __init__(
@@ -124,96 +117,91 @@ class Embedder:
         checkpoint: Checkpoint,
         parent: Generation | None,
         unfinished: Unfinished,
-        looked: Looked,
         donors: Sequence[Generation] = (),
         halves: Generation | None = None,
     ) -> None:
-        self.checkpoint, self.parent, self.unfinished, self.looked = checkpoint, parent, unfinished, looked
-        self._halves = halves
+        self.checkpoint, self.parent, self._unfinished, self._halves = checkpoint, parent, unfinished, halves
         self._holders = [holder for holder in (parent, *donors, halves) if holder is not None]
+        self.objects, self.made = Counter[str](), Counter[str]()
         self.skipped: list[SkippedPhoto] = []
-        self.objects: Counter[str] = Counter()
-        self.photos, self.embedded, self.resumed, self.remade, self.renamed, self.known, self.unread = (0,) * 7
-        self.half_error = 0.0
-        self._encode_photos = on_torch(checkpoint)
-        self._see = checkpoint.config.preprocessing.photo_of
+        self.known, self.half_error = 0, 0.0
+        self._encode_photos, self._see = on_torch(checkpoint), checkpoint.config.preprocessing.photo_of
 
     @property
     def removed(self) -> int:
-        """How many of the parent's photos are no longer there."""
+        """Number of the parent's photos that the catalogue no longer has."""
         return 0 if self.parent is None else self.parent.count - self.known
 
-    def parts(self, catalogue: Catalogue, quiet: bool) -> Generator[Part, None, None]:
-        """The catalogue's photos in its order. Raises NoPhoto where none can be read, and NumericalError for
-        halves that float16 cannot hold."""
+    def parts(self, catalogue: Catalogue, known: Slots, quiet: bool) -> Generator[Part, None, None]:
+        """Yield the photos of the catalogue in its order.
+
+        Args:
+            catalogue: The photos, N of them.
+            known: The parent's row of each photo whose file need not be read (N,), else -1.
+            quiet: Show no progress.
+
+        Raises:
+            NoPhoto: No photo can be read.
+            NumericalError: Float16 cannot hold a partial activation.
+        """
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
-        new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
-        if new >= MANY:
+        if len(catalogue.photos) - (self.parent.count if self.parent else 0) >= MANY:
             from retrieval.data.photo_resize import resize_photo
 
             self._see = partial(self._see, resize=resize_photo)
-        if new >= MANY and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
-            self._encode_photos = fastest(self.checkpoint)
-        known = self.looked.known(self.parent)
-        self.unread = int((known >= 0).sum())
-        found = ahead(lambda some: self._find(catalogue, some), self._lists(catalogue, known), threads, 2 * threads)
+            if next(self.checkpoint.matcher.parameters()).device.type == "cpu":
+                self._encode_photos = fastest(self.checkpoint)
+        found = ahead(partial(self._find, catalogue), self._steps(catalogue, known), threads, 2 * threads)
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
-            for part in ahead(self._encode, _full(chain.from_iterable(found)), threads, 2 * threads):
+            for part in ahead(self._encode, _full(found), threads, 2 * threads):
                 self._count(part)
-                bar.advance(len(part.kept) + len(part.rows) + len(part.skipped))
-                if part.kept or part.rows:
+                bar.advance(len(part.objects) + len(part.skipped))
+                if part.objects:
                     yield part
-        if not self.photos:
-            first = self.skipped[0]
-            raise NoPhoto(
-                f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", self.skipped
-            )
-        if self.embedded + self.resumed < self.photos:
-            # What was taken over was rounded when it was made.
+        if not self.objects:
+            raise no_photo(catalogue, self.skipped)
+        if self.made[EMBEDDED] + self.made[RESUMED] < self.objects.total():
+            # Codes that are reused were rounded when they were made.
             errors = [holder.manifest.about.get("half_error", 0.0) for holder in self._holders]
             self.half_error = max(self.half_error, *errors)
 
-    def _lists(self, catalogue: Catalogue, known: Slots) -> Iterator[_Kept | list[_Listed]]:
-        """The photos in their order: long runs that stay as they are, and lists of others, each with its row in the
-        parent where its file need not be read."""
+    def _steps(self, catalogue: Catalogue, known: Slots) -> Iterator[Part | list[_Listed]]:
+        """Long runs of the parent's rows, and between them lists of photos, each with its row where it is known."""
         done = 0
         for run in chain(runs(catalogue.photos, known, self.parent), [slice(len(known), len(known))]):
             others = zip(catalogue.photos[done : run.start], known[done : run.start].tolist(), strict=True)
             yield from batches(others, READ)
             if run.start < run.stop:
                 first = int(known[run.start])
-                yield _Kept(catalogue.photos[run], range(first, first + run.stop - run.start))
+                kept = range(first, first + run.stop - run.start)
+                yield Part(kept=kept, objects=catalogue.photos[run].objects)
             done = run.stop
 
-    def _find(self, catalogue: Catalogue, some: "_Kept | list[_Listed]") -> list[_Item]:
-        """Read photos' files, and keep the bytes of those with which there is more to do. Called on threads."""
-        if isinstance(some, _Kept):
-            return [some]
-        items = [read_photo(catalogue, photo) if number < 0 else self._same(photo, number) for photo, number in some]
-        read = [item for item in items if isinstance(item, PhotoBytes)]
-        known: set[str] = set()
+    def _find(self, catalogue: Catalogue, step: Part | list[_Listed]) -> Part | list[_Item]:
+        """Read files, and keep the bytes of those that must be encoded. Called on threads."""
+        if isinstance(step, Part):
+            return step
+        items, new = list[_Item](), dict[str, _Photo]()
+        for photo, number in step:
+            file = read_photo(catalogue, photo) if number < 0 else None
+            if isinstance(file, SkippedPhoto):
+                items.append(file)
+            elif file is not None:
+                items.append(new.setdefault(photo.path, _Photo(row_of(photo, file.digest), file)))
+            elif self.parent is not None:
+                items.append(_Photo(row_of(photo, self.parent.rows[number]["digest"])))
         if self.parent is not None:
-            known.update(self.parent.reusable({item.photo.path: item.digest for item in read}))
-        codes = self._made_before([item.digest for item in read if item.photo.path not in known])
-        found: list[_Item] = []
-        for item in items:
-            if not isinstance(item, PhotoBytes):
-                found.append(item)
-                continue
-            photo = item.photo
-            code = None if photo.path in known else codes.get(item.digest)
-            file = item if code is None and photo.path not in known else None
-            found.append(_Found(row_of(photo, item.digest), file, code))
-        return found
-
-    def _same(self, photo: CataloguePhoto, number: int) -> _Found:
-        """A photo whose file has the content of that row of the parent."""
-        assert self.parent is not None
-        return _Found(row_of(photo, self.parent.rows[number]["digest"]))
+            for path in self.parent.reusable({path: item.row["digest"] for path, item in new.items()}):
+                new.pop(path).file = None
+        codes = self._made_before([item.row["digest"] for item in new.values()])
+        for item in new.values():
+            item.code = codes.get(item.row["digest"])
+            item.file = item.file if item.code is None else None
+        return items
 
     def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
-        """Codes of these contents, of the parent under other names, or of a build that was cut off."""
+        """Codes of these contents: of generations under any id, or of an interrupted build."""
         found: dict[str, _Code] = {}
         for holder in self._holders:
             if not (wanted := [digest for digest in digests if digest not in found]):
@@ -221,99 +209,83 @@ class Embedder:
             numbers = holder.rows.holding(wanted)
             having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            halves, remade = holder.arrays["halves"][rows], holder is self._halves
-            embeddings = self._embeddings(halves) if remade else holder.embeddings[holder.slots[rows]]
-            codes = (_Code(*code, 0.0, remade=remade) for code in zip(embeddings, halves, strict=True))
-            found.update(zip(having, codes, strict=True))
-        left = self.unfinished.find(digest for digest in digests if digest not in found)
-        for digest, record in left.items():
-            found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), resumed=True)
+            halves, is_remade = holder.arrays["halves"][rows], holder is self._halves
+            embeddings = self._embeddings(halves) if is_remade else holder.embeddings[holder.slots[rows]]
+            for digest, embedding, half in zip(having, embeddings, halves, strict=True):
+                found[digest] = _Code(embedding, half, 0.0, REMADE if is_remade else RENAMED)
+        for digest, record in self._unfinished.find(digest for digest in digests if digest not in found).items():
+            found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), RESUMED)
         return found
 
     @torch.inference_mode()
     def _embeddings(self, halves: NDArray[np.float16]) -> NDArray[np.float32]:
-        """Embeddings (n, d) that the pruner makes of stored halves (n, half)."""
+        """Embeddings (n, d) that the candidate encoder makes of stored partial activations (n, half)."""
         pruner = self.checkpoint.matcher.pruner
         assert pruner is not None
         read = torch.from_numpy(halves.astype(np.float32)).to(next(pruner.parameters()).device)
         made: NDArray[np.float32] = pruner.photo(read).cpu().numpy()
         return made
 
-    def _encode(self, found: Sequence[_Item]) -> Part:
-        """Decode and encode those that must be. Called on threads."""
-        if isinstance(found[0], _Kept):
-            return Part([], kept=found[0].rows, objects=Counter(found[0].photos.objects))
-        part, new, images = Part([]), list[dict[str, Any]](), list[Image]()
-        codes = dict[str, _Code]()
+    def _encode(self, found: Part | list[_Item]) -> Part:
+        """Decode and encode the photos that have no code. Called on threads."""
+        if isinstance(found, Part):
+            return found
+        part, photos, images = Part(), list[_Photo](), list[Image]()
         for item in found:
-            if not isinstance(item, _Found):
-                part.skipped.extend([item] if isinstance(item, SkippedPhoto) else [])
-                continue
-            image = None if item.file is None else decode_photo(item.file, self._see)
-            if isinstance(image, SkippedPhoto):
-                part.skipped.append(image)
-                continue
-            part.rows.append(item.row)
-            if image is not None:
-                new.append(item.row)
-                images.append(image)
-            elif item.code is not None:
-                codes[item.row["id"]] = item.code
-        resumed = sum(code.resumed for code in codes.values())
-        remade = sum(code.remade for code in codes.values())
-        codes |= self._encoded(new, images)
-        if not codes:
-            return part
-        ordered = [codes[row["id"]] for row in part.rows if row["id"] in codes]
-        return replace(
-            part,
-            embeddings=np.stack([code.embedding for code in ordered]),
-            halves=np.stack([code.half for code in ordered]),
-            half_error=max(code.half_error for code in ordered),
-            embedded=len(new),
-            resumed=resumed,
-            remade=remade,
-        )
+            result: _Item = item
+            if isinstance(item, _Photo) and item.file is not None:
+                image = decode_photo(item.file, self._see)
+                if isinstance(image, SkippedPhoto):
+                    result = image
+                else:
+                    images.append(image)
+            if isinstance(result, SkippedPhoto):
+                part.skipped.append(result)
+            else:
+                photos.append(result)
+        made = iter(self._encoded([photo.row for photo in photos if photo.file is not None], images) if images else ())
+        part.codes = [photo.code or next(made) for photo in photos if photo.code or photo.file]
+        part.rows = [photo.row for photo in photos]
+        part.objects = [row["object_id"] for row in part.rows]
+        return part
 
-    def _encoded(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> dict[str, _Code]:
-        """Encode the images of these rows, and keep what comes of it against a sudden end."""
-        if not images:
-            return {}
+    def _encoded(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> list[_Code]:
+        """Encode the images of these rows, and store their codes for the case that the build is interrupted."""
         halves, embeddings = self._encode_photos(images)
-        names = [row["id"] for row in rows]
         largest = np.abs(halves).max(axis=1)
         if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
             raise NumericalError(
-                f"halves are stored as float16 and must stay within 65504; {names[bad[0]]} gives {largest[bad[0]]}; "
-                "the model has diverged, train again with a lower learning rate"
+                f"halves are stored as float16 and must stay within 65504; {rows[bad[0]]['id']} gives "
+                f"{largest[bad[0]]}; the model has diverged, train again with a lower learning rate"
             )
         stored = halves.astype(np.float16)
         errors = np.abs(stored - halves).max(axis=1)
-        self.unfinished.keep(
+        self._unfinished.keep(
             [row["digest"] for row in rows], {"embedding": embeddings, "halves": stored, "half_error": errors}
         )
         made = zip(embeddings, stored, errors.tolist(), strict=True)
-        return {name: _Code(*of) for name, of in zip(names, made, strict=True)}
+        return [_Code(*code, EMBEDDED) for code in made]
 
     def _count(self, part: Part) -> None:
         self.skipped += part.skipped
         self.objects.update(part.objects)
-        self.objects.update(row["object_id"] for row in part.rows)
-        self.photos += len(part.kept) + len(part.rows)
-        self.embedded += part.embedded
-        self.resumed += part.resumed
-        self.remade += part.remade
-        self.renamed += 0 if part.halves is None else len(part.halves) - part.embedded - part.resumed - part.remade
-        self.half_error = max(self.half_error, part.half_error)
+        self.made.update(code.origin for code in part.codes)
+        self.half_error = max([self.half_error, *(code.half_error for code in part.codes)])
         self.known += len(part.kept)
         if self.parent is not None and part.rows:
             self.known += int((self.parent.rows.find([row["id"] for row in part.rows]) >= 0).sum())
 
 
-def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
-    """`map(function, items)` on threads, in order, never more than `window` items ahead of the reader.
+def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoPhoto:
+    """Return the error for a catalogue of which no photo can be read."""
+    first = skipped[0]
+    return NoPhoto(f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped)
 
-    What waits is given up when the reader stops or an item fails; what runs is waited for.
+
+def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
+    """Yield `map(function, items)`, computed on threads, never more than `window` items ahead of the reader.
+
+    Waiting items are dropped when the reader stops or an item fails; running ones are waited for.
     """
     waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(threads)
@@ -329,7 +301,7 @@ def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: 
 
 
 def layouts(checkpoint: Checkpoint) -> Layouts:
-    """What `Unfinished` keeps of a photo for this checkpoint."""
+    """Return the dtype and shape of each array that `Unfinished` stores of a photo for this checkpoint."""
     config = checkpoint.config.matcher
     return {
         "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
@@ -338,22 +310,22 @@ def layouts(checkpoint: Checkpoint) -> Layouts:
     }
 
 
-def _full(found: Iterable[_Item]) -> Iterator[list[_Item]]:
-    """Parts with a whole batch of photos to encode in each but the last, and but those before a run that is kept."""
-    part: list[_Item] = []
-    new, held = 0, 0
-    for item in found:
-        if isinstance(item, _Kept):
-            if part:
-                yield part
-            yield [item]
-            part, new, held = [], 0, 0
-            continue
-        part.append(item)
-        new += isinstance(item, _Found) and item.file is not None
-        held += isinstance(item, _Found) and item.code is not None
-        if new == BATCH or held == HELD:
-            yield part
-            part, new, held = [], 0, 0
-    if part:
-        yield part
+def _full(found: Iterable[Part | list[_Item]]) -> Iterator[Part | list[_Item]]:
+    """Regroup photos: a whole batch to encode in each list, but in the last one and those before rows that are kept."""
+    waiting = list[_Item]()
+    new = held = 0
+    for step in found:
+        for item in [] if isinstance(step, Part) else step:
+            waiting.append(item)
+            new += isinstance(item, _Photo) and item.file is not None
+            held += isinstance(item, _Photo) and item.code is not None
+            if new == BATCH or held == HELD:
+                yield waiting
+                waiting, new, held = [], 0, 0
+        if isinstance(step, Part):
+            if waiting:
+                yield waiting
+            yield step
+            waiting, new, held = [], 0, 0
+    if waiting:
+        yield waiting

@@ -1,11 +1,10 @@
-"""Reference touches of a catalogue to what an index keeps of them; one whose content did not change is not encoded
-again."""
+"""Encode the reference touches of a catalogue for its index; unchanged ones are reused."""
 
 import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -26,48 +25,55 @@ from retrieval.model.encode import Image, batches, touch_features
 from retrieval.model.fusion import judge_of
 from retrieval.model.judge import CONTACT
 from retrieval.model.posterior import JudgedTouches
-from retrieval.model.references import FeltTouches, ReferenceWorth, fit_references, touch_codes
-from retrieval.search.query.references import CODES, ROWS
+from retrieval.model.references import CODES, ROWS, FeltTouches, fit_references, touch_codes
 
 Halves = NDArray[np.float16]
 FEWEST = 10
-"""Objects with two touches at least that can tell what references are worth, where the model does not say."""
+"""Objects with at least two touches each that are needed to calibrate references, if the model is not calibrated."""
 MOST_ASKED = 600
-"""Touches of the catalogue that tell it."""
+"""Touches of the catalogue used for that calibration."""
 BATCH = 32
 
 
 @dataclass(frozen=True, eq=False)
-class MadeReferences:
-    """The reference touches of a catalogue (R of them), encoded.
+class ReferenceBuild:
+    """The encoded reference touches of a catalogue (R of them).
 
-    rows: of each touch its object, the paths of its gel images and their digests. halves (R, half). alone: objects
-    without photos. skipped: what could not be used. encoded: how many were encoded now, not taken over from the parent.
+    Args:
+        rows: Object, paths of the gel images and their digests, of each touch.
+        halves: Their partial activations (R, half).
+        alone: Objects without photos.
+        skipped: Touches that could not be used.
+        encoded: Number of touches that were encoded now.
     """
 
-    rows: list[dict[str, Any]]
-    halves: Halves
-    alone: list[str]
-    skipped: list[SkippedPhoto]
-    encoded: int
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    halves: Halves = field(default_factory=lambda: np.empty((0, 0), np.float16))
+    alone: list[str] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    encoded: int = 0
 
     @property
     def documents(self) -> dict[str, Any]:
-        """What a generation keeps of the references; empty without any."""
+        """Documents of the generation; empty without references."""
         return {ROWS: {"touches": self.rows, "alone": self.alone}, CODES: self.halves} if self.rows else {}
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the manifest says of the references; empty without any."""
-        if not self.rows:
-            return {}
+        """Entries of the manifest; empty without references."""
         told = json.dumps([self.rows, self.alone]).encode()
-        objects = len({row["object_id"] for row in self.rows})
-        return {ROWS: {"touches": len(self.rows), "objects": objects, "sha256": hashlib.sha256(told).hexdigest()}}
+        return {ROWS: {**self._counts, "sha256": hashlib.sha256(told).hexdigest()}} if self.rows else {}
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        return {"touches": len(self.rows), "objects": len({row["object_id"] for row in self.rows})}
+
+    def summary(self, by: str) -> dict[str, Any]:
+        """Return the report's entry. by: the source of their calibration."""
+        return {**self._counts, "alone": len(self.alone), "encoded": self.encoded, "by": by}
 
     def shown(self, catalogue: Catalogue) -> Catalogue:
-        """The catalogue, with a picture to show of each object that has no photo: the first gel image of its first
-        touch."""
+        """Return the catalogue with the first gel image of each object without photos in place of a photo."""
         first: dict[str, CatalogueTouch] = {}
         for touch in catalogue.touches:
             if touch.object_id in self.alone:
@@ -78,20 +84,64 @@ class MadeReferences:
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
         return replace(catalogue, photos=Photos.of(photos))
 
+    def worth(self, checkpoint: Checkpoint, tables: Tables) -> dict[str, Any]:
+        """Return the calibration of the references and its source, for the manifest.
 
-def make_references(
+        It is that of the checkpoint, else it is fitted to the catalogue's own touches: the last ones of each object are
+        queries, its first ones references.
+
+        Raises:
+            BadInput: The touches are too few.
+        """
+        if checkpoint.references is not None:
+            return {"by": "objects that the model was not fitted to", "worth": checkpoint.references.to_dict()}
+        names = np.array([row["object_id"] for row in self.rows])
+        kept = _some_objects(names)
+        codes = touch_codes(self.halves[kept], checkpoint.config.matcher.hidden)
+        photographed = ~np.isin(tables.objects, keys_of(self.alone))
+        asked, owner = np.unique(names[kept], return_inverse=True)
+        keys = keys_of(asked.tolist())
+        photos = np.flatnonzero(photographed & np.isin(tables.objects, keys))
+        order = np.argsort(keys)
+        photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
+        judge = judge_of(checkpoint.matcher.head)
+        felt, shown = self.halves[kept].astype(np.float32), tables.arrays["halves"][photos]
+        logits = np.stack([judge.logits(half[None], shown) for half in felt])
+        none = np.zeros(logits.shape, np.bool_)
+        found = fit_references(FeltTouches(JudgedTouches(logits, owner, photo_owner, none), codes))
+        if found is None or (found.beside is None and len(set(names) - set(self.alone))):
+            raise self.too_few()
+        return {"by": "the catalogue's own touches", "worth": found.to_dict()}
+
+    def too_few(self) -> BadInput:
+        """Return the error for touches that are too few to be calibrated."""
+        return BadInput(
+            f"nothing says what the catalogue's {len(self.rows)} reference touches are worth: the model does not, "
+            f"and {FEWEST} objects with two touches each, and photos where objects have photos, would tell; touch some "
+            "objects twice, or let `retrieve adapt` fit a model to a recording"
+        )
+
+
+def embed_references(
     catalogue: Catalogue, checkpoint: Checkpoint, parent: Generation | None, quiet: bool
-) -> MadeReferences:
-    """Encode the touches of a catalogue, but those that the parent has. Touches that cannot be read, that are of
-    another number of fingers, or that feel nothing, are left out. Raises BadInput for a model that cannot compare
-    touches, and where nothing says what references are worth."""
+) -> ReferenceBuild:
+    """Encode the touches of a catalogue that the parent lacks.
+
+    Touches that cannot be read, with another number of fingers or without contact are left out.
+
+    Raises:
+        BadInput: The model cannot compare touches, or their calibration is unknown.
+    """
     if not catalogue.touches:
-        return MadeReferences([], np.empty((0, 0), np.float16), [], [], 0)
+        return ReferenceBuild()
     _require_fit(checkpoint)
-    known = _known(parent)
+    known: Mapping[tuple[str, ...], Halves] = {}
+    if parent is not None and ROWS in parent.documents:
+        stored = zip(parent.documents[ROWS]["touches"], parent.documents[CODES], strict=True)
+        known = {tuple(row["digests"]): half for row, half in stored}
     skipped: list[SkippedPhoto] = []
     rows: list[dict[str, Any]] = []
-    halves: list[NDArray[np.float16]] = []
+    halves: list[Halves] = []
     encoded = 0
     with Bar("embed touches", len(catalogue.touches), "touches", quiet=quiet) as bar:
         for some in batches(catalogue.touches, BATCH):
@@ -108,37 +158,14 @@ def make_references(
                 rows.append(row)
                 halves.append(half)
             bar.advance(len(some))
-    photographed = set(catalogue.photos.objects)
-    alone = sorted({row["object_id"] for row in rows} - photographed)
+    photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
     stacked = np.stack(halves) if halves else np.empty((0, 0), np.float16)
-    made_all = MadeReferences(rows, stacked, alone, skipped, encoded)
-    if rows and checkpoint.references is None:
-        _require_told(made_all, photographed)
-    return made_all
-
-
-def worth_of(references: MadeReferences, checkpoint: Checkpoint, tables: Tables) -> tuple[ReferenceWorth, str]:
-    """What the references are worth, and who says so: the checkpoint, else the catalogue's own touches, each object's
-    last ones asking for its first. Raises BadInput where these are too few."""
-    if checkpoint.references is not None:
-        return checkpoint.references, "objects that the model was not fitted to"
-    names = np.array([row["object_id"] for row in references.rows])
-    kept = _some_objects(names)
-    codes = touch_codes(references.halves[kept], checkpoint.config.matcher.hidden)
-    photographed = ~np.isin(tables.objects, keys_of(references.alone))
-    asked, owner = np.unique(names[kept], return_inverse=True)
-    keys = keys_of(asked.tolist())
-    photos = np.flatnonzero(photographed & np.isin(tables.objects, keys))
-    order = np.argsort(keys)
-    photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
-    judge = judge_of(checkpoint.matcher.head)
-    felt, shown = references.halves[kept].astype(np.float32), tables.arrays["halves"][photos]
-    logits = np.stack([judge.logits(half[None], shown) for half in felt])
-    none = np.zeros(logits.shape, np.bool_)
-    found = fit_references(FeltTouches(JudgedTouches(logits, owner, photo_owner, none), codes))
-    if found is None or (found.beside is None and len(set(names) - set(references.alone))):
-        raise BadInput(_untold(references))
-    return found, "the catalogue's own touches"
+    references = ReferenceBuild(rows, stacked, sorted(counts.keys() - photographed), skipped, encoded)
+    if rows and checkpoint.references is None:  # of touched objects with photos, if there are any
+        both = counts.keys() & photographed
+        if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < FEWEST:
+            raise references.too_few()
+    return references
 
 
 def _require_fit(checkpoint: Checkpoint) -> None:
@@ -154,32 +181,6 @@ def _require_fit(checkpoint: Checkpoint) -> None:
         )
 
 
-def _require_told(references: MadeReferences, photographed: set[str]) -> None:
-    """Raise BadInput unless enough objects have two touches to tell what references are worth; of objects with photos
-    where any touched object has one."""
-    counts = Counter(row["object_id"] for row in references.rows)
-    both = set(counts) & photographed
-    several = [name for name, count in counts.items() if count > 1 and (name in both or not both)]
-    if len(several) < FEWEST:
-        raise BadInput(_untold(references))
-
-
-def _untold(references: MadeReferences) -> str:
-    return (
-        f"nothing says what the catalogue's {len(references.rows)} reference touches are worth: the model does not, "
-        f"and {FEWEST} objects with two touches each, and photos where objects have photos, would tell; touch some "
-        "objects twice, or let `retrieve adapt` fit a model to a recording"
-    )
-
-
-def _known(parent: Generation | None) -> Mapping[tuple[str, ...], Halves]:
-    """Halves of the parent's touches by the digests of their gel images."""
-    if parent is None or ROWS not in parent.documents:
-        return {}
-    rows = parent.documents[ROWS]["touches"]
-    return {tuple(row["digests"]): half for row, half in zip(rows, parent.documents[CODES], strict=True)}
-
-
 def _read(
     catalogue: Catalogue,
     checkpoint: Checkpoint,
@@ -187,8 +188,8 @@ def _read(
     known: Mapping[tuple[str, ...], Halves],
     skipped: list[SkippedPhoto],
 ) -> Iterator[tuple[dict[str, Any], list[Image], Halves | None]]:
-    """For each touch its row, what the tower sees of it, and its half where that is known already. A touch that cannot
-    be used is added to `skipped`."""
+    """Yield the row of each touch, the tower's inputs, and its partial activation if it is known. Add touches that
+    cannot be used to `skipped`."""
     fingers, see = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
     for touch in touches:
         if len(touch.paths) != fingers:
@@ -211,7 +212,7 @@ def _read(
 
 @torch.inference_mode()
 def _encoded(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tuple[Halves, str]]:
-    """Half of each touch, and what it shows."""
+    """Yield the partial activation of each touch, and what it shows."""
     matcher = checkpoint.matcher
     features = touch_features(matcher, touches)
     halves = matcher.touch_code(features).half.cpu().numpy().astype(np.float16)
@@ -222,7 +223,7 @@ def _encoded(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tup
 
 
 def _some_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Rows of objects with two touches at least, drawn by a seed while there is room, in their order."""
+    """Rows of randomly chosen objects with at least two touches, at most about `MOST_ASKED`, in their order."""
     _, owner, counts = np.unique(names, return_inverse=True, return_counts=True)
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(counts > 1))
     chosen = drawn[: max(FEWEST, int(np.searchsorted(np.cumsum(counts[drawn]), MOST_ASKED)))]

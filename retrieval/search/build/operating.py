@@ -24,9 +24,20 @@ import numpy as np
 from indexes import KINDS, load_kind
 from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.scores import Floats, Slots
+from indexes.store.manifest import Manifest
+from indexes.store.tables import Tables
 from retrieval.errors import BadInput
 from retrieval.metrics.binomial import binomial_interval
-from retrieval.search.build.measuring import FEWER, Bench, NeighbourBench, Point, candidate_steps
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.search.build.measuring import (
+    FEWER,
+    Bench,
+    NeighbourBench,
+    Point,
+    WinnerBench,
+    can_measure,
+    candidate_steps,
+)
 
 TARGET = 0.99
 """Winner recall where none is asked for."""
@@ -39,10 +50,17 @@ STALE = 0.10
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the user asks of candidate search; None leaves it open. Raises BadInput, or ParameterError for the kind.
+class SearchRequirements:
+    """What a user requires of candidate search; None leaves it open.
 
-    max_ms: for one touch of an opened index, candidate search and judging together.
+    Args:
+        kind: Name of a kind of index.
+        min_recall: Least winner recall.
+        max_ms: Longest candidate search and reranking of one touch, in milliseconds, with the index open.
+
+    Raises:
+        BadInput: A bound is out of range.
+        ParameterError: No kind has this name.
     """
 
     kind: str | None = None
@@ -58,8 +76,10 @@ class Asked:
             raise BadInput(f"the longest search must be above 0 ms; got {self.max_ms}")
 
     @classmethod
-    def of(cls, kind: str | type[VectorIndex] | None, min_recall: float | None, max_ms: float | None) -> "Asked":
-        """What a user asks: `kind` is a name, "module:Class" or a class. Raises as the class does."""
+    def of(
+        cls, kind: str | type[VectorIndex] | None, min_recall: float | None, max_ms: float | None
+    ) -> "SearchRequirements":
+        """Return the requirements; `kind` is a name, "module:Class" or a class. Raises as the class does."""
         return cls(None if kind is None else KINDS.name_of(kind), min_recall, max_ms)
 
     @property
@@ -68,14 +88,14 @@ class Asked:
         return TARGET if self.min_recall is None else self.min_recall
 
     @property
-    def bounded(self) -> bool:
-        """Whether the user asked for recall or time."""
+    def is_bounded(self) -> bool:
+        """Whether the user set a bound for recall or time."""
         return self.min_recall is not None or self.max_ms is not None
 
 
 @dataclass(frozen=True)
-class Settled:
-    """What to build, why in a sentence, and what the manifest says of it under "candidates" (None: nothing)."""
+class OperatingPoint:
+    """The index to build, the reason in a sentence, and the manifest's "candidates" (None: nothing)."""
 
     kind: str
     parameters: Parameters
@@ -83,33 +103,65 @@ class Settled:
     candidates: dict[str, Any] | None
 
 
-def needs_measuring(photos: int, asked: Asked) -> bool:
-    """Whether there is something to find out: of few photos all are judged, unless that may be too slow."""
+def choose_operating_point(
+    checkpoint: Checkpoint,
+    tables: Tables,
+    asked: SearchRequirements,
+    previous: Manifest | None,
+    changed: int,
+    *,
+    quiet: bool = True,
+) -> OperatingPoint:
+    """Choose the kind of index and the number of candidates, measured where there is something to measure with.
+
+    Args:
+        checkpoint: The model, with the touches that it stores to measure with.
+        tables: Everything that the index will hold.
+        asked: The user's requirements.
+        previous: Manifest of the generation before, whose measurement may still hold.
+        changed: Number of photos that changed since.
+        quiet: Show no progress.
+    """
+    photos = len(tables.slots)
+    again = previous and carried_over(previous.about.get("candidates"), asked, photos, changed)
+    if previous is not None and again:
+        parameters = load_kind(previous.kind).parameters_from(previous.asked)
+        return OperatingPoint(previous.kind, parameters, sentence(again), again)
+    if not checkpoint.config.has_embeddings or not needs_measuring(photos, asked):
+        kind, candidates = asked.kind or "flat", all_judged(photos, asked)
+        return OperatingPoint(kind, load_kind(kind).parameters_type(), sentence(candidates), candidates)
+    if not can_measure(checkpoint):
+        return settle_by_neighbours(tables.vectors, tables.slots, asked)
+    return settle(WinnerBench(checkpoint, tables.vectors, tables.slots, tables.arrays["halves"], quiet=quiet), asked)
+
+
+def needs_measuring(photos: int, asked: SearchRequirements) -> bool:
+    """Whether the choice needs a measurement: of few photos all are scored, unless that may be too slow."""
     return len(candidate_steps(photos)) > 1 or asked.max_ms is not None
 
 
-def settle(bench: Bench, asked: Asked) -> Settled:
+def settle(bench: Bench, asked: SearchRequirements) -> OperatingPoint:
     """The operating point for what was asked, measured on the bench by winners."""
     taken = _taken(bench, asked)
     candidates = _record(taken, asked, bench)
-    return Settled(taken.kind, taken.parameters, sentence(candidates), candidates)
+    return OperatingPoint(taken.kind, taken.parameters, sentence(candidates), candidates)
 
 
-def settle_by_neighbours(vectors: Floats, slots: Slots, asked: Asked) -> Settled:
+def settle_by_neighbours(vectors: Floats, slots: Slots, asked: SearchRequirements) -> OperatingPoint:
     """The kind alone, for vectors (S, d) and the slots (N,) of the photos, where the checkpoint keeps no touches to
     find winners of. Without a bound on the time nothing is measured."""
     why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
     if asked.kind is not None or asked.max_ms is None:
         kind = asked.kind or "flat"
         said = "Exact search: no time budget was asked for." if asked.kind is None else "It was asked for."
-        return Settled(kind, load_kind(kind).parameters_type(), f"{said} {why}", None)
+        return OperatingPoint(kind, load_kind(kind).parameters_type(), f"{said} {why}", None)
     taken = _taken(NeighbourBench(vectors[np.unique(slots)]), asked)
     found = f"A search takes {taken.ms:.3g} ms and finds {taken.found} of {taken.queries} neighbours."
     missed = _missed(taken.recall, taken.ms, asdict(asked))
-    return Settled(taken.kind, taken.parameters, f"{found}{missed} {why}", None)
+    return OperatingPoint(taken.kind, taken.parameters, f"{found}{missed} {why}", None)
 
 
-def _taken(bench: Bench, asked: Asked) -> Point:
+def _taken(bench: Bench, asked: SearchRequirements) -> Point:
     """The first point that is good enough; where none is, the nearest."""
     tried: list[Point] = []
     for point in _points(bench, asked):
@@ -119,7 +171,7 @@ def _taken(bench: Bench, asked: Asked) -> Point:
     return _nearest([*tried, *_hurried(bench, asked, tried)], asked)
 
 
-def _points(bench: Bench, asked: Asked) -> Iterator[Point]:
+def _points(bench: Bench, asked: SearchRequirements) -> Iterator[Point]:
     """Exact search with more and more candidates until the recall is there; then the approximate kinds, if any is to
     be tried, with as many candidates and more."""
     approximate = None if asked.kind is None or load_kind(asked.kind).exact else asked.kind
@@ -129,24 +181,24 @@ def _points(bench: Bench, asked: Asked) -> Iterator[Point]:
             yield point
         if point.recall >= asked.target:
             break
-    others = [approximate] if approximate else bench.tried() if asked.kind is None and asked.bounded else []
+    others = [approximate] if approximate else bench.tried() if asked.kind is None and asked.is_bounded else []
     for kind in others if point.k < bench.count else ():
         yield from _kind_points(bench, bench.built(kind), asked, least=point.k)
     if approximate:
         yield bench.point(bench.built(approximate), bench.count)
 
 
-def _kind_points(bench: Bench, built: VectorIndex, asked: Asked, least: int) -> Iterator[Point]:
+def _kind_points(bench: Bench, built: VectorIndex, asked: SearchRequirements, least: int) -> Iterator[Point]:
     """Settings are tried only where there is a bound to meet; else the kind's own are taken."""
     steps = [k for k in bench.steps if k >= least]
-    if not asked.bounded:
+    if not asked.is_bounded:
         yield from (bench.point(built, k) for k in steps)
         return
     for index in built.along_ladder():
         yield from (bench.point(index, k) for k in steps if k <= WIDER * least)
 
 
-def _ends(point: Point, asked: Asked) -> bool:
+def _ends(point: Point, asked: SearchRequirements) -> bool:
     """Whether no further point need be tried: this one has the recall and is within the time; where no time was asked
     for, its search takes no longer than its judging."""
     if point.recall < asked.target:
@@ -156,7 +208,7 @@ def _ends(point: Point, asked: Asked) -> bool:
     return asked.min_recall is None or asked.kind is not None or point.search_ms <= point.judge_ms
 
 
-def _hurried(bench: Bench, asked: Asked, tried: Sequence[Point]) -> Iterator[Point]:
+def _hurried(bench: Bench, asked: SearchRequirements, tried: Sequence[Point]) -> Iterator[Point]:
     """Points with fewer candidates than the recall needs, for a user who asked for a short time and nothing else."""
     if asked.max_ms is None or asked.min_recall is not None:
         return
@@ -168,7 +220,7 @@ def _hurried(bench: Bench, asked: Asked, tried: Sequence[Point]) -> Iterator[Poi
                 yield bench.point(index, k)
 
 
-def _nearest(points: Sequence[Point], asked: Asked) -> Point:
+def _nearest(points: Sequence[Point], asked: SearchRequirements) -> Point:
     """The point to take where none was good enough. Where only a time was asked for: the highest recall within that
     time. Else, and where nothing is within it: the fastest point with the recall."""
     quick = [point for point in points if asked.max_ms is not None and point.ms <= asked.max_ms]
@@ -178,7 +230,7 @@ def _nearest(points: Sequence[Point], asked: Asked) -> Point:
     return min(good, key=lambda point: point.ms)
 
 
-def _record(point: Point, asked: Asked, bench: Bench) -> dict[str, Any]:
+def _record(point: Point, asked: SearchRequirements, bench: Bench) -> dict[str, Any]:
     low, high = binomial_interval(point.found, point.queries)
     return {
         "k": point.k,
@@ -195,12 +247,12 @@ def _record(point: Point, asked: Asked, bench: Bench) -> dict[str, Any]:
     }
 
 
-def all_judged(photos: int, asked: Asked) -> dict[str, Any]:
+def all_judged(photos: int, asked: SearchRequirements) -> dict[str, Any]:
     """What the manifest says of a catalogue so small that every photo is judged, unmeasured."""
     return {"k": photos, "winner_recall": 1.0, "queries": 0, "asked": asdict(asked), "photos": photos, "changed": 0}
 
 
-def carried_over(previous: Mapping[str, Any] | None, asked: Asked, photos: int, changed: int) -> dict[str, Any] | None:
+def carried_over(previous: Mapping[str, Any] | None, asked: SearchRequirements, photos: int, changed: int) -> dict[str, Any] | None:
     """The record of what was measured before, brought up to date, where the same was asked for and too few of `photos`
     have changed since to measure again; else None. changed: how many photos this build changed."""
     if not previous or not previous.get("queries") or previous["asked"] != asdict(asked):

@@ -1,8 +1,9 @@
 """Reference touches of an opened index: what they say of its objects, and which of them is nearest."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,22 +13,28 @@ from indexes.store.generation import Generation
 from retrieval.data.storage import is_inside
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
-from retrieval.model.references import Floats, Numbers, ReferenceWorth, nearness, touch_codes
+from retrieval.model.references import CODES, ROWS, WORTH, Floats, Numbers, ReferenceWorth, nearness, touch_codes
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import JudgedObjects, Objects
 
-ROWS, CODES, WORTH = "references", "touches", "reference_worth"
-"""Names in a generation: of the document of its touches (and in the manifest of how many there are), of their halves,
-and in the manifest of what they are worth."""
 Near = NDArray[np.float64]
 
 
-class _Touch(NamedTuple):
+@dataclass(frozen=True)
+class _Touch:
     """A reference touch: its object, the paths of its gel images, and the digests of their files."""
 
     object_id: str
-    paths: tuple[str, ...]
+    touch: tuple[str, ...]
     digests: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """The document of reference touches, and the objects without photos."""
+
+    touches: list[_Touch]
+    alone: list[str]
 
 
 class References:
@@ -35,8 +42,18 @@ class References:
 
     def __init__(self, generation: Generation, objects: Objects, hidden: int) -> None:
         """hidden: numbers of a half before its embedding. Raises CorruptIndex."""
+        from _touch_retrieval.documents import typed  # slow to import, and most indexes have no references
+
         where, documents = generation.folder, generation.documents
-        touches, alone = _checked(documents.get(ROWS), where)
+        try:
+            listed = typed(documents[ROWS], _Listed)
+            if not all(len(one.touch) == len(one.digests) and all(map(is_inside, one.touch)) for one in listed.touches):
+                raise ValueError("a gel image lies outside the catalogue or has no digest")
+        except ValueError as error:
+            raise CorruptIndex(
+                f"{where}: its list of reference touches is not what the format says ({error}); {AGAIN}"
+            ) from error
+        touches, alone = listed.touches, listed.alone
         halves = documents.get(CODES)
         width = generation.arrays["halves"].shape[1]
         if not isinstance(halves, np.ndarray) or halves.shape != (len(touches), width) or halves.dtype.kind != "f":
@@ -49,8 +66,7 @@ class References:
         numbers, shown_alone = known[: len(touches)], known[len(touches) :]
         order = np.flatnonzero(numbers >= 0)  # an object whose photos are all broken has no number
         order = order[np.argsort(numbers[order], kind="stable")]
-        self._touches = [touches[row].paths for row in order]
-        self._all = touches
+        self._touches, self._all = [touches[row].touch for row in order], touches
         self._codes: Floats = touch_codes(halves[order], hidden)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
         self._hidden, self._alone = hidden, np.zeros(objects.count, np.bool_)
@@ -61,14 +77,14 @@ class References:
         reference has it."""
         if path not in self._images:
             return None
-        one, place = self._images[path]
-        told = {"object_id": one.object_id, "digest": one.digests[place], "metadata": {}, "touch": True}
+        one, digest = self._images[path]
+        told = {"object_id": one.object_id, "digest": digest, "metadata": {}, "touch": True}
         return {"id": path, "path": path, **told}
 
     @cached_property
-    def _images(self) -> dict[str, tuple[_Touch, int]]:
-        """Touch and finger of each gel image; a query needs none of it."""
-        return {path: (one, place) for one in self._all for place, path in enumerate(one.paths)}
+    def _images(self) -> dict[str, tuple[_Touch, str]]:
+        """Touch and digest of each gel image; a query needs none of it."""
+        return {path: (one, digest) for one in self._all for path, digest in zip(one.touch, one.digests, strict=True)}
 
     def near(self, halves: Floats) -> Near:
         """C (count,) of the grasps with these halves (G, half) with every object; NaN where it has no reference."""
@@ -113,40 +129,8 @@ class References:
         return NearestReference(self._touches[start + best], float(cosines[best]), adds)
 
 
-def open_references(generation: Generation, objects: Objects, hidden: int) -> References | None:
-    """The reference touches of a generation; None where it has none. Raises CorruptIndex."""
-    return References(generation, objects, hidden) if ROWS in generation.documents else None
-
-
 def told_of(about: Mapping[str, Any]) -> dict[str, Any]:
     """What a manifest says of reference touches: how many, of how many objects, and what they are worth; nothing where
     there are none."""
     counts, worth = about.get(ROWS), about.get(WORTH)
     return {**counts, **worth} if isinstance(counts, dict) and isinstance(worth, dict) else {}
-
-
-def by_both(
-    references: References, objects: Objects, rows: Numbers, logits: Floats, grasps: int
-) -> JudgedObjects | None:
-    """Objects judged by their photos with the posterior that is used beside references; None where no object has both
-    photos and references."""
-    beside = references.worth.beside
-    return None if beside is None else objects.judged(rows, logits, beside, grasps)
-
-
-def _checked(document: Any, where: object) -> tuple[list[_Touch], list[str]]:
-    """The touches, and the objects without photos."""
-    wrong = CorruptIndex(f"{where}: its list of reference touches is not what the format says; {AGAIN}")
-    if not isinstance(document, dict) or not all(isinstance(document.get(key), list) for key in ("touches", "alone")):
-        raise wrong
-    touches = []
-    for row in document["touches"]:
-        paths, digests = (row.get("touch"), row.get("digests")) if isinstance(row, dict) else (None, None)
-        if not isinstance(paths, list) or not isinstance(row.get("object_id"), str) or not all(map(is_inside, paths)):
-            raise wrong
-        if not isinstance(digests, list) or [type(one) for one in digests] != [str] * len(paths):
-            raise wrong
-        touches.append(_Touch(row["object_id"], tuple(paths), tuple(digests)))
-    if not all(isinstance(name, str) for name in document["alone"]):
-        raise wrong
-    return touches, document["alone"]

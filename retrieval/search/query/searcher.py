@@ -1,4 +1,4 @@
-"""From gel images to ranked objects: encode the touch, take candidates, rerank them by match logit from halves."""
+"""Query an opened index: encode the touch, find candidates, rerank them by match logit, and give a verdict."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
-from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from retrieval.data.storage import place_of
 from retrieval.errors import BadInput
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
 from retrieval.model.onnx_encoder import exported
 from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
+from retrieval.model.references import ROWS
 from retrieval.model.stored import Stored, read_judge
 from retrieval.model.touches import (
     AnyImage,
@@ -29,10 +29,9 @@ from retrieval.model.touches import (
 )
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
 from retrieval.search.query.objects import Objects
-from retrieval.search.query.opening import OpenShards, folder_shard, open_cluster, stored_for
-from retrieval.search.query.references import ROWS, told_of
+from retrieval.search.query.opening import OpenShards, open_index
+from retrieval.search.query.references import told_of
 from retrieval.search.query.shard import Felt, FolderShard, Judged, Shard
-from retrieval.search.sharding.object_store import is_cluster, read_cluster
 
 Floats = NDArray[np.float32]
 
@@ -80,18 +79,22 @@ class Searcher:
         threads: int | None = None,
         shards: OpenShards | None = None,
     ) -> "Searcher":
-        """Open the current generation of an index, or of a cluster of them, with the checkpoint that built it.
+        """Open the current generation of an index, or of a sharded index, with the checkpoint that built it.
 
-        * `index`: its folder; of a cluster the URL too, from which shards are fetched once into the user's cache.
-        * `model`: where that checkpoint lies now, if it was moved.
-        * `verify`: compare the checksums of the index's files.
-        * `threads`: how many encode a touch; None leaves the choice to the library. PyTorch has one number for all that
-          computes in a process.
-        * `shards`: what opens the shards of a cluster; None opens them in this process.
+        Touches are encoded by the export of the checkpoint (`retrieval.model.export`) if one lies beside it or in the
+        user's cache, without PyTorch.
 
-        Touches are encoded by the export of the checkpoint where one lies beside it (`retrieval.model.export`) or in
-        the user's cache; PyTorch is not imported then. Raises the errors of `indexes.store.folder.IndexStore.open`,
-        CheckpointError, and MismatchedIndex for another model.
+        Args:
+            index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
+            model: Path of the checkpoint, if it was moved.
+            verify: Compare the checksums of the index's files.
+            threads: Number of threads that encode a touch; None: the library's choice. PyTorch has one number for all
+                computation of a process.
+            shards: Opens the shards of a sharded index; None: in this process.
+
+        Raises:
+            IndexesError: The index is missing, damaged, or of another model.
+            CheckpointError: The checkpoint is missing or damaged.
 
         >>> import numpy as np
         >>> from PIL import Image
@@ -101,19 +104,12 @@ class Searcher:
         >>> from_arrays.results == from_files.results
         True
         """
-        if is_cluster(index):
-            manifest = read_cluster(index)
-            stored = stored_for(manifest, model)
-            shard = shards(index, manifest, stored) if shards else open_cluster(index, manifest, stored, verify)
-        else:
-            generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
-            stored = stored_for(generation.manifest, model)
-            shard = folder_shard(generation, stored)
+        shard, stored = open_index(index, model, verify, shards)
         encoder = exported(stored, threads) or torch_encoder(stored, threads)
         return cls(place_of(index), shard, stored, encoder, read_judge(stored.path))
 
     def close(self) -> None:
-        """Let go of index and model; what is under way in other threads is finished first. Does nothing twice."""
+        """Release index and model; queries in other threads are answered first. Does nothing twice."""
         self._closed = True
         for name in ("shard", "encoder", "reader", "judge"):
             vars(self).pop(name, None)
@@ -158,26 +154,29 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> QueryResult:
-        """Which of the catalogue's objects was felt in one or more grasps, or none of them?
+        """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
-        * `touches`: one grasp, a list with an image for each finger in their order; or a list of several such grasps.
-          For a model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a Pillow
-          image, or an array (height, width, 3) of uint8, red first: what OpenCV reads is blue first and looks like any
-          other array, so turn it by `image[..., ::-1]`. A file and its decoded array give the same answer.
-        * `background`: the fingers' no-contact frames, for a model that subtracts them, and for one that was taught by
-          them what a contact is.
-        * `top`: how many objects to return.
-        * `candidates`: how many photos the full classifier judges, `top` at least: those nearest to all grasps
-          together. By default as many as the index was found to need. Where that is no fewer than there are photos, or
-          the model has no trained embeddings, every photo is judged and nothing is searched.
-        * `none_prior`: probability, before anything is felt, that the catalogue lacks the object.
+        Only grasps with contact count. Match logits of several grasps add; `retrieval.model.posterior` states how the
+        sums become probabilities of the objects and of "none of these".
 
-        Only grasps with contact are judged. Match logits of several grasps add; `retrieval.model.posterior` says what
-        the sum is worth and how objects and "none of these" get their probabilities. Raises BadInput, ImageError or
-        NumericalError.
+        Args:
+            touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
+                model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a Pillow
+                image, or an array (height, width, 3) of uint8, red first: OpenCV reads blue first, so turn its arrays
+                by `image[..., ::-1]`. A file and its decoded array give the same answer.
+            background: The fingers' no-contact frames, for a model that subtracts them or compares with them.
+            top: Number of objects to return.
+            candidates: Number of photos to rerank, at least `top`: those nearest to all grasps together; None: as
+                measured for the index. All photos are reranked if they are no more than that, or if the model has no
+                trained embeddings.
+            none_prior: Prior probability that the catalogue lacks the object.
+
+        Raises:
+            BadInput: An argument is invalid.
+            ImageError: An image cannot be read.
+            NumericalError: A logit is not finite.
         """
         held = self._held()
-        require_counts(top, candidates)
         grasps = read_grasps(touches, held.reader.fingers)
         return held._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
@@ -190,8 +189,7 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """What `query` answers after the first grasp, after the first two, and so on to all of them; every grasp is
-        encoded once.
+        """Return what `query` answers after the first grasp, after the first two, and so on; each is encoded once.
 
         >>> with retrieval.open("index") as searcher:
         ...     after_one, after_two = searcher.query_growing([["a.png", "b.png"], ["a2.png", "b2.png"]])
@@ -199,7 +197,6 @@ class Searcher:
         (1, 2)
         """
         held = self._held()
-        require_counts(top, candidates)
         grasps = read_grasps(touches, held.reader.fingers)
         asked = [slice(count) for count in range(1, len(grasps) + 1)]
         return held._answers(grasps, asked, background, top, candidates, none_prior)
@@ -213,13 +210,12 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Answer for several objects in the hand, each given as `query` takes it, in their order.
+        """Return the answer for each of several objects in the hand, given as `query` takes them.
 
-        Their touches are encoded in batches. Logits are within 1e-4 of those of single queries, as a batch rounds in
-        another order. Where the touches of one object cannot be used, nothing is answered and the error names it.
+        Touches are encoded in batches, so logits are within 1e-4 of those of single queries. If the touches of one
+        object cannot be used, the error names it and nothing is answered.
         """
         held = self._held()
-        require_counts(top, candidates)
         asked = [
             read_grasps(touches, held.reader.fingers, of=f"object {number}, ")
             for number, touches in enumerate(objects, 1)
@@ -227,19 +223,21 @@ class Searcher:
         ends = np.cumsum([len(grasps) for grasps in asked]).tolist()
         spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, asked, strict=True)]
         every = [grasp for grasps in asked for grasp in grasps]
-        return held._answers(every, spans, background, top, candidates, none_prior) if asked else []
+        return held._answers(every, spans, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
-        """The unit embeddings (G, embedding_dim) and halves (G, half) of G grasps, given as `query` takes them.
+        """Return the unit embeddings (G, embedding_dim) and partial activations (G, half) of G grasps.
 
-        The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) is the score by which
-        candidates are found; it orders photos for one touch and is no probability. Match logits, summed over the
-        grasps, are `searcher.judge.logits(halves, photo_halves)`.
+        The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) orders candidates; it is not
+        a probability. Match logits, summed over the grasps, are `searcher.judge.logits(halves, photo_halves)`.
+
+        Args:
+            touches: As `query` takes them.
+            background: As `query` takes it.
         """
         held = self._held()
         grasps = read_grasps(touches, held.reader.fingers)
-        references = held.reader.references(background)
-        codes = held.reader.encode(grasps, references, Stopwatch())
+        codes = held.reader.encode(grasps, held.reader.references(background), Stopwatch())
         return Encoded(codes.embeddings, codes.halves)
 
     def _held(self) -> "Searcher":
@@ -250,8 +248,6 @@ class Searcher:
             raise BadInput(f"this searcher of {self.index} was closed; open the index again")
         return held
 
-    # The stages: each takes and gives what belongs to one object, images of all objects side by side ------------
-
     def _answers(
         self,
         grasps: Sequence[Sequence[GivenImage]],
@@ -261,37 +257,40 @@ class Searcher:
         candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
-        """An answer for each object in the hand; each slice of `asked` names the grasps that are of one object."""
+        """An answer for each object in the hand; each slice of `asked` selects the grasps of one object."""
+        require_counts(top, candidates)
         require_prior(none_prior)
+        if not grasps:
+            return []
         clock = Stopwatch()
-        references = self.reader.references(background)
-        codes = self.reader.encode(grasps, references, clock)
+        codes = self.reader.encode(grasps, self.reader.references(background), clock)
         shown = np.full(len(codes.halves), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
             shown = np.array(self.gel_check.judge(codes.readings, codes.levels))
-        parts = [(shown[own], codes.halves[own], codes.embeddings[own]) for own in asked]
         judged = []
-        for own, halves, embeddings in parts:
-            felt = (own == CONTACT) & (own != NOT_A_GEL).all()
-            judged.append(self._judged(Felt(embeddings[felt], halves[felt]), top, candidates, none_prior, clock))
+        for its in asked:
+            felt = (shown[its] == CONTACT) & (shown[its] != NOT_A_GEL).all()
+            own = Felt(codes.embeddings[its][felt], codes.halves[its][felt])
+            judged.append(self._judged(own, top, candidates, none_prior, clock))
         timing_ms = clock.finished(len(asked))
         return [
-            self._answer(grasps[its], own.tolist(), embeddings, timing_ms, found, none_prior)
-            for its, (own, _, embeddings), found in zip(asked, parts, judged, strict=True)
+            self._answer(grasps[its], shown[its].tolist(), codes.embeddings[its], timing_ms, found, none_prior)
+            for its, found in zip(asked, judged, strict=True)
         ]
 
     def _judged(
         self, felt: Felt, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
     ) -> "_Judged | None":
-        """The best objects, and what is believed of them; None where nothing was felt."""
+        """The best objects and their posterior; None without a grasp with contact."""
         if not len(felt.halves):
             clock.add({"candidates": 0.0, "rerank": 0.0})
             return None
         found = self.shard.ask(felt, top, candidates, self.posterior)
         clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
-        if self.posterior is None or found.mass is None:
-            return _Judged(found, len(felt.halves), None)
-        belief = self.posterior.share([one.logit for one in found.best], found.mass, len(felt.halves), none_prior)
+        belief = None
+        if self.posterior is not None and found.mass is not None:
+            logits = [one.logit for one in found.best]
+            belief = self.posterior.share(logits, found.mass, len(felt.halves), none_prior)
         return _Judged(found, len(felt.halves), belief)
 
     def _answer(
@@ -303,45 +302,48 @@ class Searcher:
         judged: "_Judged | None",
         none_prior: float,
     ) -> QueryResult:
-        belief = judged.belief if judged else None
+        described, belief = self.described, judged.belief if judged else None
         verdict = _verdict(shown, belief)
+        shares = {}
+        if described.shards > 1:
+            searched = described.photos if judged is None else judged.found.searched
+            shares = {"shards": described.shards, "searched": searched / described.photos}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,
             index={
                 "path": str(self.index),
-                "generation": self.described.name,
-                "kind": self.described.kind,
-                "photos": self.described.photos,
-                "objects": self.described.objects,
+                "generation": described.name,
+                "kind": described.kind,
+                "photos": described.photos,
+                "objects": described.objects,
                 "scored": judged.found.photos if judged else 0,
-                **(self._shares(judged) if self.described.shards > 1 else {}),
+                **shares,
                 "encoder": self.encoder.name,
-                "catalogue": str(self.described.about["catalogue"]),
+                "catalogue": str(described.about["catalogue"]),
                 "model": str(self.checkpoint.path),
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },
             timing_ms=timing_ms,
             verdict=verdict,
             none_probability=belief.none if belief else None,
-            posterior=self._meaning(judged, none_prior) if judged else None,
+            posterior=self._formula(judged, none_prior) if judged else None,
             results=self._ranking(judged) if judged else [],
-            more_grasps=self._more_grasps(judged, none_prior) if verdict == NONE_OF_THESE else None,
+            more_grasps=self._more_grasps(judged, none_prior) if verdict == NONE_OF_THESE and judged else None,
             embeddings=embeddings,
         )
 
-    def _more_grasps(self, judged: "_Judged | None", none_prior: float) -> int | None:
+    def _more_grasps(self, judged: "_Judged", none_prior: float) -> int | None:
         """Further grasps after which the verdict is expected to be a match; None where the ranking is not clear."""
-        if not (self.posterior and judged and judged.belief and (mass := judged.found.mass)):
-            return None
-        if not is_clear(float(judged.belief.objects_if_present[0])):
+        mass, belief = judged.found.mass, judged.belief
+        if (
+            self.posterior is None
+            or belief is None
+            or mass is None
+            or not is_clear(float(belief.objects_if_present[0]))
+        ):
             return None
         return self.posterior.more_grasps(judged.found.best[0].logit, mass.objects, judged.grasps, none_prior)
-
-    def _shares(self, judged: "_Judged | None") -> dict[str, Any]:
-        """For an index of several shards: how many there are, and which share of all photos could be searched."""
-        searched = self.described.photos if judged is None else judged.found.searched
-        return {"shards": self.described.shards, "searched": searched / self.described.photos}
 
     def _ranking(self, judged: "_Judged") -> list[Match]:
         ranking, base, belief = [], self.catalogue.absolute(), judged.belief
@@ -352,7 +354,7 @@ class Searcher:
             ranking.append(Match(*told, base / photo.path, reference, if_present))
         return ranking
 
-    def _meaning(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
+    def _formula(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
         """The formula of the probabilities, with the numbers of this answer."""
         if self.posterior is None or judged.belief is None:
             return None
@@ -368,7 +370,7 @@ class Searcher:
 
 
 class _Judged(NamedTuple):
-    """What was found for one object in the hand by so many grasps, and what is believed of it."""
+    """The result for one object in the hand, the number of its grasps with contact, and the posterior."""
 
     found: Judged
     grasps: int

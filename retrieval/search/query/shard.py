@@ -21,10 +21,11 @@ from indexes.store.rows import key_of
 from retrieval.errors import BadInput
 from retrieval.model.judge import Judge
 from retrieval.model.posterior import Mass, Posterior
+from retrieval.model.references import ROWS
 from retrieval.model.touches import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
-from retrieval.search.query.references import Near, by_both, open_references
+from retrieval.search.query.references import Near, References
 
 DEFAULT_CANDIDATES = 1000
 COMPLETED = 20
@@ -127,7 +128,8 @@ class FolderShard:
     def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
         self.generation, self.judge, self.has_embeddings = generation, judge, has_embeddings
         self.objects = Objects(generation)
-        self.references = open_references(generation, self.objects, len(judge.out))
+        has_references = ROWS in generation.documents
+        self.references = References(generation, self.objects, len(judge.out)) if has_references else None
         self._lock = Lock()
 
     @property
@@ -150,7 +152,7 @@ class FolderShard:
         with clock("candidates"):
             limit = self.limit(top, candidates)
             near = None if self.references is None else self.references.near(felt.halves)
-            rows = self._with_near(self._candidates(felt.embeddings, limit), near, limit)
+            rows = self._candidates(felt.embeddings, near, limit)
         with clock("rerank"):
             objects, photos = self._judged(felt.halves, rows, top, posterior or Posterior(), near)
             mass = None if posterior is None else self._mass(felt.halves, objects, posterior, near)
@@ -175,13 +177,10 @@ class FolderShard:
         if object_id is not None:
             found = found[self.generation.rows.keys("object_id") == key_of(object_id)]
         if words:
-            texts = self._texts_once()
+            with self._lock:
+                texts = self._texts
             found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
         return Page(len(found), [self.generation.rows[int(row)] for row in found[offset : offset + limit]])
-
-    def _texts_once(self) -> list[str]:
-        with self._lock:
-            return self._texts
 
     @cached_property
     def _texts(self) -> list[str]:
@@ -197,17 +196,15 @@ class FolderShard:
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
-    def _candidates(self, embeddings: Floats, k: int) -> Rows:
-        """Rows to judge, those nearest to all grasps together; all rows where the stage would leave nothing out."""
+    def _candidates(self, embeddings: Floats, near: Near | None, k: int) -> Rows:
+        """Rows to score: the k nearest to all grasps together, and the photos of the k objects whose reference touches
+        are nearest; all rows where that would leave nothing out."""
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
-        return np.sort(self.generation.candidates(together(embeddings), k)[0])
-
-    def _with_near(self, rows: Rows, near: Near | None, most: int) -> Rows:
-        """The rows, and with them the photos of at most `most` objects, those whose reference touches are nearest."""
+        rows = np.sort(self.generation.candidates(together(embeddings), k)[0])
         if self.references is None or near is None or len(rows) == self.generation.count:
             return rows
-        return np.union1d(rows, self.objects.rest_of(self.references.nearest_objects(near, most), rows))
+        return np.union1d(rows, self.objects.rest_of(self.references.nearest_objects(near, k), rows))
 
     def _ranked(self, objects: JudgedObjects, place: int, halves: Floats) -> Ranked:
         photo, logit = listed_photo(self.generation.rows[int(objects.rows[place])]), float(objects.logits[place])
@@ -223,7 +220,8 @@ class FolderShard:
         objects = self.objects.judged(rows, logits, meaning, grasps)
         if self.references is None or near is None:
             return objects
-        both = by_both(self.references, self.objects, rows, logits, grasps)
+        beside = self.references.worth.beside  # the posterior of photos next to references
+        both = None if beside is None else self.objects.judged(rows, logits, beside, grasps)
         return self.references.added(objects, both, near, meaning, grasps)
 
     def _judged(

@@ -1,15 +1,16 @@
-"""From photos to a cluster: several index folders over one catalogue, switched together.
+"""Build a sharded index: several index folders over one catalogue, which are switched together.
 
-Each shard is built as an ordinary index is, over the photos of the objects that are its own: what was embedded before,
-in it, in the shards of another division, or by a build that was cut off, is not embedded again. The cluster's manifest
-is written when every shard is on the disk. Killed at any moment, a build leaves the cluster as it was.
+The photos of an object go to one shard, and each shard is built as an ordinary index. Codes are reused from the shard,
+from the shards of another division, and from an interrupted build. The cluster's manifest is written when every shard
+is on the disk: a build that is killed leaves the cluster as it was.
 
-A cluster in an object store is made in a folder of this machine, each shard put into the store as soon as it is made
+A sharded index in an object store is built in a local folder, and each shard is uploaded as soon as it is complete
 (`retrieval.search.sharding.object_store`).
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,39 +45,54 @@ from retrieval.data.touched import CatalogueTouch
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, NoPhoto, TooManyBad
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.references import ROWS, WORTH
 from retrieval.model.stored import fingerprint
-from retrieval.search.build.build_index import Wanted, build_listed, naming_by
+from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by
 from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.operating import Asked
-from retrieval.search.query.references import ROWS, WORTH
+from retrieval.search.build.embed import no_photo
+from retrieval.search.build.operating import SearchRequirements
 from retrieval.search.sharding.object_store import StoredCluster, folder_with, names
 from retrieval.version import __version__
 
 BAD_SHARE = 0.05
-"""Of a catalogue's photos, how many may be unreadable where nothing else is said."""
+"""Fraction of a catalogue's photos that may be unreadable, by default."""
 _KEEP_ALL = 10**6
+SUMMED = ("photos", "embedded", "reused", "renamed", "resumed", "remade", "removed", "unread", "seconds")
+"""Fields of a report that add up over the shards."""
 
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One shard to build, as it is sent to wherever it is built. cluster: its folder, or its URL. donors: shards of
-    another division."""
+    """One shard to build, as it is sent to the process that builds it.
+
+    Args:
+        cluster: Folder or URL of the sharded index.
+        folder: Folder of the shard in it.
+        catalogue: The shard's photos and touches.
+        model: Path of the checkpoint.
+        options: As for an index folder.
+        donors: Shards of another division, whose codes may be reused.
+    """
 
     cluster: str | Path
     folder: str
     catalogue: Catalogue
     model: Path
-    naming: Naming
-    asked: Asked
+    options: BuildOptions
     donors: Sequence[ShardEntry]
-    verify: bool
-    quiet: bool
 
 
 @dataclass(frozen=True)
 class ShardBuilt:
-    """What became of the shard in `folder`; `entry` and `report` are None where none of its photos can be read. counts:
-    how many photos each of its objects has."""
+    """Result of a `ShardJob`.
+
+    Args:
+        folder: Folder of the shard.
+        entry: Its entry in the manifest; None if none of its photos can be read.
+        report: Its report; None likewise.
+        counts: Number of photos of each object.
+        skipped: Photos that could not be read.
+    """
 
     folder: str
     entry: ShardEntry | None
@@ -104,12 +120,23 @@ def build_cluster(
     quiet: bool = False,
     run: Run | None = None,
 ) -> BuildReport:
-    """Write the next generation of the cluster `out`, a folder or a URL, over the catalogue `folder`.
+    """Write the next generation of a sharded index of a catalogue.
 
-    shards: into how many it is divided. run: builds them; None: here, one after another. What else is asked for is as
-    `build_index` takes it, and holds for each shard. Raises its errors; BadInput for a number of shards that is none,
-    or where `out` is an index folder; TooManyBad where more than a share of `bad_share` of the photos cannot be read;
-    and StorageError where what lies behind the URL goes on refusing.
+    Args:
+        folder: The catalogue, as `build_index` takes it, and so the other arguments that are not listed here.
+        checkpoint: The model.
+        out: Folder or URL of the sharded index.
+        shards: Number of shards.
+        bad_share: Largest fraction of photos that may be unreadable.
+        run: Builds the shards; None: this process, one after another.
+
+    Returns:
+        What was built, in all shards together.
+
+    Raises:
+        BadInput: The number of shards is out of range, or `out` is an index folder.
+        TooManyBad: More photos than `bad_share` cannot be read.
+        StorageError: The storage behind the URL refuses again and again, or another build finished first.
     """
     if not 1 <= shards <= MOST_SHARDS:
         raise BadInput(f"shards must be from 1 to {MOST_SHARDS}; got {shards}")
@@ -119,10 +146,17 @@ def build_cluster(
     own = Path(out) if stored is None else stored.work
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
-    asked = Asked.of(kind, min_recall, max_ms)
+    asked = SearchRequirements.of(kind, min_recall, max_ms)
     with WriterLock(own / "LOCK"):
         seen = None if stored is None else stored.manifest()
-        before, note = _before(lambda: read_cluster(own) if stored is None else stored.parsed(seen))
+        before: ClusterManifest | None = None
+        note = ""
+        try:
+            before = read_cluster(own) if stored is None else stored.parsed(seen)
+        except NoIndex:
+            pass
+        except (CorruptIndex, UnsupportedFormat) as error:
+            note = f"The cluster there was not usable ({error})."
         naming, renamed = naming_by(objects_from, {} if before is None else before.about)
         catalogue = list_photos(folder, naming)
         if catalogue.touches and checkpoint.references is None:
@@ -133,9 +167,10 @@ def build_cluster(
         _sweep(own, before, shards)
         left = {} if stored is None else stored.generations()
         donors = [] if before is None or before.of == shards else before.shards
+        options = BuildOptions(naming, asked, quiet, verify, keep=_KEEP_ALL)
         jobs = [
-            ShardJob(out, shard_folder(number, shards), part, checkpoint.path, naming, asked, donors, verify, quiet)
-            for number, part in _divided(catalogue, shards)
+            ShardJob(out, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
+            for folder, part in _divided(catalogue, shards)
         ]
         built = sorted((run or one_after_another)(jobs, checkpoint), key=lambda one: one.folder)
         report = _report(out, catalogue, naming, checkpoint, built)
@@ -166,41 +201,31 @@ def one_after_another(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Itera
 
 
 def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuilt:
-    """Build one shard. Raises the errors of `build_index`, but none where no photo of this one can be read."""
+    """Build one shard. Raises the errors of `build_index`, except where none of its photos can be read."""
     model = checkpoint or load_checkpoint(job.model)
     stored = StoredCluster(str(job.cluster)) if is_url(job.cluster) else None
     cluster = Path(job.cluster) if stored is None else stored.work
     if stored is not None:
         stored.restore(job.folder)
-    store = IndexStore(cluster / job.folder)
-    usable = [one for donor in job.donors if (one := _donor(job.cluster, donor, fingerprint(model))) is not None]
-    about = {"shard": job.folder}
-    wanted = Wanted(job.naming, job.asked, job.quiet, job.verify, "", about, usable, _KEEP_ALL)
+    store, donors = IndexStore(cluster / job.folder), list[Generation]()
+    for donor in job.donors:
+        with suppress(IndexesError):  # it cannot serve then
+            place = folder_with(job.cluster, donor) / donor.folder
+            donors.append(IndexStore(place).open(name=donor.generation, expect=fingerprint(model)))
     try:
-        report = build_listed(job.catalogue, model, store.path, wanted)
+        report = build_listed(job.catalogue, model, store.path, replace(job.options, donors=donors))
     except NoPhoto as error:
         return ShardBuilt(job.folder, None, None, [], error.skipped)
     generation = store.open(name=report.generation, verify=False)
     counts = np.bincount(generation.codes("object_id")).tolist()
     entry = entry_of(cluster, job.folder, generation, len(counts))
     if stored is not None:
-        stored.put(entry, job.verify)
+        stored.put(entry, job.options.verify)
     return ShardBuilt(job.folder, entry, report, counts, report.skipped)
 
 
-def _before(read: Callable[[], ClusterManifest]) -> tuple[ClusterManifest | None, str]:
-    """The cluster there, and why it is of no use where it is not."""
-    try:
-        before = read()
-    except NoIndex:
-        return None, ""
-    except (CorruptIndex, UnsupportedFormat) as error:
-        return None, f"The cluster there was not usable ({error})."
-    return before, ""
-
-
 def _sweep(out: Path, before: ClusterManifest | None, shards: int) -> None:
-    """Delete shards of divisions that neither the cluster there nor the wanted one has."""
+    """Delete shards of divisions that neither the current cluster nor the new one has."""
     known = set() if before is None else {entry.folder for entry in before.shards}
     for path in out.iterdir():
         division = FOLDER.fullmatch(path.name)
@@ -208,82 +233,58 @@ def _sweep(out: Path, before: ClusterManifest | None, shards: int) -> None:
             remove_folder(path)
 
 
-def _divided(catalogue: Catalogue, shards: int) -> list[tuple[int, Catalogue]]:
-    """The catalogue's photos and touches by shard; a shard without any is left out. What concerns neither is said of
-    none."""
-    photos: dict[int, list[CataloguePhoto]] = {}
-    touches: dict[int, list[CatalogueTouch]] = {}
+def _divided(catalogue: Catalogue, shards: int) -> list[tuple[str, Catalogue]]:
+    """Folder and catalogue of each shard that has photos or touches. Files that are neither belong to no shard."""
+    photos, touches = defaultdict[int, list[CataloguePhoto]](list), defaultdict[int, list[CatalogueTouch]](list)
     for photo in catalogue.photos:
-        photos.setdefault(shard_of(photo.object_id, shards), []).append(photo)
+        photos[shard_of(photo.object_id, shards)].append(photo)
     for touch in catalogue.touches:
-        touches.setdefault(shard_of(touch.object_id, shards), []).append(touch)
+        touches[shard_of(touch.object_id, shards)].append(touch)
     none = replace(catalogue, ignored=(), skipped=(), notes=(), unread=())
     return [
-        (number, replace(none, photos=Photos.of(photos.get(number, [])), touches=tuple(touches.get(number, ()))))
+        (shard_folder(number, shards), replace(none, photos=Photos.of(photos[number]), touches=tuple(touches[number])))
         for number in sorted(photos.keys() | touches.keys())
     ]
-
-
-def _donor(cluster: str | Path, entry: ShardEntry, wanted: Mapping[str, str]) -> Generation | None:
-    """A shard whose codes may be taken over; None where it cannot serve."""
-    try:
-        return IndexStore(folder_with(cluster, entry) / entry.folder).open(name=entry.generation, expect=wanted)
-    except IndexesError:
-        return None
 
 
 def _report(
     out: str | Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuilt]
 ) -> BuildReport:
-    """What all builds did together. Raises NoPhoto where none of them had a photo to write."""
+    """The reports of all shards as one. Raises NoPhoto where no shard has a photo."""
     reports = [one.report for one in built if one.report is not None]
     skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
     if not reports:
-        raise NoPhoto(f"no photo in {catalogue.where} can be read; the first: {skipped[0]}", skipped)
+        raise no_photo(catalogue, skipped)
     counts = [count for one in built for count in one.counts]
     lost = {name for report in reports for name in report.without_photo}
     bad = {item.path for one in built if one.report is None for item in one.skipped}
     lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad} | set(catalogue.unread)
-    reasons = Counter(report.reason for report in reports).most_common()
-    return BuildReport(
+    reason, same = Counter(report.reason for report in reports).most_common(1)[0]
+    told = [report.references for report in reports if report.references]
+    of_touches = {key: sum(one[key] for one in told) for key in ("touches", "objects", "alone", "encoded")}
+    return replace(
+        reports[0],
+        **{name: sum(getattr(report, name) for report in reports) for name in SUMMED},
         index=str(out),
         generation="",
         written=True,
         model=str(checkpoint.path),
-        photos=sum(report.photos for report in reports),
         objects=len(counts),
         objects_from=naming.text,
         per_object=per_object(counts),
-        examples=reports[0].examples,
         doubts=doubts(Counter(catalogue.photos.objects), naming),
-        embedded=sum(report.embedded for report in reports),
-        reused=sum(report.reused for report in reports),
-        renamed=sum(report.renamed for report in reports),
-        resumed=sum(report.resumed for report in reports),
-        remade=sum(report.remade for report in reports),
-        removed=sum(report.removed for report in reports),
-        unread=sum(report.unread for report in reports),
         skipped=skipped,
         ignored=list(catalogue.ignored),
         without_photo=sorted(lost),
         notes=list(catalogue.notes),
         kind=", ".join(sorted({report.kind for report in reports})),
-        reason=f"{len(reports)} shards; of {reasons[0][1]} of them: {reasons[0][0]}",
+        reason=f"{len(reports)} shards; of {same} of them: {reason}",
         recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
         candidates=None,
         half_error=max(report.half_error for report in reports),
-        seconds=sum(report.seconds for report in reports),
         shards=[asdict(one.entry) for one in built if one.entry is not None],
-        references=_references([report.references for report in reports if report.references]),
+        references={**of_touches, "by": told[0]["by"]} if told else None,
     )
-
-
-def _references(told: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Of reference touches in all shards."""
-    if not told:
-        return None
-    counts = {key: sum(one[key] for one in told) for key in ("touches", "objects", "alone", "encoded")}
-    return {**counts, "by": told[0]["by"]}
 
 
 def _manifest(
@@ -293,9 +294,9 @@ def _manifest(
     checkpoint: Checkpoint,
     catalogue: Catalogue,
     report: BuildReport,
-    asked: Asked,
+    asked: SearchRequirements,
 ) -> ClusterManifest:
-    """The manifest to write, or the one that is there where it would say the same."""
+    """The manifest to write, or the current one where they would be equal."""
     about: dict[str, Any] = {
         "checkpoint": str(checkpoint.path.resolve()),
         "catalogue": catalogue.where,

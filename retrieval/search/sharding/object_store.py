@@ -1,17 +1,17 @@
-"""A cluster in an object store: whatever `fsspec` writes to, by its URL.
+"""A sharded index in an object store: whatever `fsspec` writes to, by its URL.
 
     CLUSTER.json                               as in a folder (`indexes.store.cluster`); put last, by one request
-    shard-00-of-04/gen-000007-<SHA-256>/       a generation, under the digest of its manifest
+    shard-00-of-04/gen-000007-<SHA-256>/       a generation, named by the digest of its manifest
         rows.jsonl, ...
         manifest.json                          put last
 
-The name of a generation stands for every byte of it, so that it is never changed, and two builds cannot mix theirs. It
-is there when its manifest is, and its files have the sizes that this one says: what was torn on its way is put again.
-Files that were altered at the same size are found when they are fetched, for they are checked by their digests.
+The name of a generation stands for every byte of it: it never changes, and two builds cannot mix theirs. A generation
+is complete when its manifest is there; files of another size than the manifest states are put again. Each file is
+checked by its digest when it is fetched.
 
-Generations are made in a folder of this machine, an ordinary cluster's, and fetched into another one to be searched.
-Both lie in the user's cache and may be deleted at any time: a build takes up what the store has, and a search fetches
-it again.
+Generations are made in one local folder and fetched into another one to be searched. Both lie in the user's cache and
+may be deleted at any time. The caches of fsspec (`filecache`, `simplecache`) do not serve here: they store files under
+hashed names and do not compare digests.
 """
 
 import errno
@@ -43,13 +43,12 @@ KEPT = 2
 
 
 def is_cluster(where: str | Path) -> bool:
-    """Whether a cluster lies in this folder; what lies behind a URL is always one."""
+    """Whether this is a sharded index; what lies behind a URL always is."""
     return is_url(where) or folders.is_cluster(Path(where))
 
 
 def read_cluster(where: str | Path) -> ClusterManifest:
-    """The manifest of a cluster in a folder or behind a URL. Raises the errors of `indexes.store.cluster`, and
-    StorageError."""
+    """Return the manifest in a folder or behind a URL. Raises IndexesError and StorageError."""
     if not is_url(where):
         return folders.read_cluster(Path(where))
     stored = StoredCluster(str(where))
@@ -57,14 +56,21 @@ def read_cluster(where: str | Path) -> ClusterManifest:
 
 
 def folder_with(where: str | Path, entry: ShardEntry) -> Path:
-    """The folder of a cluster in which this shard lies on this machine, fetched first where it lies elsewhere."""
+    """Return the local folder of the sharded index that holds this shard, which is fetched from a URL."""
     return StoredCluster(str(where)).fetch(entry) if is_url(where) else Path(where)
 
 
 class StoredCluster:
-    """The cluster behind a URL. work: the folder of this machine in which its shards are made.
+    """The sharded index behind a URL.
 
-    Raises BadInput for a URL that nothing opens, or that means a folder of this machine.
+    Args:
+        url: Its URL.
+
+    Attributes:
+        work: Local folder in which its shards are made.
+
+    Raises:
+        BadInput: Nothing opens the URL, or it names a local folder.
     """
 
     def __init__(self, url: str) -> None:
@@ -83,12 +89,11 @@ class StoredCluster:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def manifest(self) -> bytes | None:
-        """What its manifest holds; None without one. Raises StorageError."""
-
+        """Return the content of its manifest; None without one. Raises StorageError."""
         return self._try(folders.NAME, self._content)
 
     def parsed(self, manifest: bytes | None) -> ClusterManifest:
-        """A manifest that was read here. Raises NoIndex where there is none, CorruptIndex and UnsupportedFormat."""
+        """Return the manifest of that content. Raises NoIndex for None, CorruptIndex and UnsupportedFormat."""
         if manifest is None:
             raise NoIndex(f"{self.url}: there is no cluster here; run `retrieve build-index --out {self.url}` first")
         own = self._fetched / folders.NAME
@@ -100,9 +105,9 @@ class StoredCluster:
             raise type(error)(f"{self.url}: {error}") from error
 
     def fetch(self, entry: ShardEntry) -> Path:
-        """The folder of a cluster, on this machine, in which this shard lies. Only what is not there is fetched.
+        """Return the local folder that holds this shard, which is fetched unless it is there.
 
-        Raises CorruptIndex for one that is not what the cluster was made of, and StorageError.
+        Raises CorruptIndex for a shard with another content, and StorageError.
         """
         own = self._fetched / entry.sha256[:32]
         place = own / entry.folder / entry.generation
@@ -117,12 +122,12 @@ class StoredCluster:
         return own
 
     def restore(self, folder: str) -> None:
-        """Make the newest whole generation of this shard the current one of the folder to work in, unless it lies there
-        already: what was embedded on another machine need not be again. One that is damaged is left."""
-        whole = [name for name, is_whole in self.generations(folder).items() if is_whole]
-        if not whole:
+        """Make the newest complete generation of this shard the current one of the local folder: a build then reuses
+        what another machine embedded. A damaged one is ignored."""
+        name = max((name for name, is_whole in self.generations(folder).items() if is_whole), default=None)
+        if name is None:
             return
-        store, name = IndexStore(self.work / folder), max(whole)
+        store = IndexStore(self.work / folder)
         generation, sha256 = GENERATION.fullmatch(name).groups()  # type: ignore[union-attr]
         place = store.path / generation
         if place.is_dir():
@@ -134,7 +139,7 @@ class StoredCluster:
             store.make_current(generation)
 
     def generations(self, folder: str = "") -> dict[str, bool]:
-        """{name of a generation: whether its manifest is there}: of one shard, or `<shard>/<name>` of all."""
+        """Return {generation: whether its manifest is there} of one shard; or of all, as `<shard>/<generation>`."""
         files = self._sizes(folder)
         names = {file.rpartition("/")[0] for file in files}
         found = {name: f"{name}/{MANIFEST}" in files for name in names if GENERATION.fullmatch(name.rpartition("/")[2])}
@@ -143,28 +148,33 @@ class StoredCluster:
     # Writing ---------------------------------------------------------------------------------------------------
 
     def put(self, entry: ShardEntry, verify: bool = False) -> None:
-        """Put the shard that lies in the folder to work in, but for files that are there: by their size, and by what
-        they hold with `verify`. Raises StorageError."""
+        """Upload a shard from the local folder, except files that are there: with the same size, and with `verify` with
+        the same digest. Raises StorageError."""
         place, own = f"{entry.folder}/{_name(entry)}", self.work / entry.folder / entry.generation
         there = self._sizes(place)
         must = {name: file["sha256"] for name, file in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
         for name, sha256 in must.items():
             size = (own / name).stat().st_size
-            if there.get(name) != size or (verify and self._digest(f"{place}/{name}") != sha256):
+            if there.get(name) != size or (verify and self._try(f"{place}/{name}", self._digest) != sha256):
                 self._put(own / name, f"{place}/{name}")
 
     def switch(self, before: bytes | None, manifest: ClusterManifest) -> None:
-        """Put the manifest in its place: this cluster answers from now on. before: what was there when the build began.
+        """Make this manifest the current one.
 
-        Raises StorageError, where another build has put its own meanwhile too: a store with conditional writes refuses
-        even what was put between the last look and this.
+        Args:
+            before: Content of the manifest when the build began.
+            manifest: The new manifest.
+
+        Raises:
+            StorageError: The storage refuses, or another build switched meanwhile; a store with conditional writes
+                refuses even if that happened after the last look.
         """
         content = cluster_file(manifest)
 
         def put(path: str) -> bool:
-            condition = self._unchanged(path)  # asked first: what is read then is no older than what it stands for
+            condition = self._unchanged(path)  # first, so that the content below is no older
             there = self._content(path)
-            if there == content:  # by a try that was not answered
+            if there == content:  # put by a request whose answer was lost
                 return True
             torn = there is not None and content.startswith(there)
             if there != before and not torn:
@@ -186,10 +196,10 @@ class StoredCluster:
             )
 
     def discard(self, names: Iterable[str]) -> None:
-        """Delete generations, as `generations` names them, each manifest first."""
+        """Delete generations, named as `generations` names them, each manifest first."""
 
         def delete(path: str) -> None:
-            with suppress(FileNotFoundError):  # by a try that was not answered
+            with suppress(FileNotFoundError):  # deleted by a request whose answer was lost
                 self._system.rm_file(path)
 
         for name in names:
@@ -199,7 +209,7 @@ class StoredCluster:
     # The store -------------------------------------------------------------------------------------------------
 
     def _try(self, name: str, function: Callable[[str], T]) -> T:
-        """Call it with the whole path of `name`, again where the store refuses. Raises StorageError."""
+        """Call `function` with the whole path of `name`, again where the store refuses. Raises StorageError."""
         what = f"{self.url}/{name}".rstrip("/")
         try:
             return tried(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
@@ -222,7 +232,7 @@ class StoredCluster:
         return self._try(name, sizes)
 
     def _info(self, path: str) -> dict[str, Any] | None:
-        """What the store says of a file now; None where it is not there."""
+        """The store's information about a file now; None without one."""
         self._system.invalidate_cache()
         try:
             found: dict[str, Any] = self._system.info(path)
@@ -230,13 +240,8 @@ class StoredCluster:
             return None
         return found
 
-    def _size(self, path: str) -> int:
-        """Of a file; -1 where it is not there."""
-        found = self._info(path)
-        return -1 if found is None else int(found["size"])
-
     def _content(self, path: str) -> bytes | None:
-        """Of a cluster's manifest; None where it is not there."""
+        """The content of a manifest; None without one."""
         try:
             data: bytes = self._system.cat_file(path, start=0, end=MOST_BYTES + 1)
         except FileNotFoundError:
@@ -246,30 +251,27 @@ class StoredCluster:
         return data
 
     def _unchanged(self, path: str) -> dict[str, Any]:
-        """With what `pipe_file` is refused where this file is another one by then: what fsspec has for a file that is
-        not there, and what S3 has for one that is; nothing for other stores."""
+        """Arguments with which `pipe_file` refuses to replace another file than the current one: fsspec's for no file,
+        S3's for a file; none for other stores."""
         found = self._info(path)
         if found is None:
             return {"mode": "create"}
         return {"IfMatch": found["ETag"]} if "s3" in self._system.protocol and found.get("ETag") else {}
 
-    def _digest(self, name: str) -> str:
-        def digest(path: str) -> str:
-            with self._system.open(path, "rb") as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()
-
-        return self._try(name, digest)
+    def _digest(self, path: str) -> str:
+        with self._system.open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
     def _put(self, file: Path, name: str) -> None:
         def put(path: str) -> None:
             self._system.put_file(str(file), path)
-            if self._size(path) != file.stat().st_size:
+            if (self._info(path) or {}).get("size") != file.stat().st_size:
                 raise OSError("it was torn on its way")
 
         self._try(name, put)
 
     def _fetch(self, name: str, sha256: str, place: Path) -> None:
-        """A generation into `place`, where it stands only when it is whole. Files that an earlier try fetched stay."""
+        """Fetch a generation into `place`, which appears when it is complete. Files of an earlier try are reused."""
         part = place.with_name(f"{place.name}.part")
         part.mkdir(parents=True, exist_ok=True)
         self._fetch_file(f"{name}/{MANIFEST}", part / MANIFEST, None, sha256)
@@ -278,12 +280,12 @@ class StoredCluster:
         part.rename(place)
 
     def _fetch_file(self, name: str, file: Path, must: int | None, sha256: str) -> None:
-        """must: the bytes that it has; None for a manifest."""
+        """Fetch one file. must: its number of bytes; None for a manifest."""
         if file.is_file() and file_digest(file) == sha256:
             return
-        size = self._try(name, self._size)
-        if size < 0 or (size > MOST_BYTES if must is None else size != must):
-            what = "is missing" if size < 0 else f"has {size} bytes, and not {must or MOST_BYTES}"
+        size = (self._try(name, self._info) or {}).get("size")
+        if size is None or (size > MOST_BYTES if must is None else size != must):
+            what = "is missing" if size is None else f"has {size} bytes, and not {must or MOST_BYTES}"
             raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
 
         def fetch(path: str) -> None:
@@ -298,7 +300,7 @@ class StoredCluster:
 
 
 def names(entries: Iterable[ShardEntry]) -> set[str]:
-    """Generations, as `StoredCluster.generations` names them."""
+    """Return the names of generations, as in `StoredCluster.generations`."""
     return {f"{entry.folder}/{_name(entry)}" for entry in entries}
 
 

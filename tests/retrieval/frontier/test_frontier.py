@@ -20,7 +20,7 @@ from retrieval.metrics.binomial import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
 from retrieval.search.build.measuring import WinnerBench
-from retrieval.search.build.operating import Asked, settle
+from retrieval.search.build.operating import SearchRequirements, settle
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -160,7 +160,7 @@ def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pru
     photos = pruning_sample.catalogue
     slots = np.arange(len(photos.halves))
     bench = WinnerBench(WithQueries(pruning_sample), photos.embeddings["pruner"], slots, photos.halves)
-    settled = settle(bench, Asked())
+    settled = settle(bench, SearchRequirements())
     assert default_k(pruning_sample) == settled.candidates["k"]
     kinds = load_approximation("index_kinds")(pruning_sample)
     assert all(one.default.series == settled.kind for one in kinds.panels)

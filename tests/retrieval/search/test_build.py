@@ -18,7 +18,6 @@ from retrieval.errors import BadInput, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import encode_photos, for_inference
 from retrieval.model.fusion import Matcher
-from retrieval.search.build import build_index as build
 from retrieval.search.build import measuring, operating
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.embed import ahead
@@ -389,7 +388,7 @@ def test_without_a_budget_no_vector_is_measured(own, checkpoint, index, monkeypa
 
 
 def test_few_photos_are_all_judged_and_nothing_is_measured(own, queried, index, monkeypatch):
-    monkeypatch.setattr(build, "WinnerBench", None)
+    monkeypatch.setattr(operating, "WinnerBench", None)
     report = build_index(own, queried, index, quiet=True)
     assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
     assert "candidate search: flat. The classifier judges all 24 photos." in list(report.lines())
@@ -424,7 +423,7 @@ def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(own,
     monkeypatch.setattr(measuring, "FIRST", 4)
     benches = []
     monkeypatch.setattr(
-        build, "WinnerBench", lambda *made, **how: benches.append(made[1:]) or WinnerBench(*made, **how)
+        operating, "WinnerBench", lambda *made, **how: benches.append(made[1:]) or WinnerBench(*made, **how)
     )
     build_index(own, queried, index, quiet=True)
     other_picture(own / "newcomer" / "1.jpg", seed=78)

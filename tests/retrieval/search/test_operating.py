@@ -17,7 +17,7 @@ from retrieval.model.fusion import Matcher
 from retrieval.search.build import measuring
 from retrieval.search.build.measuring import NeighbourBench, Point, WinnerBench, can_measure, query_codes
 from retrieval.search.build.operating import (
-    Asked,
+    SearchRequirements,
     all_judged,
     carried_over,
     needs_measuring,
@@ -93,7 +93,7 @@ def test_judging_every_photo_finds_every_winner_and_searches_nothing(checkpoint,
 
 
 def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall(checkpoint, gallery):
-    settled = settle(WinnerBench(checkpoint, *gallery), Asked())
+    settled = settle(WinnerBench(checkpoint, *gallery), SearchRequirements())
     enough = [k for k in (4, 8, 16, 32, 64) if winners_found(checkpoint, *gallery, k) >= 0.99 * TOUCHES]
     assert settled.kind == "flat"
     assert settled.candidates["k"] == min([*enough, PHOTOS])
@@ -103,7 +103,7 @@ def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall
 
 def test_a_lower_recall_takes_fewer_candidates(checkpoint, gallery):
     bench = WinnerBench(checkpoint, *gallery)
-    low, high = (settle(bench, Asked("flat", min_recall=recall)).candidates["k"] for recall in (0.3, 1.0))
+    low, high = (settle(bench, SearchRequirements("flat", min_recall=recall)).candidates["k"] for recall in (0.3, 1.0))
     assert low < high
 
 
@@ -180,18 +180,18 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
 @pytest.mark.parametrize(
     ("asked", "points", "kind", "k", "said"),
     [
-        (Asked(), QUICK, "flat", 500, ""),
-        (Asked(min_recall=0.95), EXACT | {("ivf_sq8", 500): (99, 0.1, 2.0)}, "ivf_sq8", 500, ""),
-        (Asked(min_recall=0.99), QUICK, "flat", 500, ""),  # the search takes less than the judging
-        (Asked(max_ms=5), QUICK, "flat", 500, ""),
-        (Asked(max_ms=4), QUICK, "ivf_sq8", 500, ""),
-        (Asked(max_ms=2.8), QUICK, "hnsw", 500, ""),
-        (Asked(max_ms=2.6), QUICK, "flat", 100, "reaches a recall of 0.99; this is the nearest"),
-        (Asked(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the nearest"),
-        (Asked(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the nearest"),
-        (Asked("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
-        (Asked("ivf_sq8"), EXACT, "ivf_sq8", 1000, ""),  # all are judged before a winner is lost
-        (Asked("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
+        (SearchRequirements(), QUICK, "flat", 500, ""),
+        (SearchRequirements(min_recall=0.95), EXACT | {("ivf_sq8", 500): (99, 0.1, 2.0)}, "ivf_sq8", 500, ""),
+        (SearchRequirements(min_recall=0.99), QUICK, "flat", 500, ""),  # the search takes less than the judging
+        (SearchRequirements(max_ms=5), QUICK, "flat", 500, ""),
+        (SearchRequirements(max_ms=4), QUICK, "ivf_sq8", 500, ""),
+        (SearchRequirements(max_ms=2.8), QUICK, "hnsw", 500, ""),
+        (SearchRequirements(max_ms=2.6), QUICK, "flat", 100, "reaches a recall of 0.99; this is the nearest"),
+        (SearchRequirements(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the nearest"),
+        (SearchRequirements(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the nearest"),
+        (SearchRequirements("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
+        (SearchRequirements("ivf_sq8"), EXACT, "ivf_sq8", 1000, ""),  # all are judged before a winner is lost
+        (SearchRequirements("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
     ],
 )
 def test_what_was_asked_for_decides(asked, points, kind, k, said):
@@ -202,40 +202,44 @@ def test_what_was_asked_for_decides(asked, points, kind, k, said):
 
 
 def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do():
-    for asked, built in ((Asked(), {"flat"}), (Asked(max_ms=5), {"flat"}), (Asked(max_ms=4), {"flat", "ivf_sq8"})):
+    for asked, built in (
+        (SearchRequirements(), {"flat"}),
+        (SearchRequirements(max_ms=5), {"flat"}),
+        (SearchRequirements(max_ms=4), {"flat", "ivf_sq8"}),
+    ):
         bench = Scripted(QUICK)
         settle(bench, asked)
         assert set(bench.built_kinds) == built
 
 
 def test_few_photos_are_all_judged_unless_that_may_be_too_slow():
-    assert not needs_measuring(4, Asked())
-    assert not needs_measuring(4, Asked(min_recall=1.0))
-    assert needs_measuring(5, Asked())
-    assert needs_measuring(4, Asked(max_ms=5))
-    assert sentence(all_judged(4, Asked())) == "The classifier judges all 4 photos."
+    assert not needs_measuring(4, SearchRequirements())
+    assert not needs_measuring(4, SearchRequirements(min_recall=1.0))
+    assert needs_measuring(5, SearchRequirements())
+    assert needs_measuring(4, SearchRequirements(max_ms=5))
+    assert sentence(all_judged(4, SearchRequirements())) == "The classifier judges all 4 photos."
 
 
 def test_a_measurement_stands_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
-    made = settle(WinnerBench(checkpoint, *gallery), Asked()).candidates
-    assert carried_over(made, Asked(), PHOTOS, 0) == made
-    after = carried_over(made, Asked(), PHOTOS + 4, 4)
+    made = settle(WinnerBench(checkpoint, *gallery), SearchRequirements()).candidates
+    assert carried_over(made, SearchRequirements(), PHOTOS, 0) == made
+    after = carried_over(made, SearchRequirements(), PHOTOS + 4, 4)
     assert after == {**made, "changed": 4}
-    assert carried_over(after, Asked(), PHOTOS + 7, 3)["changed"] == 7
-    assert carried_over(after, Asked(), PHOTOS + 8, 4) is None
-    assert carried_over(made, Asked(min_recall=0.5), PHOTOS, 0) is None
-    assert carried_over(all_judged(4, Asked()), Asked(), 5, 1) is None
-    assert carried_over(None, Asked(), PHOTOS, 0) is None
+    assert carried_over(after, SearchRequirements(), PHOTOS + 7, 3)["changed"] == 7
+    assert carried_over(after, SearchRequirements(), PHOTOS + 8, 4) is None
+    assert carried_over(made, SearchRequirements(min_recall=0.5), PHOTOS, 0) is None
+    assert carried_over(all_judged(4, SearchRequirements()), SearchRequirements(), 5, 1) is None
+    assert carried_over(None, SearchRequirements(), PHOTOS, 0) is None
 
 
 def test_where_all_were_judged_newcomers_are_too():
-    made = {**all_judged(1000, Asked()), "queries": 50}
-    assert carried_over(made, Asked(), 1001, 1)["k"] == 1001
+    made = {**all_judged(1000, SearchRequirements()), "queries": 50}
+    assert carried_over(made, SearchRequirements(), 1001, 1)["k"] == 1001
 
 
 def test_a_point_is_told_in_one_sentence_with_its_interval():
     record = {"k": 500, "winner_recall": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
-    record |= {"exhaustive_ms": 50.0, "asked": dataclasses.asdict(Asked()), "photos": 1000}
+    record |= {"exhaustive_ms": 50.0, "asked": dataclasses.asdict(SearchRequirements()), "photos": 1000}
     assert sentence(record) == (
         "The classifier judges the best 500 of 1000 photos: these hold its winner for 99 of 100 validation touches "
         "(95 % interval 0.946 to 1.000), in 4.5 ms against 50 ms for all."
@@ -252,13 +256,13 @@ def test_measuring_needs_touches_and_embeddings_that_are_made_from_them():
 
 def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(ParameterError, match="must be one of"):
-        Asked("tree")
+        SearchRequirements("tree")
     for recall in (0, -0.1, 1.01, float("nan")):
         with pytest.raises(BadInput, match="least winner recall"):
-            Asked(min_recall=recall)
+            SearchRequirements(min_recall=recall)
     for ms in (0, -1, float("nan")):
         with pytest.raises(BadInput, match="must be above 0 ms"):
-            Asked(max_ms=ms)
+            SearchRequirements(max_ms=ms)
 
 
 # By neighbours ------------------------------------------------------------------------------------------------------
@@ -270,11 +274,11 @@ def unit(count, dim=16):
 
 
 def test_without_a_bound_on_the_time_exact_search_is_taken_and_no_vector_is_read():
-    for asked in (Asked(), Asked(min_recall=0.9)):
+    for asked in (SearchRequirements(), SearchRequirements(min_recall=0.9)):
         settled = settle_by_neighbours(None, None, asked)
         assert (settled.kind, settled.candidates) == ("flat", None)
         assert "no time budget was asked for" in settled.reason
-    assert settle_by_neighbours(None, None, Asked("hnsw", max_ms=1.0)).kind == "hnsw"
+    assert settle_by_neighbours(None, None, SearchRequirements("hnsw", max_ms=1.0)).kind == "hnsw"
 
 
 @pytest.fixture
@@ -300,7 +304,7 @@ def timed(monkeypatch):
 def test_the_first_kind_within_the_time_that_finds_the_neighbours_is_taken(ms, kind, said, timed):
     timed[0].update(ms)
     vectors = np.repeat(unit(900), 2, axis=0)  # copies are left out of the measurement
-    settled = settle_by_neighbours(vectors, np.repeat(np.arange(900), 2) * 2, Asked(max_ms=5))
+    settled = settle_by_neighbours(vectors, np.repeat(np.arange(900), 2) * 2, SearchRequirements(max_ms=5))
     assert settled.kind == kind
     assert set(timed[1]) == set(ms)
     assert said in settled.reason
@@ -324,7 +328,7 @@ class Newcomer(FlatIndex):
 def test_a_new_kind_is_a_class_that_an_installed_package_names(monkeypatch, tmp_path):
     plugins.install(tmp_path / "site", monkeypatch, indexes={"newcomer": f"{__name__}:Newcomer"})
     assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw", "newcomer"]
-    assert Asked("newcomer").kind == "newcomer"
+    assert SearchRequirements("newcomer").kind == "newcomer"
     rows = [{"id": str(number)} for number in range(20)]
     IndexStore(tmp_path).write(rows, unit(20), fingerprint={}, kind="newcomer")
     found = IndexStore(tmp_path).open()
