@@ -16,7 +16,6 @@ from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
 from indexes.store.seen_folders import SeenFolders
 from indexes.store.tables import Tables
-from indexes.store.unfinished import Unfinished
 from indexes.store.writing import RECALL_QUERIES, Chosen
 from retrieval.data.catalogue import Catalogue
 from retrieval.data.naming import FOLDER, Naming, doubts, per_object
@@ -26,9 +25,9 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.references import ROWS, WORTH
 from retrieval.model.stored import fingerprint, halves_kept
 from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.embed import EMBEDDED, REMADE, RENAMED, RESUMED, Embedder, Part, layouts
+from retrieval.search.build.embed import EMBEDDED, REMADE, RENAMED, RESUMED, Embedder, Part
 from retrieval.search.build.embed_touches import ReferenceBuild, embed_references
-from retrieval.search.build.looks import Looked
+from retrieval.search.build.looks import Looked, runs
 from retrieval.search.build.measuring import can_measure, query_codes
 from retrieval.search.build.operating import SearchRequirements, choose_operating_point
 from retrieval.version import __version__
@@ -142,12 +141,12 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         start = time.perf_counter()
         looked = Looked(catalogue, out, options.verify)
         known = looked.known(parent)
-        with Unfinished(out, fingerprint(checkpoint), layouts(checkpoint)) as unfinished:
-            embedder = Embedder(checkpoint, parent, unfinished, options.donors, halves)
-            with closing(embedder.parts(catalogue, known, options.quiet)) as parts:
-                job = _Job(store, embedder, references, catalogue.where, options)
+        kept = list(runs(catalogue.photos, known, parent))
+        with Embedder(checkpoint, out, parent, options.donors, halves) as embedder:
+            job = _Job(store, embedder, references, catalogue.where, options)
+            with closing(embedder.parts(catalogue, known, kept, options.quiet)) as parts:
                 generation, is_written = job.write(parts)
-            unfinished.clear()
+            embedder.clear()
         looked.note(generation)
         seconds = time.perf_counter() - start - job.choosing_s
     notes = (options.note, UNNOTED if parent is not None and looked.unnoted else why)

@@ -9,8 +9,9 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -21,13 +22,14 @@ from indexes.store.generation import Generation
 from indexes.store.tables import Block, Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, decode_photo, read_photo
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, Photos, decode_photo, read_photo
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, one_thread
 from retrieval.model.photo_encoder import fastest, on_torch
-from retrieval.search.build.looks import row_of, runs
+from retrieval.model.stored import fingerprint
+from retrieval.search.build.looks import row_of
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -95,12 +97,14 @@ _Listed: TypeAlias = tuple[CataloguePhoto, int]
 
 
 class Embedder:
-    """Embed the photos of a catalogue, and count them. What it encodes is stored in `unfinished` at once.
+    """Embed the photos of a catalogue, and count them; used by `with`, under the lock of the index.
+
+    New codes are stored in the index folder at once, for the case that the build is interrupted.
 
     Args:
         checkpoint: The model.
+        index: Folder of the index.
         parent: The current generation, if this model made it.
-        unfinished: Codes that an interrupted build left.
         donors: Other generations of this model, whose codes serve photos of the same content.
         halves: A generation whose partial activations this model would make again, but not its embeddings.
 
@@ -115,29 +119,51 @@ class Embedder:
     def __init__(
         self,
         checkpoint: Checkpoint,
+        index: Path,
         parent: Generation | None,
-        unfinished: Unfinished,
         donors: Sequence[Generation] = (),
         halves: Generation | None = None,
     ) -> None:
-        self.checkpoint, self.parent, self._unfinished, self._halves = checkpoint, parent, unfinished, halves
+        self.checkpoint, self.parent, self._halves = checkpoint, parent, halves
+        config = checkpoint.config.matcher
+        layouts: Layouts = {
+            "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
+            "halves": (np.dtype(np.float16), (config.half,)),
+            "half_error": (np.dtype(np.float32), ()),
+        }
+        self._unfinished = Unfinished(index, fingerprint(checkpoint), layouts)
         self._holders = [holder for holder in (parent, *donors, halves) if holder is not None]
         self.objects, self.made = Counter[str](), Counter[str]()
         self.skipped: list[SkippedPhoto] = []
         self.known, self.half_error = 0, 0.0
         self._encode_photos, self._see = on_torch(checkpoint), checkpoint.config.preprocessing.photo_of
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._unfinished.__exit__(kind, error, trace)
+
+    def clear(self) -> None:
+        """Delete the codes for an interrupted build: a generation holds them now."""
+        self._unfinished.clear()
+
     @property
     def removed(self) -> int:
         """Number of the parent's photos that the catalogue no longer has."""
         return 0 if self.parent is None else self.parent.count - self.known
 
-    def parts(self, catalogue: Catalogue, known: Slots, quiet: bool) -> Generator[Part, None, None]:
+    def parts(
+        self, catalogue: Catalogue, known: Slots, kept: Iterable[slice], quiet: bool
+    ) -> Generator[Part, None, None]:
         """Yield the photos of the catalogue in its order.
 
         Args:
             catalogue: The photos, N of them.
             known: The parent's row of each photo whose file need not be read (N,), else -1.
+            kept: Runs of photos whose rows in the parent follow each other and stay as they are.
             quiet: Show no progress.
 
         Raises:
@@ -152,7 +178,7 @@ class Embedder:
             self._see = partial(self._see, resize=resize_photo)
             if next(self.checkpoint.matcher.parameters()).device.type == "cpu":
                 self._encode_photos = fastest(self.checkpoint)
-        found = ahead(partial(self._find, catalogue), self._steps(catalogue, known), threads, 2 * threads)
+        found = ahead(partial(self._find, catalogue), _steps(catalogue.photos, known, kept), threads, 2 * threads)
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
             for part in ahead(self._encode, _full(found), threads, 2 * threads):
                 self._count(part)
@@ -165,18 +191,6 @@ class Embedder:
             # Codes that are reused were rounded when they were made.
             errors = [holder.manifest.about.get("half_error", 0.0) for holder in self._holders]
             self.half_error = max(self.half_error, *errors)
-
-    def _steps(self, catalogue: Catalogue, known: Slots) -> Iterator[Part | list[_Listed]]:
-        """Long runs of the parent's rows, and between them lists of photos, each with its row where it is known."""
-        done = 0
-        for run in chain(runs(catalogue.photos, known, self.parent), [slice(len(known), len(known))]):
-            others = zip(catalogue.photos[done : run.start], known[done : run.start].tolist(), strict=True)
-            yield from batches(others, READ)
-            if run.start < run.stop:
-                first = int(known[run.start])
-                kept = range(first, first + run.stop - run.start)
-                yield Part(kept=kept, objects=catalogue.photos[run].objects)
-            done = run.stop
 
     def _find(self, catalogue: Catalogue, step: Part | list[_Listed]) -> Part | list[_Item]:
         """Read files, and keep the bytes of those that must be encoded. Called on threads."""
@@ -300,14 +314,15 @@ def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: 
         pool.shutdown(cancel_futures=True)
 
 
-def layouts(checkpoint: Checkpoint) -> Layouts:
-    """Return the dtype and shape of each array that `Unfinished` stores of a photo for this checkpoint."""
-    config = checkpoint.config.matcher
-    return {
-        "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
-        "halves": (np.dtype(np.float16), (config.half,)),
-        "half_error": (np.dtype(np.float32), ()),
-    }
+def _steps(photos: Photos, known: Slots, kept: Iterable[slice]) -> Iterator[Part | list[_Listed]]:
+    """Parts of the parent's rows, and between them lists of photos, each with its row where it is known."""
+    done = 0
+    for run in [*kept, slice(len(known), len(known))]:
+        yield from batches(zip(photos[done : run.start], known[done : run.start].tolist(), strict=True), READ)
+        if run.start < run.stop:
+            first = int(known[run.start])
+            yield Part(kept=range(first, first + run.stop - run.start), objects=photos[run].objects)
+        done = run.stop
 
 
 def _full(found: Iterable[Part | list[_Item]]) -> Iterator[Part | list[_Item]]:
