@@ -8,6 +8,7 @@ import inspect
 import itertools
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,13 @@ def _text(docstring: str | None) -> str:
 def _paragraph(text: str) -> str:
     if text.startswith(">>>"):
         return f"```python\n{text}\n```"
+    if section := re.match(r"(Args|Attributes|Raises|Returns):\n", text):  # of a Google-style docstring
+        below = textwrap.dedent(text[section.end() :])
+        if section[1] == "Returns":
+            return f"Returns: {below}"
+        entries = re.split(r"\n(?=\S)", below)
+        items = [re.sub(r"^(\w+): ", r"`\1`: ", entry).replace("\n    ", "\n  ") for entry in entries]
+        return f"{section[1]}:\n\n" + "\n".join(f"* {item}" for item in items)
     columns = re.search(r"^\S.*\S {2,}\S", text, flags=re.MULTILINE) and not text.startswith("* ")
     return f"```\n{text}\n```" if columns else text
 

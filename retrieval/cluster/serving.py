@@ -13,10 +13,11 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -32,7 +33,6 @@ from retrieval.search.query.opening import described_cluster, folder_shard
 from retrieval.search.query.shard import Described, Felt, Judged, Page, first_rows, merged, one_page
 from retrieval.search.sharding.object_store import folder_with
 
-T = TypeVar("T")
 HOLDERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
 AGAIN_S, AT_HAND_S = 0.05, 0.005
@@ -81,17 +81,13 @@ class ShardReplica:
         self._shard = folder_shard(generation, stored)
         threadpool_limits(1, "blas")  # as long as this process lives: idle ones spin, and take others' processors
 
-    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged | Exception:
-        """As `Shard.ask`. What is wrong is given back: raised, it would come with the tracebacks of all processes."""
-        return _or_error(lambda: self._shard.ask(felt, top, candidates, posterior))
-
-    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None] | Exception:
-        """As `Shard.rows`."""
-        return _or_error(lambda: self._shard.rows(ids))
-
-    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page | Exception:
-        """As `Shard.page`."""
-        return _or_error(lambda: self._shard.page(words, object_id, offset, limit))
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Return what this method of `Shard` returns, or its error: raised, it would carry the tracebacks of all
+        processes."""
+        try:
+            return getattr(self._shard, method)(*arguments)
+        except (RetrievalError, IndexesError) as error:
+            return error
 
 
 class RayShards:
@@ -124,17 +120,14 @@ class RayShards:
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`. Raises Unanswered where a shard does not answer."""
 
-        def of_shard(entry: ShardEntry) -> Callable[[int, int], Page]:
-            def page(offset: int, limit: int) -> Page:
-                answers, silent = self._asked("page", list(words), object_id, offset, limit, entries=[entry])
-                if silent:
-                    raise self._unanswered(silent, self.described.photos - entry.photos)
-                found: Page = answers[0]
-                return found
+        def of_shard(entry: ShardEntry, offset: int, limit: int) -> Page:
+            answers, silent = self._asked("page", list(words), object_id, offset, limit, entries=[entry])
+            if silent:
+                raise self._unanswered(silent, self.described.photos - entry.photos)
+            found: Page = answers[0]
+            return found
 
-            return page
-
-        return one_page([of_shard(entry) for entry in self.entries], offset, limit)
+        return one_page([partial(of_shard, entry) for entry in self.entries], offset, limit)
 
     def _asked(
         self, method: str, *asked: Any, entries: Sequence[ShardEntry] | None = None
@@ -155,7 +148,7 @@ class RayShards:
         return answers, silent
 
     def _send(self, entry: ShardEntry, method: str, asked: Sequence[Any]) -> Any:
-        return getattr(self._handles[entry.folder], method).remote(*asked)
+        return self._handles[entry.folder].call.remote(method, *asked)
 
     def _answer(self, entry: ShardEntry, response: Any, method: str, asked: Sequence[Any], until: float) -> Any:
         """The answer of a shard, asked again where its replica was lost; None where it has none in time."""
@@ -238,13 +231,7 @@ class Deployments:
             if made and made[1] not in held:
                 self._ray.serve.delete(name, _blocking=False)
 
-    def _deploy(
-        self,
-        names: dict[str, str],
-        cluster: str,
-        manifest: ClusterManifest,
-        stored: Stored,
-    ) -> None:
+    def _deploy(self, names: dict[str, str], cluster: str, manifest: ClusterManifest, stored: Stored) -> None:
         serve, held = self._ray.serve, self._held
         there = serve.status().applications
         wanted = [entry for entry in manifest.shards if names[entry.folder] not in there]
@@ -292,10 +279,3 @@ class Deployments:
         if self._ray.is_initialized():
             for name in over:
                 self._ray.serve.delete(name, _blocking=False)
-
-
-def _or_error(function: Callable[[], T]) -> T | Exception:
-    try:
-        return function()
-    except (RetrievalError, IndexesError) as error:
-        return error

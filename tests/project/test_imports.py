@@ -92,6 +92,16 @@ def test_the_layers_of_retrieval_run_one_way():
                 assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
 
 
+def test_the_rooms_of_search_run_one_way():
+    """A query needs nothing of a build, nor a build of a query; one module opens what lies in shards."""
+    search = ROOT / "retrieval" / "search"
+    for room, others in (("build", ("query", "sharding")), ("query", ("build", "sharding")), ("sharding", ("query",))):
+        for path in sorted((search / room).glob("*.py")):
+            barred = tuple(f"retrieval.search.{other}" for other in others)
+            met = [name for name in imported(path) if name.startswith(barred)]
+            assert not met or path.name == "opening.py", f"{path} imports {met}"
+
+
 def test_the_layers_are_as_contributing_and_the_package_say():
     rows = table_rows(CONTRIBUTING)
     first = next(number for number, row in enumerate(rows) if row[0] == "layers of `retrieval/`") + 2

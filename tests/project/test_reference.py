@@ -66,6 +66,13 @@ def test_the_reference_page_is_up_to_date():
     assert PAGE.read_text("utf-8") == reference.reference(), "run `python -m benchmarks.reference`"
 
 
+def test_the_sections_of_a_docstring_become_lists():
+    text = "Do it.\n\nArgs:\n    top: How many\n        objects.\n    none: Prior.\n\nReturns:\n    Answers."
+    assert reference._text(text) == (
+        "Do it.\n\nArgs:\n\n* `top`: How many\n  objects.\n* `none`: Prior.\n\nReturns: Answers.\n"
+    )
+
+
 def test_importing_the_packages_and_naming_what_they_have_imports_nothing_heavy():
     code = "import retrieval, robot, indexes\nprint(dir(retrieval), dir(robot), dir(indexes), indexes.load_kind)"
     done = run_blocked(code, HEAVY)

@@ -142,7 +142,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         looked = Looked(catalogue, out, options.verify)
         known = looked.known(parent)
         kept = list(runs(catalogue.photos, known, parent))
-        with Embedder(checkpoint, out, parent, options.donors, halves) as embedder:
+        with closing(Embedder(checkpoint, out, parent, options.donors, halves)) as embedder:
             job = _Job(store, embedder, references, catalogue.where, options)
             with closing(embedder.parts(catalogue, known, kept, options.quiet)) as parts:
                 generation, is_written = job.write(parts)

@@ -10,8 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -56,7 +55,7 @@ class _Code(NamedTuple):
     origin: str
 
 
-@dataclass
+@dataclass(slots=True)
 class _Photo:
     """The row of a photo that was read; and where the parent lacks it, its file or the code of an equal file."""
 
@@ -97,7 +96,7 @@ _Listed: TypeAlias = tuple[CataloguePhoto, int]
 
 
 class Embedder:
-    """Embed the photos of a catalogue, and count them; used by `with`, under the lock of the index.
+    """Embed the photos of a catalogue, and count them, under the lock of the index; `close` it.
 
     New codes are stored in the index folder at once, for the case that the build is interrupted.
 
@@ -138,13 +137,9 @@ class Embedder:
         self.known, self.half_error = 0, 0.0
         self._encode_photos, self._see = on_torch(checkpoint), checkpoint.config.preprocessing.photo_of
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._unfinished.__exit__(kind, error, trace)
+    def close(self) -> None:
+        """Close the file of the codes for an interrupted build."""
+        self._unfinished.__exit__(None, None, None)
 
     def clear(self) -> None:
         """Delete the codes for an interrupted build: a generation holds them now."""

@@ -1,6 +1,6 @@
 """What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,11 @@ class NearestReference:
     adds: float | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return {"touch": list(self.touch), "cosine": self.cosine, "adds": self.adds}
+        """Return a plain dictionary for JSON."""
+        return {**asdict(self), "touch": list(self.touch)}
+
+
+_SAID_OF_MATCH = ("rank", "object_id", "logit", "probability", "probability_if_present", "photo", "metadata")
 
 
 @dataclass(frozen=True)
@@ -65,16 +68,8 @@ class Match:
     probability_if_present: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        said = {
-            "rank": self.rank,
-            "object_id": self.object_id,
-            "logit": self.logit,
-            "probability": self.probability,
-            "probability_if_present": self.probability_if_present,
-            "photo": self.photo,
-            "metadata": self.metadata,
-        }
+        """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
+        said = {name: getattr(self, name) for name in _SAID_OF_MATCH}
         return said if self.reference is None else {**said, "reference": self.reference.to_dict()}
 
 
@@ -143,13 +138,12 @@ class QueryResult:
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
         """Inverse of `to_dict`. Raises BadInput for another document."""
         try:
-            catalogue, asked = Path(document["index"]["catalogue"]), document["query"]
-            matches = [_match(match, catalogue) for match in document["results"]]
-            others = {
-                name: document[name] for name in ("index", "timing_ms", "verdict", "none_probability", "posterior")
-            }
+            matches = [_match(match, Path(document["index"]["catalogue"])) for match in document["results"]]
+            asked = {name: document["query"][name] for name in ("touches", "grasps")}
+            names = ("index", "timing_ms", "verdict", "none_probability", "posterior")
+            others = {name: document[name] for name in names}
             others["more_grasps"] = document.get("more_grasps")  # a service's history holds documents without it
-            return cls(touches=asked["touches"], grasps=asked["grasps"], results=matches, **others)
+            return cls(**asked, results=matches, **others)
         except (KeyError, TypeError) as error:
             raise BadInput(f"this is not the document of `retrieve query --json`: {error!r}") from error
 

@@ -122,7 +122,7 @@ class Searcher:
 
     @property
     def generation(self) -> Generation:
-        """The opened generation, where one index folder is searched. Raises BadInput for a cluster."""
+        """The opened generation of an index folder. Raises BadInput for a sharded index."""
         return self._folder.generation
 
     @property
@@ -198,8 +198,8 @@ class Searcher:
         """
         held = self._held()
         grasps = read_grasps(touches, held.reader.fingers)
-        asked = [slice(count) for count in range(1, len(grasps) + 1)]
-        return held._answers(grasps, asked, background, top, candidates, none_prior)
+        spans = [slice(count) for count in range(1, len(grasps) + 1)]
+        return held._answers(grasps, spans, background, top, candidates, none_prior)
 
     def query_many(
         self,
@@ -251,13 +251,13 @@ class Searcher:
     def _answers(
         self,
         grasps: Sequence[Sequence[GivenImage]],
-        asked: Sequence[slice],
+        spans: Sequence[slice],
         background: Sequence[AnyImage] | None,
         top: int,
         candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
-        """An answer for each object in the hand; each slice of `asked` selects the grasps of one object."""
+        """An answer for each object in the hand; each span selects the grasps of one object."""
         require_counts(top, candidates)
         require_prior(none_prior)
         if not grasps:
@@ -268,14 +268,14 @@ class Searcher:
         if self.gel_check is not None and codes.readings is not None:
             shown = np.array(self.gel_check.judge(codes.readings, codes.levels))
         judged = []
-        for its in asked:
+        for its in spans:
             felt = (shown[its] == CONTACT) & (shown[its] != NOT_A_GEL).all()
             own = Felt(codes.embeddings[its][felt], codes.halves[its][felt])
             judged.append(self._judged(own, top, candidates, none_prior, clock))
-        timing_ms = clock.finished(len(asked))
+        timing_ms = clock.finished(len(spans))
         return [
             self._answer(grasps[its], shown[its].tolist(), codes.embeddings[its], timing_ms, found, none_prior)
-            for its, found in zip(asked, judged, strict=True)
+            for its, found in zip(spans, judged, strict=True)
         ]
 
     def _judged(
@@ -304,10 +304,8 @@ class Searcher:
     ) -> QueryResult:
         described, belief = self.described, judged.belief if judged else None
         verdict = _verdict(shown, belief)
-        shares = {}
-        if described.shards > 1:
-            searched = described.photos if judged is None else judged.found.searched
-            shares = {"shards": described.shards, "searched": searched / described.photos}
+        searched = judged.found.searched if judged else described.photos
+        shares = {"shards": described.shards, "searched": searched / described.photos} if described.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,

@@ -26,7 +26,6 @@ from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import BadInput, TooManyBad, Unanswered
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
-from retrieval.search.query.opening import stored_for
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.sharding.build_cluster import build_cluster
 from tests import on_ray, referenced, serving, synthetic
@@ -92,12 +91,6 @@ def test_answers_are_those_of_the_folder(count, held, searcher, grasps):
         assert (ours.index["shards"], ours.index["searched"]) == (4, 1.0)
 
 
-def test_with_candidates_a_shard_judges_as_many_as_the_folder(held, searcher, grasps):
-    for candidates in (1, 2, 5):
-        ours, theirs = (one.query(grasps[0], top=1, candidates=candidates) for one in (held, searcher))
-        assert ours.top.logit >= theirs.top.logit - 1e-5
-
-
 def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
     rows = list(searcher.generation.rows)
     ids = [row["id"] for row in rows[::7]] + ["absent"]
@@ -155,17 +148,6 @@ def test_a_shard_leaves_the_processors_to_others_between_two_queries(cluster):
     said = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
     assert said
     assert set(said) == {"1"}
-
-
-def test_many_threads_ask_at_once(held, grasps):
-    expected = names(held.query(grasps[0]))
-    found, threads = [], []
-    for _ in range(8):
-        threads.append(threading.Thread(target=lambda: found.append(names(held.query(grasps[0])))))
-        threads[-1].start()
-    for thread in threads:
-        thread.join(300)
-    assert found == [expected] * 8
 
 
 def test_one_that_ends_leaves_the_shards_of_another(ray, cluster, held, grasps):
@@ -474,7 +456,3 @@ def test_without_a_cluster_the_service_says_what_to_do(index, capsys):
 
     assert main(["serve", "--index", str(index), "--cluster", "--no-history"]) == 2
     assert "is one index folder; make a cluster by `retrieve build-index --shards`" in capsys.readouterr().err
-
-
-def test_the_checkpoint_of_a_cluster_is_found(cluster, model):
-    assert stored_for(read_cluster(cluster), None).path == model

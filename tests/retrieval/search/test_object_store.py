@@ -314,7 +314,9 @@ def test_damage_that_another_machine_finds_is_embedded_again(build, store, embed
         assert opened.described.photos == 24
 
 
-def test_of_two_builds_at_once_the_one_that_comes_second_is_told(build, store, catalogue, tmp_path, monkeypatch, touch):
+def test_of_two_builds_at_once_the_second_is_told_and_embeds_nothing_twice(
+    build, store, catalogue, tmp_path, monkeypatch, touch, embedded
+):
     build()
     run = building.one_after_another
     other = changed(catalogue, tmp_path / "other", 2)
@@ -332,29 +334,8 @@ def test_of_two_builds_at_once_the_one_that_comes_second_is_told(build, store, c
     with Searcher.open(URL) as opened:
         assert opened.described.photos == 26
         assert opened.query(touch).index["searched"] == 1.0
-
-
-def test_of_two_first_builds_that_both_looked_one_makes_the_cluster_and_the_other_adds_to_it(
-    build, store, catalogue, tmp_path, requests, embedded, monkeypatch
-):
-    """The second switches between the last look of the first and its switch."""
-    mine, theirs = (changed(catalogue, tmp_path / name, times) for name, times in (("mine", 1), ("theirs", 2)))
-
-    def meanwhile(name, path, *_):
-        if name == "pipe_file" and path.endswith("/CLUSTER.json"):
-            requests.rule = None
-            with monkeypatch.context() as elsewhere:
-                elsewhere.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # another machine
-                build(theirs)
-
-    requests.rule = meanwhile
-    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
-        build(mine)
-    with Searcher.open(URL) as opened:
-        assert opened.described.photos == 26
     embedded.clear()
-    report = build(mine)
-    assert (report.generation, report.photos, embedded) == ("cluster-000002", 25, [])
+    assert (build(changed(catalogue, tmp_path / "c")).photos, embedded) == (25, [])
 
 
 # Bad input ------------------------------------------------------------------------------------------------------------

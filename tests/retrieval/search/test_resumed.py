@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,10 +123,3 @@ def test_ctrl_c_keeps_what_was_embedded_and_says_so(own, model, tmp_path, embedd
     assert main(command) == 0
     assert sum(embedded) == PHOTOS
     assert done >= 16
-
-
-def test_an_index_without_leftovers_is_what_a_build_leaves(own, model, tmp_path):
-    index = tmp_path / "index"
-    build_index(own, load_checkpoint(model), index, quiet=True)
-    assert sorted(path.name for path in index.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
-    assert not Path(index / FOLDER).exists()

@@ -69,14 +69,6 @@ def test_one_pillow_image_may_be_given_for_both_fingers(searcher, touch):
     assert ranking(searcher.query([image, image])) == ranking(searcher.query([touch[0], touch[0]]))
 
 
-def test_a_bad_array_is_named_by_grasp_and_finger(searcher, touch):
-    good = array(touch[0])
-    with pytest.raises(
-        ImageError, match=r"grasp 2, finger b \(array 120 x 160 x 3 float64\): an array must hold uint8"
-    ):
-        searcher.query([[good, good], [good, good / 255]])
-
-
 # Several objects -----------------------------------------------------------------------------------------------------
 
 

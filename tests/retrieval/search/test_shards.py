@@ -17,7 +17,6 @@ from indexes.store.manifest import own_digest
 from retrieval.errors import BadInput, RetrievalError, TooManyBad
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Mass, Posterior
-from retrieval.search.build.build_index import build_index
 from retrieval.search.query.objects import ListedPhoto
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import Judged, Ranked, merged
@@ -69,7 +68,6 @@ def test_when_all_are_judged_answers_are_those_of_one_folder(posterior, count, d
 
 def test_the_best_of_a_few_are_the_best_of_all(divided, searcher, grasps):
     same_answers(divided.query(grasps[0], top=2), searcher.query(grasps[0], top=2))
-    assert [match.rank for match in divided.query(grasps[0], top=2).results] == [1, 2]
 
 
 def test_with_as_many_candidates_in_each_shard_the_winner_is_found_at_least_as_often(divided, searcher, grasps):
@@ -107,13 +105,10 @@ def test_rows_are_found_in_whatever_shard_they_lie(divided, searcher):
     assert divided.shard.rows(asked)[-1] is None
 
 
-def test_an_answer_says_of_how_many_shards_and_that_all_were_searched(divided, searcher, touch, cluster):
+def test_an_answer_says_of_how_many_shards_and_what_concerns_one_folder_is_refused(divided, searcher, touch, cluster):
     index = divided.query(touch).index
     assert (index["shards"], index["searched"]) == (len(read_cluster(cluster).shards), 1.0)
     assert "shards" not in searcher.query(touch).index
-
-
-def test_what_concerns_one_folder_is_refused_for_several(divided):
     with pytest.raises(BadInput, match="is a cluster of index folders"):
         _ = divided.generation
 
@@ -304,13 +299,10 @@ def test_a_shard_none_of_whose_photos_can_be_read_is_left_out(own, model):
     assert read_cluster(cluster).photos == report.photos
 
 
-@pytest.mark.parametrize("shards", [0, -1, 5000])
-def test_a_number_of_shards_that_is_none_is_refused(shards, catalogue, model, tmp_path):
-    with pytest.raises(BadInput, match="shards must be from 1 to 4096"):
-        build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", shards, quiet=True)
-
-
-def test_an_index_folder_is_not_made_a_cluster(catalogue, model, index):
+def test_a_number_of_shards_that_is_none_and_an_index_folder_are_refused(catalogue, model, index, tmp_path):
+    for shards in (0, -1, 5000):
+        with pytest.raises(BadInput, match="shards must be from 1 to 4096"):
+            build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", shards, quiet=True)
     with pytest.raises(BadInput, match="is an index folder; give another one"):
         build_cluster(catalogue, load_checkpoint(model), index, 2, quiet=True)
 
@@ -361,20 +353,14 @@ def test_ray_that_goes_on_failing_ends_the_build_in_a_sentence(failing, catalogu
 # Damage ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_generation_that_is_not_the_clusters_is_refused(own):
+def test_a_missing_shard_is_named_and_another_ones_generation_refused_in_its_place(own):
     _, cluster = own
-    first, second = (cluster / entry.folder for entry in read_cluster(cluster).shards[:2])
-    shutil.rmtree(first)
-    shutil.copytree(second, first)
-    with pytest.raises(CorruptIndex, match=r"is not the generation that .* was written for"):
+    first, second = read_cluster(cluster).shards[:2]
+    shutil.rmtree(cluster / first.folder / first.generation)
+    with pytest.raises(CorruptIndex, match=f"{first.folder}: the generation {first.generation} is missing"):
         Searcher.open(cluster)
-
-
-def test_a_missing_shard_is_named(own):
-    _, cluster = own
-    entry = read_cluster(cluster).shards[1]
-    shutil.rmtree(cluster / entry.folder / entry.generation)
-    with pytest.raises(CorruptIndex, match=f"{entry.folder}: the generation {entry.generation} is missing"):
+    shutil.copytree(cluster / second.folder / second.generation, cluster / first.folder / first.generation)
+    with pytest.raises(CorruptIndex, match=r"is not the generation that .* was written for"):
         Searcher.open(cluster)
 
 
@@ -395,19 +381,16 @@ def test_a_manifest_cut_short_is_refused_in_a_sentence(cut, own):
         Searcher.open(cluster)
 
 
-ENTRY = {"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "", "photos": 1, "objects": 1}
+ENTRY = {"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "0" * 64, "photos": 1, "objects": 1}
 
 
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("shards", []),
-        ("shards", [{"folder": "../elsewhere", "generation": "gen-000001", "sha256": "", "photos": 1, "objects": 1}]),
-        ("shards", [{"folder": "shard-00-of-01", "generation": "gen/../1", "sha256": "", "photos": 1, "objects": 1}]),
-        (
-            "shards",
-            [{"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "", "photos": -1, "objects": 1}],
-        ),
+        ("shards", [ENTRY | {"folder": "../elsewhere"}]),
+        ("shards", [ENTRY | {"generation": "gen/../1"}]),
+        ("shards", [ENTRY | {"photos": -1}]),
         ("generation", "gen-000001"),
         ("fingerprint", {"checkpoint": 1}),
         ("about", []),
@@ -436,9 +419,3 @@ def test_another_format_is_told(own):
     path.write_text(json.dumps(content))
     with pytest.raises(UnsupportedFormat, match="has the newer format 99, this software reads 1; update"):
         Searcher.open(cluster)
-
-
-def test_an_index_of_one_folder_is_still_one(catalogue, model, tmp_path):
-    build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
-    with Searcher.open(tmp_path / "index") as searcher:
-        assert (searcher.described.shards, searcher.generation.count) == (1, 24)

@@ -10,7 +10,6 @@ from PIL import Image
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
-from retrieval.model.posterior import Posterior
 from retrieval.model.stored import read_stored
 from retrieval.search.defaults import SHIPPED, shipped_model
 from retrieval.search.query.answer import EXIT_CODES, in_words
@@ -65,17 +64,6 @@ def test_a_touch_is_judged_and_all_that_may_be_adds_up_to_one(searcher, grasps):
         assert result.verdict == ("match" if best > result.none_probability else "none of these")
 
 
-def test_the_answer_holds_all_that_its_probabilities_are_made_of(searcher, grasps):
-    own = [grasp for grasp in grasps if grasp.object_id == grasps[0].object_id]
-    result = searcher.query([grasp.touches for grasp in own], top=99, none_prior=0.3)
-    said = result.to_dict()["posterior"]
-    weight = said["slope"] / (1 + said["dependence"] * (said["grasps"] - 1))
-    odds = [0.7 / said["objects"] * np.exp(weight * match.logit + said["offset"]) for match in result.results]
-    assert [match.probability for match in result.results] == pytest.approx(np.array(odds) / (0.3 + sum(odds)))
-    assert (said["grasps"], said["objects"], said["judged_objects"], said["unjudged_probability"]) == (2, 4, 4, 0.0)
-    assert "exp(w * logit + offset)" in said["formula"]
-
-
 def test_untouched_gels_name_nobody(searcher, grasps):
     for grasp in grasps:
         result = searcher.query(grasp.backgrounds)
@@ -88,10 +76,6 @@ def test_untouched_gels_name_nobody(searcher, grasps):
 def test_pictures_that_are_no_gel_images_name_nobody(searcher, kind):
     result = searcher.query([picture(kind)] * 2)
     assert (result.verdict, result.results, result.grasps) == ("not a gel image", [], ["not a gel image"])
-
-
-def test_a_photo_given_as_gel_images_names_nobody(searcher, grasps):
-    assert searcher.query([grasps[0].photo] * 2).verdict == "not a gel image"
 
 
 def test_one_foreign_picture_among_good_grasps_refuses_them_all_and_is_named(searcher, grasps):
@@ -123,11 +107,6 @@ def test_several_objects_at_once_have_each_their_own_verdict(searcher, grasps):
     results = searcher.query_many([grasps[0].touches, grasps[0].backgrounds, [picture("black")] * 2])
     assert [result.verdict for result in results][1:] == ["no contact", "not a gel image"]
     assert results[0].results
-
-
-def test_a_prior_of_zero_rules_out_that_the_catalogue_lacks_it(searcher, grasps):
-    result = searcher.query(grasps[0].touches, none_prior=0)
-    assert (result.none_probability, result.verdict) == (0.0, "match")
 
 
 def test_the_command_says_the_verdict_by_its_exit_code_in_json_and_on_the_page(index, grasps, tmp_path, capsys):
@@ -164,14 +143,3 @@ def test_the_card_of_a_shipped_checkpoint_is_its_own_and_says_how_often_its_chec
     assert card.startswith(f"# {path.name}")
     assert stored.provenance["data_digest"][:16] in card
     assert f"touches called foreign {stored.gel_check.shares['touches_called_foreign']:.3f}" in card
-
-
-def test_a_model_without_a_posterior_ranks_and_says_that_it_is_uncalibrated(index, grasps, monkeypatch):
-    with Searcher.open(index) as searcher:
-        calibrated = searcher.query(grasps[0].touches)
-        searcher.posterior = None
-        result = searcher.query(grasps[0].touches)
-    assert (result.verdict, result.none_probability, result.posterior) == ("uncalibrated", None, None)
-    assert all(match.probability is None for match in result.results)
-    assert Posterior().weight(1) == 1
-    assert {match.object_id for match in result.results} == {match.object_id for match in calibrated.results}
