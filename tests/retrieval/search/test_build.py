@@ -155,17 +155,6 @@ def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(own, checkpoi
     assert report.half_error == before.manifest.about["half_error"]
 
 
-def test_a_whole_catalogue_under_other_names_is_not_embedded_again(own, checkpoint, index, embedded):
-    build_index(own, checkpoint, index, quiet=True)
-    embedded.clear()
-    for number, photo in enumerate(sorted(own.rglob("*.jpg"))):
-        photo.rename(own / f"{photo.parent.name}_{number}.jpg")
-    report = build_index(own, checkpoint, index, objects_from="stem", quiet=True)
-    assert embedded == []
-    assert (report.photos, report.objects, report.renamed) == (24, 8, 24)
-    assert Searcher.open(index).generation.count == 24
-
-
 def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(own, checkpoint, index):
     (own / "twin").mkdir()
     shutil.copy(first_photo(own), own / "twin" / "1.jpg")
