@@ -12,8 +12,7 @@ from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.training.finish import finish, unfinished
-from retrieval.training.train import Trainer, labelled_pairs
+from retrieval.training.train import Trainer, finish, labelled_pairs, unfinished
 
 
 @dataclass(frozen=True, eq=False)

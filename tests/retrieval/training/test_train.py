@@ -23,8 +23,9 @@ from retrieval.model.losses.match import match_loss
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.judgement import with_verdicts
+from retrieval.training.state import state_path
 from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
-from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
+from retrieval.training.train import Trainer, build_matcher, set_training_mode, train
 from tests.conftest import TINY
 from tests.labelled import label_recording
 from tests.waiting import running, until
