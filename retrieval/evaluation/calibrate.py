@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration
-from retrieval.metrics.reliability import reliability_bins
+from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import LEAST_OBJECTS, JudgedTouches, Posterior, Questions, fit_questions
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import LEADING, View, canonical, cosine, decompose, factored, unit_rows
-from retrieval.methods.held_out import held_out_folds
-from retrieval.methods.selection import Validator, judged_rows
+from retrieval.methods.selection import Validator, held_out_folds, judged_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
 from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior

@@ -316,6 +316,13 @@ def load_config(name_or_path: str) -> Config:
     return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 
 
+def named_config(config: Config | str, name: str | None = None) -> tuple[Config, str]:
+    """Return a configuration, given as such or as `load_config` takes it, and what it is called."""
+    if isinstance(config, Config):
+        return config, name or "own"
+    return load_config(config), name or Path(config).stem
+
+
 def preset_names() -> list[str]:
     """Names of the presets that come with the package."""
     files = (resources.files("retrieval") / "configs").iterdir()

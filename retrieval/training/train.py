@@ -22,11 +22,13 @@ from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.check.recording import require_fit
 from retrieval.data.dataset import (
+    AnyRecording,
     Grasp,
     PairSampler,
     Split,
     data_digest,
     finger_count,
+    folder_of,
     load_grasps,
     make_split,
     recording_source,
@@ -42,7 +44,7 @@ from retrieval.model.checkpoint import (
     save_checkpoint,
     store_checkpoint,
 )
-from retrieval.model.config import Config, TrainingConfig
+from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.weights import initialise_tower
@@ -59,9 +61,9 @@ from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shu
 
 
 def train(
-    recording: Path,
+    recording: AnyRecording,
     out: Path,
-    config: Config,
+    config: Config | str = "small",
     *,
     split: Split | None = None,
     resume: bool = False,
@@ -70,19 +72,30 @@ def train(
 ) -> Checkpoint:
     """Train on a recording and write the best checkpoint by validation objects to `out`.
 
-    split: drawn from the configuration where None. resume: go on from the state beside `out`. cache: folder where
-    decoded images are kept (`retrieval.training.kept`), for towers that are trained. The number of fingers is the
-    recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
-    one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+    Ctrl-C ends after the current step with a usable checkpoint; a second one stops at once.
+
+    Args:
+        recording: A folder, or what `robot.read_recording` returns. It decides the number of fingers.
+        out: The checkpoint (.safetensors).
+        config: As an object (`Config.using` takes towers and losses of your own) or as `load_config` takes it.
+        split: Objects of each part; drawn from the configuration where None.
+        resume: Continue from the state next to `out`.
+        cache: Folder of decoded images (`retrieval.training.kept`), for towers that are trained.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        Interrupted: After Ctrl-C.
 
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
     >>> config = dataclasses.replace(config, training=config.training.of_steps(2))  # a real one takes thousands
-    >>> made = retrieval.train(Path("lab"), Path("lab.safetensors"), config, quiet=True)
+    >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
     >>> made.provenance["step"], len(made.split.train)
     (2, 7)
     """
+    recording, (config, _) = folder_of(recording), named_config(config)
     if cache and config.training.freeze_towers:
         raise ConfigError(
             "images are kept for towers that are trained; frozen ones look at each once: leave out the cache"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.evaluation.real.protocol import Protocol
-from retrieval.metrics.binomial import clopper_pearson
 from retrieval.metrics.choices import compare_choices, summarise_choices
+from retrieval.metrics.guesses import clopper_pearson
 from retrieval.metrics.intervals import LEVEL, compare, summarise
 from retrieval.metrics.measure import Measure
 

@@ -25,7 +25,7 @@ from indexes import KINDS, load_kind
 from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.scores import Floats, Slots
 from retrieval.errors import BadInput
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.search.build.measuring import FEWER, Bench, NeighbourBench, Point, candidate_steps
 
 TARGET = 0.99

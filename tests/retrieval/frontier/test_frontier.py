@@ -16,7 +16,7 @@ from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.pixels import load_touch
 from retrieval.frontier.points import Panel, Row, Tradeoff, duration, missed, number
 from retrieval.frontier.sample import Sample, Scale, blend
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
 from retrieval.search.build.measuring import WinnerBench
