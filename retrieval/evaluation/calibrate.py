@@ -178,12 +178,9 @@ def reliability(
     for choice in choices:
         table, posterior = test.get(choice.grasps), calibrations.posteriors.get(choice.grasps)
         if table and posterior and len(table.objects) >= choice.k:
-            found[choice.name] = _choice_reliability(drawn_choices(table, choice, seed, posterior), posterior)
+            logits = drawn_choices(table, choice, seed, posterior)
+            found[choice.name] = reliability_bins(*stated_first_guesses(logits, posterior).T)
     return found
-
-
-def _choice_reliability(logits: NDArray[np.float64], posterior: Posterior) -> dict[str, Any]:
-    return reliability_bins(*stated_first_guesses(logits, posterior).T)
 
 
 def stated_first_guesses(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import MethodScores, summaries
-from retrieval.training.features import Features, encode_recording
+from retrieval.training.features import encode_recording
 
 CONTROL_METHOD = "late_fusion"
 MEASURED = ("pair_accuracy", "guesses_k5", "guesses_k10")
@@ -81,24 +81,18 @@ def score_beside(what: str, method: str, experiment: Experiment, seed: int, *, d
 
 
 def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:
-    """The experiment of each ceiling. A grasp is never asked with itself, as no touch is with its own photo."""
+    """The experiment of each ceiling; that of photos only where an object has two to tell apart.
+
+    A grasp is never asked with itself, as no touch is with its own photo.
+    """
     features, folder = experiment.features, experiment.folder / "ceilings"
-    seen_twice = {
-        "touch_to_touch": dataclasses.replace(features, photo=features.touch.reshape(len(features), -1)),
-        "photo_to_photo": dataclasses.replace(features, touch=features.photo[:, None]),
-    }
+    twice = {"touch_to_touch": dataclasses.replace(features, photo=features.touch.reshape(len(features), -1))}
+    photos = {(owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)}
+    if len(photos) > len(set(features.object_ids)):
+        twice["photo_to_photo"] = dataclasses.replace(features, touch=features.photo[:, None])
     return {
         name: dataclasses.replace(
-            experiment, folder=folder / name, features=twice, pairs=None, checkpoint=None, role=f"ceiling: {name}"
+            experiment, folder=folder / name, features=each, pairs=None, checkpoint=None, role=f"ceiling: {name}"
         )
-        for name, twice in seen_twice.items()
-        if _is_taken_twice(features, name)
+        for name, each in twice.items()
     }
-
-
-def _is_taken_twice(features: Features, name: str) -> bool:
-    """Whether an object has two photos to tell apart; a touch is always a grasp's own."""
-    if name == "touch_to_touch":
-        return True
-    photos = {(owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)}
-    return len(photos) > len(set(features.object_ids))

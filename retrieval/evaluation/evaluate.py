@@ -115,11 +115,17 @@ def evaluate(
             side: {name: score_beside(words[name], method, one, seed, draws=DRAWS) for name, one in experiments.items()}
             for side, words, method, experiments in sides
         }
+    asked = experiment.queries
+    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
     results = {
         **_about(material, experiment, called, wanted),
-        "audit": _audited(material, out, quiet),
+        "audit": kept_document(
+            out / "audit.json",
+            {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT},
+            lambda: audit(material.grasps, material.split, quiet=quiet),  # it reads every image
+        ),
         **_scored(experiment, predictions, seed, quiet),
-        "faint": _faint(material, experiment, predictions, seed, quiet),
+        "faint": score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed),
         **beside,
     }
     write_document(out / "results.json", results)
@@ -189,15 +195,6 @@ def _scored(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool)
     return {"methods": entries, "comparisons": _compared(measures, seed)}
 
 
-def _faint(
-    material: Material, experiment: Experiment, predictions: BySeed, seed: int, quiet: bool
-) -> dict[str, Any] | None:
-    """ "faint" of results.json."""
-    asked = experiment.queries
-    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
-    return score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed)
-
-
 def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:
     first, *others = measures
     return [
@@ -207,12 +204,6 @@ def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[st
         for other in others
         if key in measures[first][0] and key in measures[other][0]
     ]
-
-
-def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
-    """The leakage audit; it reads every image, so it is kept."""
-    made_by = {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT}
-    return kept_document(out / "audit.json", made_by, lambda: audit(material.grasps, material.split, quiet=quiet))
 
 
 def _timings(material: Material, predictions: BySeed) -> dict[str, Any]:

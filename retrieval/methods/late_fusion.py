@@ -17,7 +17,8 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, score_halves
 from retrieval.training.features import Features
-from retrieval.training.train import Trainer, build_matcher, finish, unfinished
+from retrieval.training.state import finish, unfinished
+from retrieval.training.train import Trainer, build_matcher
 
 SOURCE = "features of a recording"
 """What a checkpoint says it was trained on."""

@@ -59,7 +59,10 @@ class KeptImages:
 
         Raises DatasetError for a picture that cannot be read, BadInput where the disk is too small, OSError.
         """
-        parts = [(self._path(part), part) for part in batches(dict.fromkeys(images), _PART)]
+        parts = [
+            (part_path(self._folder, self._kind, [self._seen_by], part).with_suffix(".npy"), part)
+            for part in batches(dict.fromkeys(images), _PART)
+        ]
         missing = self._unmapped(parts)
         if missing:
             self._require_space(missing, quiet)
@@ -109,9 +112,6 @@ class KeptImages:
             return False
         self._kept |= zip(part, np.asarray(images), strict=True)
         return True
-
-    def _path(self, part: list[Files]) -> Path:
-        return part_path(self._folder, self._kind, [self._seen_by], part).with_suffix(".npy")
 
     def _require_space(self, missing: Sequence[_Part], quiet: bool) -> None:
         count = sum(len(part) for _, part in missing)

@@ -3,13 +3,19 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from retrieval.errors import CheckpointError
-from retrieval.model.checkpoint import beside, load_weights, read_tensors, write_tensors
+from retrieval.model.checkpoint import Checkpoint, beside, load_checkpoint, load_weights, read_tensors, write_tensors
+
+if TYPE_CHECKING:
+    from retrieval.training.train import Trainer
+
+
+_MODEL, _OPTIMIZER = "model.", "optimizer."
 
 
 def state_path(out: Path) -> Path:
@@ -95,4 +101,33 @@ def load_state(
     return header
 
 
-_MODEL, _OPTIMIZER = "model.", "optimizer."
+def unfinished(done: Path) -> Path:
+    """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
+    return done.parent / "unfinished" / done.name
+
+
+def finish(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
+    """Train to the end and return the checkpoint, once: a finished training is read, an unfinished one resumed.
+
+    Args:
+        trainer: A training whose `out` is `unfinished(done)`.
+        done: Where the finished checkpoint lies afterwards. One of another training is replaced.
+        quiet: No progress on stderr.
+
+    Raises:
+        Interrupted: After Ctrl-C; the next call resumes.
+    """
+    mine = (trainer.config, trainer.split, trainer.data_digest)
+    if done.is_file():
+        kept = load_checkpoint(done)
+        if (kept.config, kept.split, kept.provenance.get("data_digest")) == mine:
+            return kept
+    if state_path(trainer.out).is_file():
+        try:
+            trainer.resume()
+        except CheckpointError:  # of another training
+            state_path(trainer.out).unlink()
+    trainer.run(quiet)
+    for ending in (".md", ".safetensors"):
+        beside(trainer.out, ending).replace(beside(done, ending))
+    return load_checkpoint(done)

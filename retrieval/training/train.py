@@ -38,7 +38,6 @@ from retrieval.errors import CheckpointError, ConfigError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
-    beside,
     load_checkpoint,
     require_writable,
     save_checkpoint,
@@ -345,38 +344,6 @@ class Trainer:
 
 FROZEN = ("matcher.touch_tower.", "matcher.photo_tower.")
 """How the names of the weights of frozen towers begin."""
-
-
-def unfinished(done: Path) -> Path:
-    """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
-    return done.parent / "unfinished" / done.name
-
-
-def finish(trainer: Trainer, done: Path, quiet: bool) -> Checkpoint:
-    """Train to the end and return the checkpoint, once: a finished training is read, an unfinished one resumed.
-
-    Args:
-        trainer: A training whose `out` is `unfinished(done)`.
-        done: Where the finished checkpoint lies afterwards. One of another training is replaced.
-        quiet: No progress on stderr.
-
-    Raises:
-        Interrupted: After Ctrl-C; the next call resumes.
-    """
-    mine = (trainer.config, trainer.split, trainer.data_digest)
-    if done.is_file():
-        kept = load_checkpoint(done)
-        if (kept.config, kept.split, kept.provenance.get("data_digest")) == mine:
-            return kept
-    if state_path(trainer.out).is_file():
-        try:
-            trainer.resume()
-        except CheckpointError:  # of another training
-            state_path(trainer.out).unlink()
-    trainer.run(quiet)
-    for ending in (".md", ".safetensors"):
-        beside(trainer.out, ending).replace(beside(done, ending))
-    return load_checkpoint(done)
 
 
 def labelled_pairs(config: Config) -> list[Grasp]:
