@@ -43,7 +43,10 @@ def predict(method: Method, features: Features, queries: Queries, fit_s: float) 
     encoded = time.perf_counter()
     scores = method.score(touch_codes, photo_codes)
     scored = time.perf_counter()
-    sets = {size: _set_scores(method, scores, touch_codes, photo_codes, rows) for size, rows in queries.sets.items()}
+    if type(method)._score_sets is Method._score_sets:  # it adds up scores of single touches: these are there
+        sets = {size: add_up(scores, rows) for size, rows in queries.sets.items()}
+    else:
+        sets = {size: method.score_sets(touch_codes, photo_codes, rows) for size, rows in queries.sets.items()}
     seconds = {
         "fit": fit_s,
         "encode_touch": (touched - start) / len(touch),
@@ -52,15 +55,6 @@ def predict(method: Method, features: Features, queries: Queries, fit_s: float) 
         "query": _query_s(method, touch[:1], photo_codes),
     }
     return Predictions(scores, sets, method.chosen, seconds)
-
-
-def _set_scores(
-    method: Method, single: Scores, touch_codes: Scores, photo_codes: Scores, sets: NDArray[np.int64]
-) -> Scores:
-    """Scores of sets; where a method adds up its scores of single touches, these are not computed again."""
-    if type(method)._score_sets is not Method._score_sets:
-        return method.score_sets(touch_codes, photo_codes, sets)
-    return add_up(single, sets)
 
 
 def _query_s(method: Method, touch: Scores, photo_codes: Scores, repeats: int = 5) -> float:

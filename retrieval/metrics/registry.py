@@ -95,14 +95,14 @@ TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 def _of_gallery(prefix: str, section: str, table: Callable[[Scored], ScoreTable]) -> dict[str, Metric]:
     """Measures of the whole gallery, in one direction."""
-    asked: dict[str, tuple[str, Callable[[ScoreTable], Measure]]] = {
-        **{f"recall_{k}": (f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
-        "mrr": ("MRR", protocols.reciprocal_rank),
-        "map": ("mAP", protocols.average_precision),
-    }
+
+    def metric(column: str, take: Callable[[ScoreTable], Measure]) -> Metric:
+        return Metric(f"{column}, {section}", column, section, lambda of: take(table(of)))
+
     return {
-        f"{prefix}{name}": Metric(f"{column}, {section}", column, section, lambda of, take=take: take(table(of)))
-        for name, (column, take) in asked.items()
+        **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
+        f"{prefix}mrr": metric("MRR", protocols.reciprocal_rank),
+        f"{prefix}map": metric("mAP", protocols.average_precision),
     }
 
 

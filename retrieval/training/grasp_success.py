@@ -129,8 +129,11 @@ def train_gate(
         differences = _Differences(settings, pool)
         gate = Gate(_trained(train, differences, iterations, seed, quiet), settings)
         with Bar("judge", len(validation), "grasps", quiet=quiet) as bar:
-            logits = _judged(gate, validation, differences, bar)
-    report = _report(out, settings.frame, train, validation, logits)
+            logits: list[float] = []  # the highest of each grasp
+            for part in batches(validation, BATCH):
+                logits += [max(fingers) for fingers in gate.judge(differences(part))]
+                bar.advance(len(part))
+    report = _report(out, settings.frame, train, validation, np.array(logits))
     _save(out, gate, split, attempts, recording, report, {"iterations": iterations, "seed": seed})
     return report
 
@@ -224,15 +227,6 @@ def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
         for bounds in ((1 - CONTRAST, 1 + CONTRAST), (-BRIGHTNESS, BRIGHTNESS))
     )
     return images * contrast + brightness
-
-
-def _judged(gate: Gate, attempts: list[Attempt], differences: _Differences, bar: Bar) -> NDArray[np.float64]:
-    """The highest logit of each grasp (B,)."""
-    highest: list[float] = []
-    for part in batches(attempts, BATCH):
-        highest += [max(fingers) for fingers in gate.judge(differences(part))]
-        bar.advance(len(part))
-    return np.array(highest)
 
 
 def _report(
