@@ -25,6 +25,7 @@ from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
+from retrieval.model.towers.small import Small
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features
 from retrieval.training.train import build_matcher
@@ -274,6 +275,13 @@ def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
     with torch.inference_mode():
         together = torch.cat([own(images), published(images)], 1)
         assert torch.allclose(matcher.touch_tower(images), together, atol=1e-5)
+
+
+def test_the_published_tower_is_chosen_by_name_or_as_a_class(model):
+    start = load_checkpoint(model)
+    assert config_for(start, 2, "resnet18", seed=0).matcher.tower == "small+resnet18"
+    assert config_for(start, 2, Small, seed=0).matcher.tower == "small+small"
+    assert config_for(start, 2, None, seed=0).matcher.tower == "small"
 
 
 def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):
