@@ -42,6 +42,8 @@ class BatchImages:
         self.config, self.device = config, device
         self.uses_background = config.preprocessing.background != "none"
         self.decoders = Timed(config.preprocessing.load_touch), Timed(config.preprocessing.load_photo)
+        self._touch: ImageCache | KeptImages
+        self._photo: ImageCache | KeptImages
         self._touch, self._photo = (ImageCache(load, keep_bytes) for load in self.decoders)
         self._ahead = ThreadPoolExecutor(1)
         self._workers = worker_pool(config.training.workers)
@@ -87,12 +89,11 @@ class BatchImages:
     def keep(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
         """Have the images of these grasps decoded into `folder`, and taken from there from now on (`KeptImages`)."""
         settings = self.config.preprocessing
-        self._touch, self._photo = (
-            KeptImages(load, folder, kind, settings.digest(), self.config.training.workers)
-            for load, kind in ((settings.load_touch, "touch"), (settings.load_photo, "photo"))
-        )
-        self._touch.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
-        self._photo.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
+        by, workers = settings.digest(), self.config.training.workers
+        self._touch = touches = KeptImages(settings.load_touch, folder, "touch", by, workers)
+        touches.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
+        self._photo = photos = KeptImages(settings.load_photo, folder, "photo", by, workers)
+        photos.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
 
 
 class TrainedFeatures(BatchImages):

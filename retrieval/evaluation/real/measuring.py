@@ -169,7 +169,7 @@ def read_measured(path: Path, made_by: MadeBy) -> Measured | None:
         return None
     tensors, header = kept
     measures = {
-        name: Measure(*(tensors[f"{name}/{part}"].numpy() for part in ("values", "owner", "chance")), gallery)
+        name: Measure(*(tensors[f"{name}/{part}"].numpy() for part in ("values", "owner", "chance")), gallery=gallery)
         for name, gallery in header["galleries"].items()
     }
     stated = {
