@@ -30,7 +30,7 @@ from retrieval.model.config import Config, load_config
 from retrieval.training.loading import in_order, worker_count
 from robot.recording.folder import RecordingWriter
 
-REPETITIONS, MAX_IMAGES, STEPS = 7, 96, 3
+REPETITIONS, MAX_IMAGES, STEPS = 5, 32, 2
 PHOTO_PX, GEL_PX = (1280, 960), (640, 480)
 
 

@@ -169,7 +169,12 @@ def read_measured(path: Path, made_by: MadeBy) -> Measured | None:
         return None
     tensors, header = kept
     measures = {
-        name: Measure(*(tensors[f"{name}/{part}"].numpy() for part in ("values", "owner", "chance")), gallery=gallery)
+        name: Measure(
+            values=tensors[f"{name}/values"].numpy(),
+            owner=tensors[f"{name}/owner"].numpy(),
+            chance=tensors[f"{name}/chance"].numpy(),
+            gallery=gallery,
+        )
         for name, gallery in header["galleries"].items()
     }
     stated = {
