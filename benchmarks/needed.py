@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.scale import HELD_OUT, MARGIN, TARGET, Crowd, collected, crowd_of
 from retrieval.console.progress import Bar
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.model.judge import Judge
 from retrieval.search.defaults import shipped_model
 

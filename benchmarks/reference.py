@@ -30,8 +30,10 @@ MADE_BY_HAND = (
     retrieval.Client,
     retrieval.Setting,
     robot.Frame,
+    robot.Grip,
     robot.Pose,
     robot.RecordingWriter,
+    robot.Scene,
     indexes.IndexStore,
 )
 """Classes that a user makes an object of; all others come out of a function."""

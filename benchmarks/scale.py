@@ -48,7 +48,7 @@ from indexes.store.generation import Generation
 from indexes.store.tables import Block
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import judge_of
 from retrieval.model.judge import Judge

@@ -24,7 +24,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from retrieval.data.dataset import load_grasps
 from retrieval.methods.selection import neighbours
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.search.build.measuring import FIRST
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.shard import together

@@ -41,7 +41,8 @@ from retrieval.model.encode import has_fast_bfloat16
 from retrieval.model.towers import TOWERS
 from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
-from retrieval.training.fit import Plan, fit, one_ahead
+from retrieval.training.fit import Plan, fit
+from retrieval.training.loading import ahead
 from retrieval.training.relief import ReliefTraining
 from retrieval.training.train import Trainer
 from tests import synthetic
@@ -65,7 +66,7 @@ class Work:
         """So many steps, as a training takes them; nothing is validated."""
         plan = Plan(2 * count, 1e-6, "constant", 2 * count)
         with Bar("", count, "steps", quiet=True) as bar:
-            batches = one_ahead(self.prepare, range(count))
+            batches = ahead(map(self.prepare, range(count)), 1)
             fit(self.optimizer, plan, batches, self.loss, bar=bar, before_step=self.before_step)
 
     def bare(self, batch: Any) -> None:

@@ -17,19 +17,29 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from retrieval.adaptation.recipe import Adaptation as Adaptation
+    from retrieval.adaptation.recipe import adapt as adapt
+    from retrieval.data.check.recording import check_recording as check_recording
+    from retrieval.data.dataset import load_grasps as load_grasps
+    from retrieval.data.dataset import make_split as make_split
     from retrieval.errors import BadInput as BadInput
     from retrieval.errors import RetrievalError as RetrievalError
+    from retrieval.evaluation.evaluate import evaluate as evaluate
+    from retrieval.evaluation.real.benchmark import benchmark as benchmark
     from retrieval.evaluation.real.protocol import Protocol as Protocol
-    from retrieval.evaluation.run import evaluate as evaluate
+    from retrieval.frontier.measure import measure_frontier as measure_frontier
     from retrieval.methods.base import Method as Method
     from retrieval.methods.base import Setting as Setting
     from retrieval.model.checkpoint import Checkpoint as Checkpoint
     from retrieval.model.checkpoint import load_checkpoint as load_checkpoint
     from retrieval.model.config import Config as Config
     from retrieval.model.config import load_config as load_config
+    from retrieval.model.encode import encode_photos as encode_photos
+    from retrieval.model.encode import encode_touches as encode_touches
     from retrieval.model.losses.loss import Loss as Loss
     from retrieval.model.touches import Encoded as Encoded
     from retrieval.model.towers.base import Tower as Tower
+    from retrieval.report.evaluation import write_report as write_report
     from retrieval.search.build.build_index import build_index as build_index
     from retrieval.search.build.build_report import BuildReport as BuildReport
     from retrieval.search.defaults import shipped_model as shipped_model
@@ -47,6 +57,7 @@ if TYPE_CHECKING:
     open = Searcher.open
 
 _PLACES = {
+    "Adaptation": "adaptation.recipe:Adaptation",
     "Agreement": "search.query.agreement:Agreement",
     "BadInput": "errors:BadInput",
     "BuildReport": "search.build.build_report:BuildReport",
@@ -64,16 +75,25 @@ _PLACES = {
     "Searcher": "search.query.searcher:Searcher",
     "Setting": "methods.base:Setting",
     "Tower": "model.towers.base:Tower",
+    "adapt": "adaptation.recipe:adapt",
     "agreement": "search.query.agreement:agreement",
+    "benchmark": "evaluation.real.benchmark:benchmark",
     "build_index": "search.build.build_index:build_index",
+    "check_recording": "data.check.recording:check_recording",
     "embed_photos": "search.embeddings:embed_photos",
-    "evaluate": "evaluation.run:evaluate",
+    "encode_photos": "model.encode:encode_photos",
+    "encode_touches": "model.encode:encode_touches",
+    "evaluate": "evaluation.evaluate:evaluate",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
     "load_config": "model.config:load_config",
+    "load_grasps": "data.dataset:load_grasps",
+    "make_split": "data.dataset:make_split",
+    "measure_frontier": "frontier.measure:measure_frontier",
     "nearest_photos": "search.query.neighbours:nearest_photos",
     "open": "search.query.searcher:Searcher.open",
     "shipped_model": "search.defaults:shipped_model",
     "train": "training.train:train",
+    "write_report": "report.evaluation:write_report",
 }
 """Public name -> where it stands in this package."""
 

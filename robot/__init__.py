@@ -27,11 +27,16 @@ if TYPE_CHECKING:
     from robot.recording.grasp import RecordedGrasp as RecordedGrasp
     from robot.rig import Rig as Rig
     from robot.rig import load_rig as load_rig
+    from robot.sim.gel.sensor import draw_sensor as draw_sensor
+    from robot.sim.objects.draw import draw_object as draw_object
+    from robot.sim.pinch import Grip as Grip
+    from robot.sim.scene import Scene as Scene
 
 _PLACES = {
     "Arm": "devices",
     "Camera": "devices",
     "Frame": "readings",
+    "Grip": "sim.pinch",
     "Gripper": "devices",
     "Pose": "readings",
     "RecordedGrasp": "recording.grasp",
@@ -39,8 +44,11 @@ _PLACES = {
     "RecordingWriter": "recording.folder",
     "Rig": "rig",
     "RobotError": "errors",
+    "Scene": "sim.scene",
     "Shared": "recording.folder",
     "TactileSensor": "devices",
+    "draw_object": "sim.objects.draw",
+    "draw_sensor": "sim.gel.sensor",
     "load_importer": "importers",
     "load_rig": "rig",
     "read_recording": "recording.folder",

@@ -1,10 +1,12 @@
-"""Error against run time of the kernels: the simulated rig, canonical correlations, photos decoded at a fraction.
+"""Error against run time of the kernels: the simulated rig, canonical correlations, photos decoded at a fraction, the
+number format of training.
 
 `python -m benchmarks.frontier --out report/` measures and plots them as `retrieve frontier` does those of a search.
 """
 
 APPROXIMATIONS = {
     "reduced": "benchmarks.frontier.large_photos:reduced",
+    "training_formats": "benchmarks.frontier.training:training_formats",
     "cca_solver": "benchmarks.frontier.correlation:cca_solver",
     "cca_components": "benchmarks.frontier.correlation:cca_components",
     "rays": "benchmarks.frontier.rays:rays",

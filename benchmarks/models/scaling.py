@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
-from retrieval.evaluation.run import DRAWS
+from retrieval.evaluation.evaluate import DRAWS
 from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS
 from retrieval.methods.base import Method, Setting

@@ -3,16 +3,14 @@
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.material import Material
 from retrieval.data.dataset import Grasp, Split, data_digest
-from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, Affine, Codes, fit_codes
+from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, Codes, fit_codes
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
@@ -70,27 +68,17 @@ def _log_odds(parts: Iterable[JudgedTouches]) -> tuple[float, float]:
 @torch.no_grad()
 def install(matcher: Matcher, codes: Codes, scale: float, offset: float) -> None:
     """Make the matcher judge by `scale * cosine + offset` of the codes; its layers of the head add nothing."""
-    for projection, found in ((matcher.touch_projection, codes.touch), (matcher.photo_projection, codes.photo)):
-        _set(projection, found)
+    for layer, found in ((matcher.touch_projection, codes.touch), (matcher.photo_projection, codes.photo)):
+        used = found.weight.shape[1]  # codes may be shorter than the layer: the rest stays 0, which no cosine sees
+        layer.weight.zero_()
+        layer.bias.zero_()
+        layer.weight[:used] = torch.from_numpy(found.weight.T.astype(np.float32))
+        layer.bias[:used] = torch.from_numpy(found.bias.astype(np.float32))
     for parameter in matcher.head.parameters():
         parameter.zero_()
     matcher.head.out.bias.fill_(offset)
     assert matcher.cosine_scale is not None
     matcher.cosine_scale.fill_(scale)
-
-
-def _set(layer: nn.Linear, found: Affine) -> None:
-    """Make a layer the affine map that was found. Codes may be shorter than the layer: the rest stays 0, which no
-    cosine sees."""
-    used = found.weight.shape[1]
-    layer.weight.zero_()
-    layer.bias.zero_()
-    layer.weight[:used] = _float(found.weight.T)
-    layer.bias[:used] = _float(found.bias)
-
-
-def _float(values: np.ndarray[Any, Any]) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
 def with_probabilities(made: Checkpoint, material: Material, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
@@ -100,7 +88,14 @@ def with_probabilities(made: Checkpoint, material: Material, estimate: Estimate 
     made = _checked(made, material.grasps, material.features, quiet)
     if estimate is None:
         return dataclasses.replace(made, posterior=None, references=None)
-    return _calibrated(made, _left_out(made.matcher, estimate))
+    # Touches of objects that were held out, half of each kind together, with the match logits of the matcher.
+    assert made.matcher.cosine_scale is not None
+    scale, offset = made.matcher.cosine_scale.item(), made.matcher.head.out.bias.item()
+    left_out = [
+        FeltTouches(dataclasses.replace(part.judged, logits=scale * part.judged.logits + offset), part.codes)
+        for part in estimate.choice.held_out
+    ]
+    return _calibrated(made, left_out)
 
 
 def start_with_probabilities(start: Checkpoint, material: Material, estimate: Estimate, *, quiet: bool) -> Checkpoint:
@@ -129,13 +124,3 @@ def _checked(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: b
     made.matcher.to(device)
     with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
         return with_verdicts(made, source, *halves, quiet=quiet)
-
-
-def _left_out(matcher: Matcher, estimate: Estimate) -> list[FeltTouches]:
-    """Touches of objects that were held out, half of each kind together, with the match logits of the matcher."""
-    assert matcher.cosine_scale is not None
-    scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()
-    return [
-        FeltTouches(dataclasses.replace(part.judged, logits=scale * part.judged.logits + offset), part.codes)
-        for part in estimate.choice.held_out
-    ]

@@ -11,7 +11,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, linked_objects
 from retrieval.errors import BadInput
 from retrieval.methods.cca_towers import CcaSettings, Choice, Codes, choose
-from retrieval.methods.held_out import held_out_folds
+from retrieval.methods.selection import held_out_folds
 from retrieval.metrics.guesses import guess_curves
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.training.features import Features

@@ -12,7 +12,7 @@ from retrieval.methods.cca_towers import Blocks
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers import TOGETHER
+from retrieval.model.towers import TOGETHER, architectures_of, tower_name
 from retrieval.model.towers.base import Tower
 from retrieval.model.towers.side_by_side import SideBySide, widths_of
 from retrieval.model.towers.weights import initialise_tower
@@ -48,7 +48,15 @@ class Material:
 
 
 def encode(
-    recording: Path, start: Checkpoint, *, init: str, split: Split | None, cache: Path | None, seed: int, quiet: bool
+    recording: Path,
+    start: Checkpoint,
+    *,
+    tower: str | type[Tower] = BESIDE,
+    init: str,
+    split: Split | None,
+    cache: Path | None,
+    seed: int,
+    quiet: bool,
 ) -> Material:
     """The recording as the towers of the start, and those beside them, see it."""
     grasps = load_grasps(recording)
@@ -56,13 +64,10 @@ def encode(
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if len({grasp.object_id for grasp in grasps}) < 2:
         raise BadInput("a matcher is fitted to two own objects at least; record more")
-    config = config_for(start, finger_count(grasps), beside=init != NOTHING, seed=seed)
+    config = config_for(start, finger_count(grasps), None if init == NOTHING else tower, seed=seed)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-    for tower, known in (
-        (matcher.touch_tower, start.matcher.touch_tower),
-        (matcher.photo_tower, start.matcher.photo_tower),
-    ):
-        take_over(tower, known, init)
+    take_over(matcher.touch_tower, start.matcher.touch_tower, init)
+    take_over(matcher.photo_tower, start.matcher.photo_tower, init)
     shown = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
     features = shown()
     blurred = shown(variant="blurred", photos_of=features)
@@ -70,11 +75,17 @@ def encode(
     return Material(grasps, config, matcher, features, blurred, facts.kind_of, facts.source)
 
 
-def config_for(start: Checkpoint, fingers: int, *, beside: bool, seed: int) -> Config:
-    """The preset, for towers of the start and, `beside` them, the published one."""
+def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:
+    """The preset, for towers of the start and, next to them, a published `tower`."""
     preset, known = load_config(PRESET), start.config.matcher
-    tower = TOGETHER.join([known.tower, BESIDE] if beside else [known.tower])
-    matcher = dataclasses.replace(preset.matcher, tower=tower, tower_output=known.tower_output, fingers=fingers)
+    beside = [] if tower is None else [tower_name(tower)]
+    matcher = dataclasses.replace(
+        preset.matcher,
+        tower=TOGETHER.join([known.tower, *beside]),
+        tower_output=known.tower_output,
+        fingers=fingers,
+        architectures={**known.architectures, **(architectures_of(beside[0]) if beside else {})},
+    )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)
 

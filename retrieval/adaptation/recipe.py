@@ -1,44 +1,108 @@
-"""`retrieve adapt`: a checkpoint for a new sensor and own objects, from a few of them.
+"""A checkpoint for a new sensor and own objects, from a few of them.
 
-Towers stand still: those of the checkpoint that one starts from, which learnt on the simulated rig what relief looks
-like, beside those of published weights, which know pictures. What is fitted is linear (`retrieval.methods.cca_towers`),
-and every number that is told of it comes from objects that were left out of the fit.
+Towers are frozen: those of the checkpoint that one starts from, which learnt on the simulated rig what relief looks
+like, next to a published one, which knows pictures. What is fitted is linear (`retrieval.methods.cca_towers`), and
+every number that is told of it comes from objects that were left out of the fit.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from retrieval.adaptation.curve import learning_curve, write_curve
 from retrieval.adaptation.estimate import Estimate, judge
 from retrieval.adaptation.fitting import fit_matcher, start_with_probabilities, with_probabilities
-from retrieval.adaptation.material import Material, encode
-from retrieval.data.dataset import Split
-from retrieval.model.checkpoint import Checkpoint, require_writable, store_checkpoint
+from retrieval.adaptation.material import BESIDE, Material, encode
+from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of, load_grasps
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
+from retrieval.search.defaults import shipped_model
+
+if TYPE_CHECKING:
+    from retrieval.model.towers.base import Tower
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """What `adapt` made: the checkpoint, and what it is worth on objects left out of the fit.
+
+    material: the grasps that it was fitted to, and what the towers make of them. estimate: None for fewer than six
+    objects; the checkpoint then states no probabilities. report: the page of the learning curve, where one was asked
+    for and could be drawn.
+
+    >>> from pathlib import Path
+    >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
+    >>> made.checkpoint.path.name, made.report
+    ('own.safetensors', None)
+    >>> 0 <= made.estimate.to_dict()["left_out_first_guess"] <= 1
+    True
+    """
+
+    checkpoint: Checkpoint
+    material: Material
+    estimate: Estimate | None
+    report: Path | None
+
+    def lines(self) -> list[str]:
+        """Return what people are told."""
+        lines = self.estimate.lines() if self.estimate else []
+        if self.report:
+            lines.append(f"learning curve: {self.report}")
+        grasps = self.material.grasps
+        objects = len({grasp.object_id for grasp in grasps})
+        return [*lines, f"{self.checkpoint.path}: fitted to {objects} objects, {len(grasps)} touches"]
 
 
 def adapt(
-    recording: Path,
+    recording: AnyRecording,
     out: Path,
-    start: Checkpoint,
+    start: str | Path | Checkpoint | None = None,
     *,
-    init: str,
+    tower: "str | type[Tower]" = BESIDE,
+    init: str = "imagenet",
     split: Split | None = None,
+    report: Path | None = None,
     cache: Path | None = None,
     seed: int = 0,
     quiet: bool = False,
-) -> tuple[Material, Estimate | None]:
-    """Fit the towers of `start` to a recording of another sensor and own objects, and write the checkpoint `out`; where
-    `start` as it is tells objects that were left out apart better than the fit, it is kept, its probabilities fitted.
+) -> Adaptation:
+    """Fit a model to a recording of another sensor and own objects, and write the checkpoint `out`.
 
-    init: published weights whose tower stands beside those of the start ("imagenet", a file, or "none"). split: its
-    test objects are left out of everything. cache: where features are kept, so that a run which was stopped goes on.
-    The estimate is None for fewer than six objects; the checkpoint then says nothing of probabilities. Raises
-    DatasetError, CheckpointError, BadInput.
+    Where the model as it is tells objects that were left out apart better than the fit does, it is kept, and only its
+    probabilities are fitted.
+
+    Args:
+        recording: A folder, or what `robot.read_recording` returns.
+        out: The checkpoint (.safetensors).
+        start: The model that one starts from; the shipped one of as many fingers where None.
+        tower: The published tower next to those of the model: a name, "module:Class", or a class.
+        init: Weights of that tower: "imagenet", a file, or "none" for no such tower.
+        split: Its test objects are left out of everything.
+        report: Folder of the learning curve: how many touches of how many objects it takes.
+        cache: Folder of kept features, so that a stopped run goes on.
+        seed: Of the folds.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError, BadInput: There is too little to fit to.
+        CheckpointError: `start` cannot be read, or `out` not written.
+
+    >>> from pathlib import Path
+    >>> made = retrieval.adapt("lab", Path("mine.safetensors"), "model.safetensors", init="none", quiet=True)
+    >>> made.lines()[-1]
+    'mine.safetensors: fitted to 12 objects, 24 touches'
     """
     require_writable(out)
-    material = encode(recording, start, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
+    recording = folder_of(recording)
+    if not isinstance(start, Checkpoint):
+        start = load_checkpoint(start or shipped_model(min(finger_count(load_grasps(recording)), 2)))
+    material = encode(recording, start, tower=tower, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
     estimate = judge(material, start, cache=cache, seed=seed, quiet=quiet)
     if estimate and estimate.keeps_the_model:
         made = start_with_probabilities(start, material, estimate, quiet=quiet)
     else:
         made = with_probabilities(fit_matcher(material, estimate, out), material, estimate, quiet=quiet)
     store_checkpoint(made, out)
-    return material, estimate
+    page = None
+    if report and estimate:
+        page = write_curve(report, learning_curve(material, start, cache=cache, seed=seed, quiet=quiet))
+    return Adaptation(load_checkpoint(out), material, estimate, page)

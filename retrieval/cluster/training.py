@@ -14,7 +14,8 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, Interrupted, RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
-from retrieval.training.train import require_fresh, state_path, train
+from retrieval.training.state import require_fresh, state_path
+from retrieval.training.train import train
 
 LOST = 3
 """How often a training without a step of progress is begun again."""

@@ -31,24 +31,14 @@ def adapt(
     seed: Annotated[int, typer.Option(parser=SEED, help="seed of the folds")] = 0,
 ) -> None:
     """Fit a model to a new sensor and own objects; minutes on two cores."""
-    from retrieval.adaptation.curve import learning_curve, write_curve
     from retrieval.adaptation.recipe import adapt as fit
-    from retrieval.data.dataset import finger_count, load_grasps
-    from retrieval.model.checkpoint import load_checkpoint, require_writable
     from retrieval.search import defaults
 
     if report:
         require_ours(report / "curve.md", TEXT)
-    require_writable(out)
-    fingers = finger_count(load_grasps(recording))
-    start = load_checkpoint(model or defaults.shipped_model(min(fingers, 2)))
-    material, estimate = fit(recording, out, start, init=init, split=read_split(split), cache=cache, seed=seed)
+    made = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)
     defaults.remember("model", out)
-    for line in estimate.lines() if estimate else ():
+    for line in made.lines():
         say(line)
-    if report and estimate:
-        say(f"learning curve: {write_curve(report, learning_curve(material, start, cache=cache, seed=seed))}")
-    elif report:
+    if report and not made.report:
         say(f"{report} is not written: a learning curve, too, is judged on objects that are left out")
-    objects = len({grasp.object_id for grasp in material.grasps})
-    say(f"{out}: fitted to {objects} objects, {len(material.grasps)} touches")

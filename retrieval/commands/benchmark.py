@@ -65,7 +65,7 @@ def real(
     json: Json = False,
 ) -> None:
     """Ask protocols of real data, with controls; goes on where it was stopped. Writes a report."""
-    from retrieval.evaluation.real.run import benchmark
+    from retrieval.evaluation.real.benchmark import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
     for name, kind in WRITTEN.items():

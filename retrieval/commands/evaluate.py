@@ -59,7 +59,7 @@ def evaluate(
     json: Json = False,
 ) -> None:
     """Compare methods on objects they never saw; goes on where it was stopped. Writes a report."""
-    from retrieval.evaluation import run
+    from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import write_report
 
     if model and (preset or init or init_photo or init_touch):
@@ -67,7 +67,7 @@ def evaluate(
     for name, kind in WRITTEN.items():
         require_ours(out / name, kind)
     try:
-        results = run.evaluate(
+        results = run(
             recording,
             out,
             config=training_config(

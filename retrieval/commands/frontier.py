@@ -57,31 +57,23 @@ def report(
             needs them.
         only: Names of rows; all where empty.
         quick: Smallest sizes.
-        table: What can be measured, as `retrieval.frontier.run.measure` takes it; so `need_no_model`.
+        table: What can be measured, as `retrieval.measure_frontier` takes it; so `need_no_model`.
 
     Returns:
         The content of frontier.json.
     """
-    from retrieval.console.files import PAGE, RESULTS, require_ours
-    from retrieval.frontier.report import write_frontier
-    from retrieval.frontier.run import measure
-    from retrieval.frontier.sample import QUICK, Sample, Scale
+    from retrieval.frontier.measure import measure_frontier
     from retrieval.search import defaults
 
-    require_ours(out / "frontier.json", RESULTS)
-    require_ours(out / "frontier.html", PAGE)
     path, why = defaults.find_model(model)
     say(f"model: {path} ({why})")
-    out.mkdir(parents=True, exist_ok=True)
     grasps = partial(_recording, recording, out, quick)
-    sample = Sample(path, grasps, out / "features", QUICK if quick else Scale())
     try:
-        document = measure(sample, out, only, table=table, need_no_model=need_no_model)
+        document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, need_no_model=need_no_model)
     except KeyboardInterrupt:
         say(f"what was measured is kept in {out}; the same command goes on with it")
         raise
-    page, *_ = write_frontier(out, document)
-    say(f"page: {page}")
+    say(f"page: {out / 'frontier.html'}")
     return document
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.files import read_regular
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
-from robot.recording.folder import read_info, read_recording
+from robot.recording.folder import Recording, read_info, read_recording
 
 log = logging.getLogger(__name__)
 
@@ -33,11 +33,24 @@ class Grasp:
     backgrounds: tuple[Path, ...]
 
 
-def load_grasps(folder: Path) -> list[Grasp]:
+AnyRecording = str | Path | Recording
+"""A recording: its folder, or what `robot.read_recording` returns."""
+
+
+def folder_of(recording: AnyRecording) -> Path:
+    """Return the folder of a recording."""
+    return recording.folder if isinstance(recording, Recording) else Path(recording)
+
+
+def load_grasps(recording: AnyRecording) -> list[Grasp]:
     """Read the successful grasps of a recording that have a photo and a touch, in the order of collection.
 
     Raises DatasetError for an unreadable recording, one without such grasps, or one that mixes numbers of fingers.
+
+    >>> [grasp.object_id for grasp in retrieval.load_grasps("recording")]
+    ['mug', 'mug', 'tin', 'tin']
     """
+    folder = folder_of(recording)
     return require_accepted(folder, load_all(folder))
 
 
@@ -179,6 +192,9 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
 
     validation, test: shares of the objects, each met as closely as whole groups allow; a part that is wanted holds
     at least the two objects that pairs need. Raises DatasetError where the recording has too few for that.
+
+    >>> len(retrieval.make_split(retrieval.load_grasps("lab"), validation=0.2, test=0.25, seed=0).train)
+    7
     """
     groups = linked_objects(grasps)
     queue = [groups[index] for index in np.random.default_rng(seed).permutation(len(groups))]

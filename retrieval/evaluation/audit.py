@@ -6,7 +6,6 @@ Byte-identical files are found by their digests, what was encoded again, lit oth
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_lowercase
@@ -19,6 +18,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.check.copies import PictureSet, Thumbnail, look_at
 from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Grasp, Split, finger_count
+from retrieval.training.loading import worker_pool
 
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
 UNIT = "1 less the correlation of shapes (0: a copy; about 1: unlike pictures)"
@@ -82,7 +82,7 @@ def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
         files[f"touch {ascii_lowercase[finger]}"] = [grasp.touches[finger] for grasp in grasps]
     objects = [grasp.object_id for grasp in grasps]
     with (
-        ThreadPoolExecutor(2) as pool,
+        worker_pool() as pool,
         Bar("audit", sum(map(len, map(set, files.values()))), "images", quiet=quiet) as bar,
     ):
         for kind, paths in files.items():

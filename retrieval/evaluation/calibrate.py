@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration
-from retrieval.metrics.reliability import reliability_bins
+from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import LEAST_OBJECTS, JudgedTouches, Posterior, Questions, fit_questions
 
@@ -179,12 +178,9 @@ def reliability(
     for choice in choices:
         table, posterior = test.get(choice.grasps), calibrations.posteriors.get(choice.grasps)
         if table and posterior and len(table.objects) >= choice.k:
-            found[choice.name] = _choice_reliability(drawn_choices(table, choice, seed, posterior), posterior)
+            logits = drawn_choices(table, choice, seed, posterior)
+            found[choice.name] = reliability_bins(*stated_first_guesses(logits, posterior).T)
     return found
-
-
-def _choice_reliability(logits: NDArray[np.float64], posterior: Posterior) -> dict[str, Any]:
-    return reliability_bins(*stated_first_guesses(logits, posterior).T)
 
 
 def stated_first_guesses(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:

@@ -1,4 +1,8 @@
-"""Controls: the same method where it must not be able to do what it does. Printed beside the result."""
+"""Controls and ceilings, printed next to the result.
+
+A control is the same method where it must not be able to do what it does. A ceiling is how well each side alone knows
+the object, and so which side is short.
+"""
 
 import dataclasses
 from collections import defaultdict
@@ -22,6 +26,11 @@ CONTROLS = {
     "shuffled": "touches are dealt to other objects before fitting, so that there is nothing to learn",
     "before": "the frames taken before the contact stand in for the touch, in fitting and in judging",
     "blurred": "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging",
+}
+CEILING_METHOD = "cca"
+CEILINGS = {
+    "touch_to_touch": "the touch of another grasp stands in for the photo: what can be felt twice",
+    "photo_to_photo": "the photo of another grasp stands in for the touch: what can be seen twice",
 }
 MOST_GRASPS = 12
 """Grasps of an object whose other images are encoded for a control."""
@@ -65,9 +74,25 @@ def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
     return [grasps[row] for row in sorted(kept)]
 
 
-def score_beside(
-    what: str, method: str, experiment: Experiment, training_seed: int, *, draws: int, seed: int
-) -> dict[str, Any]:
-    """The entry of results.json of a control, or of a ceiling (`retrieval.evaluation.ceilings`)."""
-    judged = MethodScores(experiment.queries, experiment.predictions(method, training_seed), seed)
+def score_beside(what: str, method: str, experiment: Experiment, seed: int, *, draws: int) -> dict[str, Any]:
+    """The entry of results.json of a control or a ceiling."""
+    judged = MethodScores(experiment.queries, experiment.run(method, seed), seed)
     return {"what": what, "measures": summaries([judged.measures(MEASURED)], draws, seed)}
+
+
+def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:
+    """The experiment of each ceiling; that of photos only where an object has two to tell apart.
+
+    A grasp is never asked with itself, as no touch is with its own photo.
+    """
+    features, folder = experiment.features, experiment.folder / "ceilings"
+    twice = {"touch_to_touch": dataclasses.replace(features, photo=features.touch.reshape(len(features), -1))}
+    photos = {(owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)}
+    if len(photos) > len(set(features.object_ids)):
+        twice["photo_to_photo"] = dataclasses.replace(features, touch=features.photo[:, None])
+    return {
+        name: dataclasses.replace(
+            experiment, folder=folder / name, features=each, pairs=None, checkpoint=None, role=f"ceiling: {name}"
+        )
+        for name, each in twice.items()
+    }

@@ -13,7 +13,6 @@ import numpy as np
 
 from retrieval.console.output import say
 from retrieval.data.dataset import Split
-from retrieval.errors import BadInput
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.methods import METHODS
@@ -55,28 +54,20 @@ class Experiment:
         comes_fitted = self.checkpoint is not None and issubclass(method, LateFusion)
         return seeds[:1] if comes_fitted or not method.is_seeded else seeds
 
-    def predict(self, name: str, seed: int) -> None:
-        """Fit a method and write its predictions; nothing where these lie there already."""
-        path = self._path(name, seed)
-        if path.is_file():
-            try:
-                read_predictions(path, self._made_by(name, seed))
-                return
-            except BadInput:  # damaged, or of other features, queries or settings: made again
-                path.unlink()
+    def run(self, name: str, seed: int) -> Predictions:
+        """Return the predictions of a method: those in the folder, else it is fitted and they are written there."""
+        path, made_by = self.folder / "predictions" / f"{name}-{seed}.safetensors", self.made_by(name, seed)
+        if (kept := read_predictions(path, made_by)) is not None:
+            return kept
         if not self.quiet:
             say(f"evaluate: {name}, seed {seed}" + (f" ({self.role})" if self.role else ""))
         method, fit_s = self._fitted(name, seed)
-        write_predictions(path, predict(method, self.features, self.queries, fit_s), self._made_by(name, seed))
+        predictions = predict(method, self.features, self.queries, fit_s)
+        write_predictions(path, predictions, made_by)
+        return predictions
 
-    def predictions(self, name: str, seed: int) -> Predictions:
-        """What `predict` wrote. Raises BadInput for a file of other features, queries or settings."""
-        return read_predictions(self._path(name, seed), self._made_by(name, seed))
-
-    def _path(self, name: str, seed: int) -> Path:
-        return self.folder / "predictions" / f"{name}-{seed}.safetensors"
-
-    def _made_by(self, name: str, seed: int) -> dict[str, Any]:
+    def made_by(self, name: str, seed: int) -> dict[str, Any]:
+        """Return everything that decides the predictions of a method, in JSON types."""
         return {
             "method": name,
             "seed": seed,
@@ -84,9 +75,10 @@ class Experiment:
             "pairs": self.pairs.digest if self.pairs else None,
             "queries": self.queries.digest,
             "split": self.split.to_dict(),
-            "config": self.config.to_dict(),
+            "config": self.config.without_paths(),
             "model": self.checkpoint.digest if self.checkpoint else None,
             "shuffled": self.shuffled,
+            "all_teach": self.all_teach,
             "software": __version__,
             **code_of(METHODS.load(name)),
         }

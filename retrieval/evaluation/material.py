@@ -12,7 +12,7 @@ from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.training.finish import finish, unfinished
+from retrieval.training.state import finish, unfinished
 from retrieval.training.train import Trainer, labelled_pairs
 
 
@@ -53,7 +53,10 @@ def prepare(
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
     split, split_from = _split(grasps, config, checkpoint, split)
     if checkpoint is None and not config.training.freeze_towers:
-        checkpoint = _trained(recording, out / "model.safetensors", config, split, grasps, quiet)
+        done = out / "model.safetensors"
+        require_writable(unfinished(done))
+        trainer = Trainer(config, split, grasps, unfinished(done), source=recording_source(recording))
+        checkpoint = finish(trainer, done, quiet)
         config = _of_model(checkpoint, config)
     return Material(
         name=recording.resolve().name,
@@ -84,12 +87,6 @@ def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
     return dataclasses.replace(checkpoint.config, training=training)
 
 
-def _trained(recording: Path, done: Path, config: Config, split: Split, grasps: list[Grasp], quiet: bool) -> Checkpoint:
-    require_writable(unfinished(done))
-    trainer = Trainer(config, split, grasps, unfinished(done), source=recording_source(recording))
-    return finish(trainer, done, quiet)
-
-
 def _split(
     grasps: Sequence[Grasp], config: Config, checkpoint: Checkpoint | None, given: Split | None
 ) -> tuple[Split, str]:
@@ -97,7 +94,8 @@ def _split(
     if given is not None:
         require_fit(given, grasps)
         return given, "given"
-    seen = _seen_by(checkpoint)
+    known = checkpoint.split if checkpoint else None
+    seen = {*known.train, *known.validation} if known else set()
     recorded = {grasp.object_id for grasp in grasps}
     if checkpoint and checkpoint.split and seen and seen <= recorded:
         test = checkpoint.split.test or tuple(sorted(recorded - seen))
@@ -110,9 +108,3 @@ def _split(
     settings = config.training
     drawn = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
     return drawn, "drawn; the model has seen none of its objects" if checkpoint else "drawn"
-
-
-def _seen_by(checkpoint: Checkpoint | None) -> set[str]:
-    if checkpoint is None or checkpoint.split is None:
-        return set()
-    return {*checkpoint.split.train, *checkpoint.split.validation}

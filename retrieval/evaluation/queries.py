@@ -65,7 +65,12 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping
     part_of = {name: part for part in PARTS for name in getattr(split, part)}
     objects = tuple(sorted({grasp.object_id for grasp in grasps} & set(part_of)))
     parts = tuple(part_of[name] for name in objects)
-    _require_objects(parts)
+    for part in PARTS:
+        if (count := parts.count(part)) < 2:
+            raise DatasetError(
+                f"an evaluation needs two {part} objects at least; the recording has {count} of the split's: record "
+                "more objects, or give a split of your own"
+            )
     rng = np.random.default_rng([seed, 11])
     judged = [_judged(grasps, name, most.get(part_of[name]), rng) for name in objects]
     touches = np.concatenate(judged)
@@ -85,15 +90,6 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping
         part_of=parts,
         sets={size: drawn for size, drawn in sets.items() if len(drawn)},
     )
-
-
-def _require_objects(parts: Sequence[str]) -> None:
-    for part in PARTS:
-        if (count := parts.count(part)) < 2:
-            raise DatasetError(
-                f"an evaluation needs two {part} objects at least; the recording has {count} of the split's: record "
-                "more objects, or give a split of your own"
-            )
 
 
 def _judged(grasps: Sequence[Grasp], name: str, most: int | None, rng: np.random.Generator) -> Rows:

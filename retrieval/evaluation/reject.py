@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retrieval.evaluation.calibrate import questions
-from retrieval.metrics.auc import weight_below
-from retrieval.metrics.measure import Measure, object_weights
+from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
 

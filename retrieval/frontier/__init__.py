@@ -18,7 +18,6 @@ APPROXIMATIONS = {
     "candidates": "retrieval.frontier.candidates:candidates",
     "index_kinds": "retrieval.frontier.kinds:index_kinds",
     "towers": "retrieval.frontier.formats:towers",
-    "training_formats": "retrieval.frontier.training:training_formats",
     "halves": "retrieval.frontier.formats:halves",
     "image_size": "retrieval.frontier.pixels:image_size",
     "grasps": "retrieval.frontier.grasps:grasps",

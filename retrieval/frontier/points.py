@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,13 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self) | {"panels": [panel.to_dict() for panel in self.panels]}
+        return asdict(self) | {"panels": [panel.to_dict() for panel in self.panels], "lines": self.lines()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Row":
         """Inverse of `to_dict`."""
-        return cls(**{**data, "panels": tuple(Panel.from_dict(panel) for panel in data["panels"])})
+        panels = tuple(Panel.from_dict(panel) for panel in data["panels"])
+        return cls(data["title"], data["text"], panels, data["skipped"])
 
 
 def missed(series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False) -> Tradeoff:

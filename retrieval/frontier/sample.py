@@ -3,8 +3,6 @@
 Everything is made when it is first asked for: a row that needs no recording makes none.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,10 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
+from retrieval.evaluation.cache import kept_document
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import Code, score_halves
 from retrieval.training.features import Features, encode_recording
@@ -174,12 +172,10 @@ class Sample:
     def winners(self) -> NDArray[np.int64]:
         """For each of `queries` the photo of `catalogue` that the full classifier ranks first of all; kept in `folder`,
         since it takes the longest."""
-        key = json.dumps([self.checkpoint.digest, self.digest, self.scale.photos, self.scale.queries, self.seed])
-        path = self.folder / f"winners-{hashlib.sha256(key.encode()).hexdigest()[:32]}.json"
-        if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(path, json.dumps(self._find_winners()).encode())
-        return np.array(read_json(path), dtype=np.int64)
+        scale = self.scale
+        made_by = {"model": self.checkpoint.digest, "grasps": self.digest, "seed": self.seed, "photos": scale.photos}
+        path = self.folder / "winners.json"
+        return np.array(kept_document(path, made_by | {"queries": scale.queries}, self._find_winners), dtype=np.int64)
 
     def _find_winners(self) -> list[int]:
         halves, found = self.queries["half"], list[int]()

@@ -104,7 +104,12 @@ class Method(ABC):
         of grasps that are independent given the object add.
         """
         self._require_fitted()
-        _require_sets(sets, len(touch_codes))
+        if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
+            raise BadInput(
+                f"sets of grasps must be whole numbers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}"
+            )
+        if sets.size and (sets.min() < 0 or sets.max() >= len(touch_codes)):
+            raise BadInput(f"sets must name rows of the {len(touch_codes)} touch codes; got {sets.min()}..{sets.max()}")
         return _scores(self._score_sets(touch_codes, photo_codes, sets), len(sets), len(photo_codes))
 
     @abstractmethod
@@ -180,10 +185,3 @@ def _require_finite(what: str, array: Array) -> None:
     if not np.isfinite(array).all():
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise NumericalError(f"{what} must be finite; got {array[place]} at {place}")
-
-
-def _require_sets(sets: NDArray[np.int64], touches: int) -> None:
-    if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
-        raise BadInput(f"sets of grasps must be whole numbers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}")
-    if sets.size and (sets.min() < 0 or sets.max() >= touches):
-        raise BadInput(f"sets must name rows of the {touches} touch codes; got {sets.min()}..{sets.max()}")

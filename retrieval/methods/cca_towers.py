@@ -8,6 +8,7 @@ Settings are chosen from `GRID` by training objects that are held out (`choose`)
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby, product
 from typing import TYPE_CHECKING, NamedTuple, Self
@@ -18,11 +19,10 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.methods.base import Array, Method
 from retrieval.methods.cca import LEADING, View, canonical, cosine, decompose, factored, unit_rows
-from retrieval.methods.held_out import held_out_folds
-from retrieval.methods.selection import Validator, judged_rows
+from retrieval.methods.selection import Validator, held_out_folds, judged_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
-from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
+from retrieval.model.posterior import JudgedTouches, fit_posterior
 from retrieval.model.references import FeltTouches
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.side_by_side import widths_of
@@ -250,8 +250,10 @@ class CcaTowers(Method):
                 self.chosen |= dict(zip(("photo_weight", "reference_weight"), self._weights, strict=True))
             if not self.setting.all_teach:
                 self._codes = codes
-        elif posterior := _posterior(choice):
-            self.chosen["posterior"] = posterior.to_dict()
+        else:
+            with suppress(BadInput):  # too few held-out objects, or one photo of each
+                posterior = fit_posterior(*(part.judged for part in choice.held_out))
+                self.chosen["posterior"] = posterior.to_dict()
 
     def _encode_touch(self, touch: Array) -> Array:
         code = unit_rows(self._codes.touch(touch.reshape(len(touch), -1)))
@@ -270,14 +272,6 @@ class CcaTowers(Method):
 
 def _rows(features: "Features") -> Rows:
     return features.touch.reshape(len(features), -1)
-
-
-def _posterior(choice: Choice) -> Posterior | None:
-    """What a cosine means, by held-out objects; None where these are too few, or have one photo each."""
-    try:
-        return fit_posterior(*(part.judged for part in choice.held_out))
-    except BadInput:
-        return None
 
 
 def _weights(codes: Codes, shown: "Features", width: int) -> list[float]:

@@ -2,8 +2,7 @@
 
 import dataclasses
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Self
 
@@ -17,7 +16,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, score_halves
 from retrieval.training.features import Features
-from retrieval.training.finish import finish, unfinished
+from retrieval.training.state import finish, unfinished
 from retrieval.training.train import Trainer, build_matcher
 
 SOURCE = "features of a recording"
@@ -65,13 +64,30 @@ def trained_checkpoint(setting: Setting, train: Features, validation: Features) 
     The towers of the checkpoint are those of `frozen_matcher`: it serves as any other where they made the features.
     Raises BadInput for features that no such towers make, Interrupted after Ctrl-C.
     """
-    grasps = [grasp for part in (train, validation) for grasp in _grasps(part)]
+    known = train.joined(validation)
+    # Grasps to draw pairs from; their files are names, which nobody opens.
+    grasps = [
+        Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
+        for grasp_id, object_id in zip(known.grasp_ids, known.object_ids, strict=True)
+    ]
     objects = [tuple(sorted(set(part.object_ids))) for part in (train, validation)]
     split = Split(setting.seed, train=objects[0], validation=objects[1], test=())
-    with _folder(setting.folder) as folder:
-        done, known = folder / f"late_fusion-{setting.seed}.safetensors", train.joined(validation)
-        trainer = Trainer(_config(setting, train), split, grasps, unfinished(done), SOURCE, known)
-        _require_fit(trainer.matcher, known)
+    config = setting.config.without_pruner()
+    config = dataclasses.replace(
+        config,
+        matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
+        # Labelled pairs are among the features.
+        training=dataclasses.replace(config.training, seed=setting.seed, freeze_towers=True, photos="", touches=""),
+    )
+    with nullcontext(setting.folder) if setting.folder else tempfile.TemporaryDirectory() as folder:
+        done = Path(folder) / f"late_fusion-{setting.seed}.safetensors"
+        trainer = Trainer(config, split, grasps, unfinished(done), SOURCE, known)
+        wanted, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
+        if wanted != got:
+            raise BadInput(
+                f"late fusion takes features of its own towers, {wanted[1]} of a finger and {wanted[2]} of a photo "
+                f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; encode with these"
+            )
         towers = frozen_matcher(setting.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
@@ -85,39 +101,6 @@ def frozen_matcher(config: Config) -> Matcher:
     return build_matcher(config).eval()
 
 
-def _config(setting: Setting, train: Features) -> Config:
-    matcher = dataclasses.replace(setting.config.matcher, fingers=train.touch.shape[1])
-    # Labelled pairs are among the features.
-    training = dataclasses.replace(
-        setting.config.training, seed=setting.seed, freeze_towers=True, photos="", touches=""
-    )
-    return dataclasses.replace(setting.config, matcher=matcher, training=training).without_pruner()
-
-
-def _grasps(features: Features) -> Iterator[Grasp]:
-    """Grasps to draw pairs from; their files are names, which nobody opens."""
-    for grasp_id, object_id in zip(features.grasp_ids, features.object_ids, strict=True):
-        yield Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
-
-
-@contextmanager
-def _folder(given: Path | None) -> Iterator[Path]:
-    if given is not None:
-        yield given
-        return
-    with tempfile.TemporaryDirectory() as temporary:
-        yield Path(temporary)
-
-
 def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
     """Fingers, features of one finger, features of a photo."""
     return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_half.in_features
-
-
-def _require_fit(matcher: Matcher, features: Features) -> None:
-    wanted, got = _feature_counts(matcher), (*features.touch.shape[1:], *features.photo.shape[1:])
-    if wanted != got:
-        raise BadInput(
-            f"late fusion takes features of its own towers, {wanted[1]} of a finger and {wanted[2]} of a photo "
-            f"({matcher.config.tower}, {matcher.config.tower_output}); got {got[1]} and {got[2]}; encode with these"
-        )

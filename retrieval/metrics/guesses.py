@@ -5,9 +5,9 @@ from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import betaincinv
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.binomial import binomial_interval, clopper_pearson
 
 
 def guess_curve(true_score: float, other_scores: ArrayLike, k: int) -> NDArray[np.float64]:
@@ -62,3 +62,18 @@ def grouped_interval(right: Sequence[Sequence[bool]]) -> tuple[float, float]:
     squares = sum((sum(part) - share * len(part)) ** 2 for part in right) * len(right) / (len(right) - 1)
     worth = total / max(1.0, squares / (total * share * (1 - share)))
     return clopper_pearson(share * worth, worth, 0.95)
+
+
+def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact interval of a share (Clopper and Pearson 1934): never too narrow for independent trials."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise BadInput(f"successes must lie within 0..trials, and trials be at least 1; got {successes} of {trials}")
+    return clopper_pearson(successes, trials, level)
+
+
+def clopper_pearson(successes: float, trials: float, level: float) -> tuple[float, float]:
+    """The interval of `binomial_interval`, for numbers that need not be whole."""
+    tail = (1 - level) / 2
+    low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0
+    return float(low), float(high)

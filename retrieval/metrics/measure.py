@@ -1,7 +1,8 @@
-"""What a measure says of every query, and its means by object."""
+"""What a measure says of every query, its means by object, and how often one score beats another."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,16 +38,19 @@ class Measure:
         return object_means(self.values, self.owner)
 
 
-def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]]) -> Measure:
+def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None = None) -> Measure:
     """One measure of queries that were asked in several galleries, such as those of folds.
 
     units: for each part, what stands for an object's number in the whole: the object, or a group of objects that only
-    together say how much others differ. Values keep their order within a unit; chance is averaged as they are. Raises
-    BadInput for no parts.
+    together say how much others differ; None: numbers stand for themselves. Values keep their order within a unit;
+    chance is averaged as they are. Raises BadInput for no parts.
     """
     if not parts:
         raise BadInput("measures are pooled of one gallery at least; got none")
-    owner = np.concatenate([[unit[int(name)] for name in part.owner] for part, unit in zip(parts, units, strict=True)])
+    owners = [part.owner for part in parts]
+    if units is not None:
+        owners = [np.array([unit[name] for name in own.tolist()]) for own, unit in zip(owners, units, strict=True)]
+    owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
     chances = np.concatenate([np.tile(part.chance, (len(part.owner), 1)) for part in parts])
     return Measure(
@@ -71,3 +75,19 @@ def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
     """(Q,) weights that sum to 1 and make every object count alike, however many queries it has."""
     _, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
     return np.asarray(1 / (counts[place] * len(counts)))
+
+
+def weight_below(
+    values: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], weights: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """(V,) weight of the `others` that each of `values` is above; of equals half (Mann and Whitney).
+
+    weights: 1 for each where None.
+
+    With weights that sum to 1, or divided by the number of others, the mean over values is the area. Scores must be
+    finite: a NaN is above nothing.
+    """
+    order = np.argsort(others)
+    below = np.append(0.0, np.cumsum(np.ones(len(others)) if weights is None else weights[order]))
+    left, right = (np.searchsorted(others[order], values, side) for side in ("left", "right"))
+    return np.asarray((below[left] + below[right]) / 2)

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.metrics import ranking
-from retrieval.metrics.auc import weight_below
 from retrieval.metrics.guesses import guess_curves
-from retrieval.metrics.measure import Measure, object_means, object_weights
+from retrieval.metrics.measure import Measure, object_means, object_weights, weight_below
 from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable, object_scores
 

@@ -5,7 +5,7 @@ A new metric is one function from a `ScoreTable` to a `Measure` (`retrieval.metr
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure
@@ -92,6 +92,20 @@ def _paired(table: ScoreTable, k: int) -> Measure | None:
 
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
+
+def _of_gallery(prefix: str, section: str, table: Callable[[Scored], ScoreTable]) -> dict[str, Metric]:
+    """Measures of the whole gallery, in one direction."""
+
+    def metric(column: str, take: Callable[[ScoreTable], Measure]) -> Metric:
+        return Metric(f"{column}, {section}", column, section, lambda of: take(table(of)))
+
+    return {
+        **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
+        f"{prefix}mrr": metric("MRR", protocols.reciprocal_rank),
+        f"{prefix}map": metric("mAP", protocols.average_precision),
+    }
+
+
 METRICS: dict[str, Metric] = {
     "pair_accuracy": Metric(
         "pair accuracy",
@@ -110,26 +124,8 @@ METRICS: dict[str, Metric] = {
     ),
     **{of_grasps(count): _of_set(count) for count in SET_SIZES},
     **{of_photos(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
-    "recall_1": Metric("R@1, touch to photo", "R@1", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 1)),
-    "recall_5": Metric("R@5, touch to photo", "R@5", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 5)),
-    "recall_10": Metric("R@10, touch to photo", "R@10", TOUCH_TO_PHOTO, lambda of: protocols.recall(of.test, 10)),
-    "mrr": Metric("MRR, touch to photo", "MRR", TOUCH_TO_PHOTO, lambda of: protocols.reciprocal_rank(of.test)),
-    "map": Metric("mAP, touch to photo", "mAP", TOUCH_TO_PHOTO, lambda of: protocols.average_precision(of.test)),
-    "photo_to_touch_recall_1": Metric(
-        "R@1, photo to touch", "R@1", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 1)
-    ),
-    "photo_to_touch_recall_5": Metric(
-        "R@5, photo to touch", "R@5", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 5)
-    ),
-    "photo_to_touch_recall_10": Metric(
-        "R@10, photo to touch", "R@10", PHOTO_TO_TOUCH, lambda of: protocols.recall(of.photos, 10)
-    ),
-    "photo_to_touch_mrr": Metric(
-        "MRR, photo to touch", "MRR", PHOTO_TO_TOUCH, lambda of: protocols.reciprocal_rank(of.photos)
-    ),
-    "photo_to_touch_map": Metric(
-        "mAP, photo to touch", "mAP", PHOTO_TO_TOUCH, lambda of: protocols.average_precision(of.photos)
-    ),
+    **_of_gallery("", TOUCH_TO_PHOTO, lambda of: of.test),
+    **_of_gallery("photo_to_touch_", PHOTO_TO_TOUCH, lambda of: of.photos),
     "objectfolder_touch_to_photo": Metric(
         "mAP, touch to photo",
         "mAP, touch to photo",

@@ -87,6 +87,10 @@ class TrainingConfig:
     freeze_towers: train only what comes after the towers; every image is then encoded once for the whole training.
     distil_steps: steps of teaching the pruner after training, where the matcher has one (`retrieval.training.distil`).
     validation_fraction, test_fraction: shares of the objects.
+
+    The loader has three settings that no result depends on, so that checkpoints and caches leave them out. workers:
+    threads that decode images, "auto" for one on each core. prefetch: batches that are loaded ahead of the step.
+    pinned_memory: copy batches to a GPU from page-locked memory while it computes.
     """
 
     init: str = "imagenet"
@@ -111,9 +115,15 @@ class TrainingConfig:
     validate_every: int = 500
     precision: str = "auto"
     seed: int = 0
+    workers: int | str = field(default="auto", compare=False)
+    prefetch: int = field(default=2, compare=False)
+    pinned_memory: bool = field(default=True, compare=False)
 
     def __post_init__(self) -> None:
+        auto = self.workers == "auto" or (isinstance(self.workers, int) and self.workers >= 1)
+        _require(auto, f'workers must be "auto" or at least 1; got {self.workers!r}')
         for name in (
+            "prefetch",
             "iterations",
             "touches_per_batch",
             "positives_per_touch",
@@ -151,9 +161,12 @@ class TrainingConfig:
         return any(weight > 0 for name, weight in self.weights.items() if name not in OF_LOGITS)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as in a TOML file: each weight is a setting of its own, `<loss>_weight`."""
+        """Plain dictionary, as in a TOML file, without the settings of the loader: each weight is a setting of its own,
+        `<loss>_weight`."""
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
+            if name in LOADER:
+                continue
             table |= (
                 {f"{loss}{WEIGHT}": weight for loss, weight in value.items()} if name == "weights" else {name: value}
             )
@@ -170,6 +183,8 @@ class TrainingConfig:
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
+LOADER: dict[str, tuple[type[Any], ...]] = {"workers": (int, str), "prefetch": (int,), "pinned_memory": (bool,)}
+"""Settings of the loader, which decide no result, with their types."""
 WEIGHT = "_weight"
 """What ends the setting of a loss's weight."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
@@ -301,6 +316,13 @@ def load_config(name_or_path: str) -> Config:
     return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 
 
+def named_config(config: Config | str, name: str | None = None) -> tuple[Config, str]:
+    """Return a configuration, given as such or as `load_config` takes it, and what it is called."""
+    if isinstance(config, Config):
+        return config, name or "own"
+    return load_config(config), name or Path(config).stem
+
+
 def preset_names() -> list[str]:
     """Names of the presets that come with the package."""
     files = (resources.files("retrieval") / "configs").iterdir()
@@ -310,17 +332,18 @@ def preset_names() -> list[str]:
 def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
-    types = {name: float for name in table if table_name == "training" and name.endswith(WEIGHT)}
-    types |= {name: type(default) for name, default in defaults.items()}
+    types = {name: (type(default),) for name, default in defaults.items()}
+    if table_name == "training":
+        types |= LOADER | {name: (float,) for name in table if name.endswith(WEIGHT)}
     _refuse_unknown(f"[{table_name}]", table, types)
     return {name: _typed(f"{table_name}.{name}", types[name], value) for name, value in table.items()}
 
 
-def _typed(name: str, wanted: type[Any], value: Any) -> Any:
-    if wanted is float and type(value) is int and abs(value) < 2**63:
+def _typed(name: str, wanted: tuple[type[Any], ...], value: Any) -> Any:
+    if wanted == (float,) and type(value) is int and abs(value) < 2**63:
         return float(value)
-    if type(value) is not wanted or (wanted is list and not all(isinstance(each, str) for each in value)):
-        raise ConfigError(f"{name} must be of type {wanted.__name__}; got {value!r}")
+    if type(value) not in wanted or (wanted == (list,) and not all(isinstance(each, str) for each in value)):
+        raise ConfigError(f"{name} must be of type {' or '.join(one.__name__ for one in wanted)}; got {value!r}")
     return value
 
 

@@ -140,14 +140,26 @@ def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -
 
 @torch.inference_mode()
 def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Code:
-    """Halves and embeddings of touches, on the CPU."""
+    """Halves and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
+
+    >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
+    >>> gels = [checkpoint.config.preprocessing.load_touch(file) for file in ("a.png", "b.png")]
+    >>> retrieval.encode_touches(checkpoint.matcher, [gels]).embedding.shape
+    torch.Size([1, 16])
+    """
     code = matcher.touch_entry(touch_features(matcher, touches, batch))
     return Code(code.half.cpu(), code.embedding.cpu())
 
 
 @torch.inference_mode()
 def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Code:
-    """Halves and embeddings of photos, on the CPU."""
+    """Halves and embeddings of photos (H, W, 3), on the CPU.
+
+    >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
+    >>> photo = checkpoint.config.preprocessing.load_photo("catalog/mug/1.jpg")
+    >>> retrieval.encode_photos(checkpoint.matcher, [photo]).half.shape
+    torch.Size([1, 32])
+    """
     code = matcher.photo_entry(photo_features(matcher, photos, batch))
     return Code(code.half.cpu(), code.embedding.cpu())
 

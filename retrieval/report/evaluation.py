@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import AnyRecording, load_grasps
 from retrieval.report import comparing, looking, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown
@@ -35,12 +35,20 @@ SIMULATION = (
 )
 
 
-def write_report(out: Path, recording: Path | None) -> list[Path]:
+def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
     """Write report.md, report.html and figures/ under `out` from its results.json (and timings.json where it is).
 
     recording: where the pictures of the galleries are; None leaves the galleries out. Returns the files written.
     Raises BadInput for results that cannot be read, DatasetError for a recording that cannot, RetrievalError where
     matplotlib is missing.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> config = retrieval.load_config("tiny")
+    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
+    >>> done = retrieval.evaluate("lab", Path("told"), config=config, methods=["cca", "chance"], quiet=True)
+    >>> [path.name for path in retrieval.write_report(Path("told"), "lab")][:2]
+    ['report.md', 'report.html']
     """
     results = read_results(out)
     grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}

@@ -15,7 +15,7 @@ import numpy as np
 
 from retrieval.data.dataset import Grasp, finger_count, load_grasps
 from retrieval.errors import BadInput
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.search.embeddings import embed_photos
 from retrieval.serve.generations import Opened
 from retrieval.serve.store import Choice

@@ -20,6 +20,7 @@ from retrieval.model.encode import Image, autocast, one_thread, photo_features, 
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
 from retrieval.training.kept import KeptImages
+from retrieval.training.loading import Timed, in_order, worker_count, worker_pool
 
 
 @dataclass(frozen=True)
@@ -32,15 +33,20 @@ class Loaded:
 
 
 class BatchImages:
-    """Loads the images of batches on threads of its own while the step before them is computed."""
+    """Loads the images of batches on worker threads (`retrieval.training.loading`), some batches ahead.
 
-    def __init__(self, config: Config, device: torch.device, *, threads: int = 2, keep_bytes: int = 4 << 30) -> None:
+    No result depends on the settings of the loader (`TrainingConfig.workers`, `prefetch`, `pinned_memory`).
+    """
+
+    def __init__(self, config: Config, device: torch.device, *, keep_bytes: int = 4 << 30) -> None:
         self.config, self.device = config, device
         self.uses_background = config.preprocessing.background != "none"
-        self._touch: ImageCache | KeptImages = ImageCache(config.preprocessing.load_touch, keep_bytes)
-        self._photo: ImageCache | KeptImages = ImageCache(config.preprocessing.load_photo, keep_bytes)
+        self.decoders = Timed(config.preprocessing.load_touch), Timed(config.preprocessing.load_photo)
+        self._touch: ImageCache | KeptImages
+        self._photo: ImageCache | KeptImages
+        self._touch, self._photo = (ImageCache(load, keep_bytes) for load in self.decoders)
         self._ahead = ThreadPoolExecutor(1)
-        self._threads = ThreadPoolExecutor(threads)
+        self._workers = worker_pool(config.training.workers)
 
     def __enter__(self) -> Self:
         return self
@@ -49,7 +55,13 @@ class BatchImages:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ahead.shutdown(cancel_futures=True)
-        self._threads.shutdown(cancel_futures=True)
+        self._workers.shutdown(cancel_futures=True)
+
+    @property
+    def decode_rate(self) -> float | None:
+        """Images a second that all workers together can decode; None where every image was kept decoded."""
+        seconds = [second for decoder in self.decoders for second in decoder.seconds]
+        return worker_count(self.config.training.workers) * len(seconds) / sum(seconds) if seconds else None
 
     def touch(self, grasp: Grasp) -> list[Image]:
         """The finger images of a grasp, preprocessed. Raises DatasetError where a no-contact frame is missing."""
@@ -77,10 +89,11 @@ class BatchImages:
     def keep(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
         """Have the images of these grasps decoded into `folder`, and taken from there from now on (`KeptImages`)."""
         settings = self.config.preprocessing
-        self._touch = KeptImages(settings.load_touch, folder, "touch", settings.digest())
-        self._touch.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
-        self._photo = KeptImages(settings.load_photo, folder, "photo", settings.digest())
-        self._photo.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
+        by, workers = settings.digest(), self.config.training.workers
+        self._touch = touches = KeptImages(settings.load_touch, folder, "touch", by, workers)
+        touches.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
+        self._photo = photos = KeptImages(settings.load_photo, folder, "photo", by, workers)
+        photos.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
 
 
 class TrainedFeatures(BatchImages):
@@ -93,8 +106,15 @@ class TrainedFeatures(BatchImages):
     def _load(self, batch: PairBatch) -> Loaded:
         grasps = [batch.grasps[row] for row in distributed.share(len(batch.grasps))]
         photos = [batch.photos[row] for row in distributed.share(len(batch.photos))]
-        touches = touch_batch(list(self._threads.map(self.touch, grasps)), self.device)
-        return Loaded(batch, touches, to_batch(list(self._threads.map(self.photo, photos)), self.device))
+        felt = [self._workers.submit(self.touch, grasp) for grasp in grasps]
+        seen = [self._workers.submit(self.photo, path) for path in photos]
+        touches = touch_batch([future.result() for future in felt])
+        return Loaded(batch, self._moved(touches), self._moved(to_batch([future.result() for future in seen])))
+
+    def _moved(self, images: Tensor) -> Tensor:
+        """Images on the device, copied from pinned memory while the device computes."""
+        pinned = self.device.type == "cuda" and self.config.training.pinned_memory
+        return (images.pin_memory() if pinned else images).to(self.device, non_blocking=pinned)
 
     def stepping(self) -> AbstractContextManager[None]:
         """What a step is computed in: towers use every core."""
@@ -112,8 +132,8 @@ class TrainedFeatures(BatchImages):
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
         """Encode the images of the pairs, each once."""
-        touch = touch_features(matcher, (self.touch(grasp) for grasp in pairs.grasps))
-        return touch, photo_features(matcher, (self.photo(path) for path in pairs.photos))
+        touch = touch_features(matcher, in_order(self._workers, self.touch, pairs.grasps))
+        return touch, photo_features(matcher, in_order(self._workers, self.photo, pairs.photos))
 
 
 class FrozenFeatures(BatchImages):
@@ -141,10 +161,12 @@ class FrozenFeatures(BatchImages):
     def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
         new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._kept}
         if new:
-            self._kept.update(zip(new, touch_features(matcher, map(self.touch, new.values())), strict=True))
+            images = in_order(self._workers, self.touch, new.values())
+            self._kept.update(zip(new, touch_features(matcher, images), strict=True))
         photos = [path for path in batch.photos if path not in self._kept]
         if photos:
-            self._kept.update(zip(photos, photo_features(matcher, map(self.photo, photos)), strict=True))
+            shown = in_order(self._workers, self.photo, photos)
+            self._kept.update(zip(photos, photo_features(matcher, shown), strict=True))
         touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
         return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
 

@@ -5,7 +5,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -28,7 +28,8 @@ from retrieval.model.config import Config
 from retrieval.model.encode import batches, default_device, photo_features, touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.training.batches import BatchImages
-from retrieval.training.kept import picture_digest
+from retrieval.training.kept import Files, part_path
+from retrieval.training.loading import in_order, worker_pool
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ VARIANTS = ("touch", "blurred", "before")
 SHOWN = ("photo", "margin")
 """What of a photo is shown: all of it; its margin, where the object mostly is not."""
 _MARGIN = 8  # the share of a side that it takes
-_PART, _FORMAT = 512, 1
+_PART = 512
 _BATCH = 32
 
 
@@ -190,10 +191,14 @@ def encode_recording(
     settings = _as_variant(config, variant, shown)
     with BatchImages(settings, device, keep_bytes=0) as images:
         touch_made_by = (variant, _digest_of(matcher.touch_tower), settings.preprocessing.digest())
-        touches = _Parts(cache, touch_made_by, images.touch, partial(touch_features, matcher), images.files, quiet)
-        touch = touches.rows(felt)
+        workers, encode = config.training.workers, partial(touch_features, matcher)
+        touch = _Parts(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(felt)
         if photos_of is None:
-            photo = _photos(grasps, shown, images, matcher, cache, quiet)
+            photo_made_by = (shown, _digest_of(matcher.photo_tower), settings.preprocessing.digest())
+            encode = partial(photo_features, matcher)
+            parts = _Parts(cache, photo_made_by, images.photo, encode, lambda file: (file,), workers, quiet)
+            files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
+            photo = parts.rows(list(files))[[files[grasp.photo] for grasp in grasps]]
         else:
             row_of = {grasp_id: row for row, grasp_id in enumerate(photos_of.grasp_ids)}
             photo = photos_of.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
@@ -203,19 +208,6 @@ def encode_recording(
         touch.reshape(len(touch), config.matcher.fingers, -1),
         photo,
     )
-
-
-def _photos(
-    grasps: Sequence[Grasp], shown: str, images: BatchImages, matcher: Matcher, cache: Path | None, quiet: bool
-) -> NDArray[np.float32]:
-    """(G, F): the features of each grasp's photo, of what of it is shown."""
-    made_by = (shown, _digest_of(matcher.photo_tower), images.config.preprocessing.digest())
-    files = list(dict.fromkeys(grasp.photo for grasp in grasps))
-    encoded = _Parts(cache, made_by, images.photo, partial(photo_features, matcher), lambda file: (file,), quiet).rows(
-        files
-    )
-    row_of = {path: row for row, path in enumerate(files)}
-    return np.asarray(encoded[[row_of[grasp.photo] for grasp in grasps]])
 
 
 def _as_variant(config: Config, variant: str, shown: str) -> Config:
@@ -261,24 +253,25 @@ class _Parts(Generic[T]):
     made_by: tuple[str, ...]
     load: Callable[[T], Any]
     encode: Callable[[list[Any]], Tensor]
-    files: Callable[[T], Iterable[Path]]
+    files: Callable[[T], Files]
+    workers: int | str
     quiet: bool
 
     def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
         """The features (len(items), F) of items, in their order."""
         shown = self.made_by[0]
         unit = "photos" if shown in SHOWN else "grasps"
-        with Bar(f"encode {shown}", len(items), unit, quiet=self.quiet) as bar, ThreadPoolExecutor(2) as pool:
+        with Bar(f"encode {shown}", len(items), unit, quiet=self.quiet) as bar, worker_pool(self.workers) as pool:
             return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
 
-    def _part(self, items: list[T], pool: ThreadPoolExecutor, bar: Bar) -> NDArray[np.float32]:
+    def _part(self, items: list[T], pool: Executor, bar: Bar) -> NDArray[np.float32]:
         path = self._path(items)
         if path and (kept := _read(path)) is not None and len(kept) == len(items):
             bar.advance(len(items))
             return kept.numpy()
         encoded = []
-        for batch in batches(items, _BATCH):
-            encoded.append(self.encode(list(pool.map(self.load, batch))).cpu())
+        for batch in batches(in_order(pool, self.load, items, _BATCH), _BATCH):
+            encoded.append(self.encode(batch).cpu())
             bar.advance(len(batch))
         features = torch.cat(encoded)
         if path:
@@ -289,9 +282,8 @@ class _Parts(Generic[T]):
         """Where the features of these very images, made in this very way, are kept."""
         if self.cache is None:
             return None
-        digests = [picture_digest(path) for item in items for path in self.files(item)]
-        key = hashlib.sha256(json.dumps([_FORMAT, len(items), self.made_by, digests]).encode()).hexdigest()
-        return self.cache / f"{self.made_by[0]}-{key[:32]}.safetensors"
+        files = [self.files(item) for item in items]
+        return part_path(self.cache, self.made_by[0], self.made_by[1:], files).with_suffix(".safetensors")
 
 
 def _read(path: Path) -> Tensor | None:

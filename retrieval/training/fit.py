@@ -1,8 +1,7 @@
 """The training loop: everything that is learned by steps down a gradient is learned in it."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -78,37 +77,6 @@ def fit(
         if stop:
             break
     return done
-
-
-def one_ahead(prepare: Callable[[int], Future[Batch]], steps: range) -> Iterator[Batch]:
-    """The batches of these steps, a step or more; each is prepared while the step before it is computed."""
-    upcoming = prepare(steps[0])
-    for step in steps[1:]:
-        batch, upcoming = upcoming.result(), prepare(step)
-        yield batch
-    yield upcoming.result()
-
-
-def optimizer_tensors(module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """What an optimiser remembers of the parameters of `module` (Adam: two moments and a count of steps), named so that
-    it can be stored beside weights: `optimizer.<parameter>.<quantity>`. `restore_optimizer` takes it back."""
-    return {
-        f"optimizer.{name}.{quantity}": tensor
-        for name, parameter in module.named_parameters()
-        for quantity, tensor in optimizer.state.get(parameter, {}).items()
-    }
-
-
-def restore_optimizer(module: nn.Module, optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Give an optimiser back what `optimizer_tensors` stored; `tensors` may hold others too."""
-    for name, parameter in module.named_parameters():
-        prefix = f"optimizer.{name}."
-        kept = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
-        if kept:  # the count of steps stays on the CPU, as PyTorch itself keeps it
-            optimizer.state[parameter] = {
-                quantity: tensor if quantity == "step" else tensor.to(parameter.device)
-                for quantity, tensor in kept.items()
-            }
 
 
 @dataclass(frozen=True)

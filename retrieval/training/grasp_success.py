@@ -18,7 +18,7 @@ A gate chooses the touches that a matcher later trains on, so it makes them easi
 import dataclasses
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from retrieval.model.losses.match import match_loss
 from retrieval.training.fit import Plan, fit
 from retrieval.training.gate import TASK, Gate, GateSettings, GraspNet
 from retrieval.training.gate import load_gate as load_gate
+from retrieval.training.loading import worker_pool
 
 BATCH = 32
 LEARNING_RATE = 3e-3  # and halved after each quarter of the steps, as by the authors
@@ -124,11 +125,15 @@ def train_gate(
         for objects in (split.train, split.validation)
     )
     _require_both(train, f"the training objects of seed {seed} must have")
-    with _Differences(settings) as differences, one_thread():
+    with worker_pool() as pool, one_thread():
+        differences = _Differences(settings, pool)
         gate = Gate(_trained(train, differences, iterations, seed, quiet), settings)
         with Bar("judge", len(validation), "grasps", quiet=quiet) as bar:
-            logits = _judged(gate, validation, differences, bar)
-    report = _report(out, settings.frame, train, validation, logits)
+            logits: list[float] = []  # the highest of each grasp
+            for part in batches(validation, BATCH):
+                logits += [max(fingers) for fingers in gate.judge(differences(part))]
+                bar.advance(len(part))
+    report = _report(out, settings.frame, train, validation, np.array(logits))
     _save(out, gate, split, attempts, recording, report, {"iterations": iterations, "seed": seed})
     return report
 
@@ -154,22 +159,15 @@ def _require_both(attempts: Sequence[Attempt], who: str) -> None:
 
 
 class _Differences:
-    """The differences of grasps, read on two threads and kept."""
+    """The differences of grasps, decoded by a pool of workers and kept in memory."""
 
-    def __init__(self, settings: GateSettings) -> None:
-        self._frame = settings.frame
+    def __init__(self, settings: GateSettings, pool: Executor) -> None:
+        self._frame, self._pool = settings.frame, pool
         self._load = ImageCache(settings.preprocessing().load_touch)
-        self._threads = ThreadPoolExecutor(2)
-
-    def __enter__(self) -> "_Differences":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._threads.shutdown(cancel_futures=True)
 
     def __call__(self, attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
         distinct = {attempt.grasp.grasp_id: attempt for attempt in attempts}  # no two threads read one file
-        read = dict(zip(distinct, self._threads.map(self._of, distinct.values()), strict=True))
+        read = dict(zip(distinct, self._pool.map(self._of, distinct.values()), strict=True))
         return [read[attempt.grasp.grasp_id] for attempt in attempts]
 
     def _of(self, attempt: Attempt) -> list[NDArray[np.float32]]:
@@ -229,15 +227,6 @@ def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
         for bounds in ((1 - CONTRAST, 1 + CONTRAST), (-BRIGHTNESS, BRIGHTNESS))
     )
     return images * contrast + brightness
-
-
-def _judged(gate: Gate, attempts: list[Attempt], differences: _Differences, bar: Bar) -> NDArray[np.float64]:
-    """The highest logit of each grasp (B,)."""
-    highest: list[float] = []
-    for part in batches(attempts, BATCH):
-        highest += [max(fingers) for fingers in gate.judge(differences(part))]
-        bar.advance(len(part))
-    return np.array(highest)
 
 
 def _report(

@@ -12,7 +12,7 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,11 @@ from retrieval.console.progress import Bar
 from retrieval.errors import BadInput, DatasetError
 from retrieval.model.encode import batches, default_device
 from retrieval.training import distributed
+from retrieval.training.loading import in_order, worker_pool
 
 log = logging.getLogger(__name__)
 _PART, _FORMAT = 128, 1
-_BATCH = 16
+_AHEAD = 16
 
 Files = tuple[Path | None, ...]
 """What one image is made from."""
@@ -39,11 +40,13 @@ class KeptImages:
     """`load(*files)`, for images that were kept without decoding anything.
 
     load: gives images of one shape and type. kind: begins the names of the parts. seen_by: what decides what `load`
-    gives beside the files, as a digest.
+    gives beside the files, as a digest. workers: as `retrieval.training.loading.worker_count` takes it.
     """
 
-    def __init__(self, load: Callable[..., NDArray[Any]], folder: Path, kind: str, seen_by: str) -> None:
-        self._load, self._folder, self._kind, self._seen_by = load, folder, kind, seen_by
+    def __init__(
+        self, load: Callable[..., NDArray[Any]], folder: Path, kind: str, seen_by: str, workers: int | str = "auto"
+    ) -> None:
+        self._load, self._folder, self._kind, self._seen_by, self._workers = load, folder, kind, seen_by, workers
         self._kept: dict[Files, NDArray[Any]] = {}
 
     def __call__(self, *files: Path | None) -> NDArray[Any]:
@@ -56,7 +59,10 @@ class KeptImages:
 
         Raises DatasetError for a picture that cannot be read, BadInput where the disk is too small, OSError.
         """
-        parts = [(self._path(part), part) for part in batches(dict.fromkeys(images), _PART)]
+        parts = [
+            (part_path(self._folder, self._kind, [self._seen_by], part).with_suffix(".npy"), part)
+            for part in batches(dict.fromkeys(images), _PART)
+        ]
         missing = self._unmapped(parts)
         if missing:
             self._require_space(missing, quiet)
@@ -74,26 +80,23 @@ class KeptImages:
         count = sum(len(part) for _, part in parts)
         with (
             Bar(f"decode {self._kind}", count, "images", quiet=quiet) as bar,
-            ThreadPoolExecutor(2) as pool,
+            worker_pool(self._workers) as pool,
         ):
             for path, part in parts:
                 self._write(path, part, pool, bar)
                 self._map(path, part)
 
-    def _write(self, path: Path, part: list[Files], pool: ThreadPoolExecutor, bar: Bar) -> None:
+    def _write(self, path: Path, part: list[Files], pool: Executor, bar: Bar) -> None:
         """Image after image, so that a few are in memory at a time."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
-            for number, some in enumerate(batches(part, _BATCH)):
-                images = list(pool.map(lambda files: self._load(*files), some))
+            for number, image in enumerate(in_order(pool, lambda files: self._load(*files), part, _AHEAD)):
                 if number == 0:
-                    shape = (len(part), *images[0].shape)
-                    form = {"descr": images[0].dtype.str, "fortran_order": False, "shape": shape}
+                    form = {"descr": image.dtype.str, "fortran_order": False, "shape": (len(part), *image.shape)}
                     np.lib.format.write_array_header_1_0(file, form)
                 with naming(path):
-                    for image in images:
-                        file.write(image.tobytes())
-                bar.advance(len(some))
+                    file.write(image.tobytes())
+                bar.advance()
 
     def _map(self, path: Path, part: list[Files]) -> bool:
         """Whether the part is there, whole; then its images are taken from it."""
@@ -110,11 +113,6 @@ class KeptImages:
         self._kept |= zip(part, np.asarray(images), strict=True)
         return True
 
-    def _path(self, part: list[Files]) -> Path:
-        digests = [[path and picture_digest(path) for path in files] for files in part]
-        key = hashlib.sha256(json.dumps([_FORMAT, self._kind, self._seen_by, digests]).encode()).hexdigest()
-        return self._folder / f"{self._kind}-{key[:32]}.npy"
-
     def _require_space(self, missing: Sequence[_Part], quiet: bool) -> None:
         count = sum(len(part) for _, part in missing)
         size = count * self._load(*missing[0][1][0]).nbytes
@@ -127,9 +125,15 @@ class KeptImages:
             say(f"{self._folder} takes {said}")
 
 
-def picture_digest(path: Path) -> str:
-    """SHA-256 of a picture's file. Raises DatasetError."""
+def part_path(folder: Path, kind: str, made_by: Sequence[str], part: Sequence[Files]) -> Path:
+    """Return where a part lies that was made in this very way from these very files; it has no suffix.
+
+    Raises:
+        DatasetError: A file cannot be read.
+    """
     try:
-        return file_digest(path)
+        digests = [[path and file_digest(path) for path in files] for files in part]
     except OSError as error:
-        raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error
+        raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
+    key = hashlib.sha256(json.dumps([_FORMAT, kind, *made_by, digests]).encode()).hexdigest()
+    return folder / f"{kind}-{key[:32]}"

@@ -6,7 +6,6 @@ matcher's (`init_photo`, `init_touch`), whose head is trained on felt objects as
 """
 
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -25,14 +24,16 @@ from retrieval.data.dataset import ImageCache
 from retrieval.data.images import to_float
 from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, labels_digest, load_labelled
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
-from retrieval.model.checkpoint import beside, read_tensors, require_writable, write_tensors
+from retrieval.errors import ConfigError, DatasetError, Interrupted
+from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.training.fit import Plan, fit, one_ahead, optimizer_tensors, restore_optimizer
+from retrieval.training.fit import Plan, fit
 from retrieval.training.kept import KeptImages
+from retrieval.training.loading import ahead, worker_pool
+from retrieval.training.state import load_state, require_fresh, save_state, state_path
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
 WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
@@ -99,21 +100,20 @@ def train_relief(
     require_writable(out)
     kind, pictures = load_labelled(folder)
     training = ReliefTraining(kind, pictures, config, iterations)
-    state = beside(out, ".state.safetensors")
     if resume:
-        training.resume(state)
-    elif state.exists():
-        raise CheckpointError(f"an unfinished training is at {state}; go on with --resume, or delete it to begin anew")
+        training.resume(out)
+    else:
+        require_fresh(out)
     if cache:
         training.keep(cache, quiet=quiet)
     with interruption() as stop, Bar("train relief", iterations, "steps", done=training.step, quiet=quiet) as bar:
-        training.run(state, bar, stop.is_set)
+        training.run(out, bar, stop.is_set)
     if training.step < iterations:
         raise Interrupted(f"stopped at step {training.step} of {iterations}; --resume goes on from here")
     report = training.report()
     about = {"tower": config.matcher.tower, "tower_output": config.matcher.tower_output}
     write_tensors(out, training.tower.state_dict(), about | dataclasses.asdict(report))
-    state.unlink(missing_ok=True)
+    state_path(out).unlink(missing_ok=True)
     return report
 
 
@@ -143,12 +143,12 @@ class ReliefTraining:
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.BatchNorm1d(features, affine=False), nn.Dropout(DROPOUT), last)
-        self.tower.to(self.device)
-        self.head.to(self.device)
+        self.modules = nn.ModuleDict({"tower": self.tower, "head": self.head}).to(self.device)
         self.optimizer = torch.optim.AdamW(
             [{"params": self.tower.parameters()}, {"params": self.head.parameters()}], weight_decay=WEIGHT_DECAY
         )
         self._forms: ImageCache | KeptImages = ImageCache(self._load)
+        self._workers = worker_pool(config.training.workers)
 
     def _load(self, file: Path, before: Path | None) -> NDArray[np.uint8]:
         """(forms, H, W, 3) of a picture as the matcher sees it; a touch also as a matcher of another policy for the
@@ -164,32 +164,34 @@ class ReliefTraining:
     def keep(self, folder: Path, *, quiet: bool = False) -> None:
         """Have all pictures decoded into `folder`, and taken from there from now on (`KeptImages`)."""
         seen_by = replace(self.config.preprocessing, views=("zoom",)).digest()
-        self._forms = KeptImages(self._load, folder, f"relief-{self.kind}", seen_by)
+        self._forms = KeptImages(self._load, folder, f"relief-{self.kind}", seen_by, self.config.training.workers)
         everything = sorted([*self.pictures, *self.validation], key=lambda picture: picture.file)
         self._forms.keep([(picture.file, picture.before) for picture in everything], quiet=quiet)
 
     def _images(self, pictures: Sequence[LabelledPicture], rng: np.random.Generator | None = None) -> Tensor:
         """(B, 3, H, W) of pictures in 8 bits. rng: draws how each touch is seen."""
-        seen = []
-        for picture in pictures:
-            forms = self._forms(picture.file, picture.before)
-            seen.append(to_float(forms[rng.integers(len(forms)) if rng else 0]))
+        seen = [
+            to_float(forms[rng.integers(len(forms)) if rng else 0])
+            for forms in self._workers.map(lambda picture: self._forms(picture.file, picture.before), pictures)
+        ]
         return to_batch(seen)
 
-    def run(self, state: Path, bar: Bar, stopped: Callable[[], bool]) -> None:
-        """Train from the current step to the last, keeping the state now and then."""
+    def run(self, out: Path, bar: Bar, stopped: Callable[[], bool]) -> None:
+        """Train from the current step to the last, saving the state of `out` now and then."""
         plan = Plan(self.iterations, LEARNING_RATE, "cosine", SAVE_EVERY)
-        with ThreadPoolExecutor(1) as ahead:
+        with ThreadPoolExecutor(1) as batches:
+            steps = range(self.step, self.iterations)
+            prepared = (batches.submit(self._batch, step) for step in steps)
             fit(
                 self.optimizer,
                 plan,
-                one_ahead(lambda step: ahead.submit(self._batch, step), range(self.step, self.iterations)),
+                ahead(prepared, self.config.training.prefetch),
                 self._loss,
                 bar=bar,
                 done=self.step,
                 before_step=self._head_faster,
                 after_step=self._stepped,
-                validate=lambda _: self._save(state),
+                validate=lambda _: self._save(out),
                 stopped=stopped,
             )
 
@@ -260,24 +262,12 @@ class ReliefTraining:
         """What must be the same for a training to be resumed."""
         return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
 
-    def _modules(self) -> nn.ModuleDict:
-        return nn.ModuleDict({"tower": self.tower, "head": self.head})
+    def _save(self, out: Path) -> None:
+        save_state(out, self.modules, self.optimizer, {"step": self.step, **self._identity()})
 
-    def _save(self, path: Path) -> None:
-        both = self._modules()
-        tensors = {f"model.{name}": tensor for name, tensor in both.state_dict().items()}
-        tensors |= optimizer_tensors(both, self.optimizer)
-        write_tensors(path, tensors, {"step": self.step, **self._identity()})
-
-    def resume(self, path: Path) -> None:
-        """Take over a state. Raises CheckpointError where there is none, or one of another training."""
-        tensors, header = read_tensors(path)
-        if any(header.get(name) != value for name, value in _plain(self._identity()).items()):
-            raise CheckpointError(f"{path} is of another training; resume with the same pictures and settings")
-        both = self._modules()
-        both.load_state_dict({name: tensors[f"model.{name}"] for name in both.state_dict()})
-        restore_optimizer(both, self.optimizer, tensors)
-        self.step = header["step"]
+    def resume(self, out: Path) -> None:
+        """Continue from the state of `out`. Raises CheckpointError where there is none, or one of another training."""
+        self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
 
 
 def augmented(images: Tensor, kind: str, rng: np.random.Generator) -> Tensor:
@@ -331,9 +321,3 @@ def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> 
     if len(readings) < 2 or readings.std() == 0 or wanted.std() == 0:
         return 0.0
     return float(np.corrcoef(readings, wanted)[0, 1])
-
-
-def _plain(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings as JSON gives them back, with lists for tuples."""
-    plain: dict[str, Any] = json.loads(json.dumps(settings))
-    return plain

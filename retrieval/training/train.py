@@ -7,6 +7,7 @@ machine ends bit for bit where an unbroken run ends.
 import dataclasses
 import math
 import threading
+import time
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
@@ -17,14 +18,17 @@ from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
 from retrieval.console.interruption import interruption
+from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.check.recording import require_fit
 from retrieval.data.dataset import (
+    AnyRecording,
     Grasp,
     PairSampler,
     Split,
     data_digest,
     finger_count,
+    folder_of,
     load_grasps,
     make_split,
     recording_source,
@@ -34,16 +38,12 @@ from retrieval.errors import CheckpointError, ConfigError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
-    beside,
     load_checkpoint,
-    load_weights,
-    read_tensors,
     require_writable,
     save_checkpoint,
     store_checkpoint,
-    write_tensors,
 )
-from retrieval.model.config import Config, TrainingConfig
+from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.weights import initialise_tower
@@ -52,28 +52,17 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
 from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
-from retrieval.training.fit import Plan, fit, one_ahead, optimizer_tensors, restore_optimizer
+from retrieval.training.fit import Plan, fit
 from retrieval.training.judgement import with_verdicts
+from retrieval.training.loading import ahead, worker_count
+from retrieval.training.state import load_state, require_fresh, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 
 
-def state_path(out: Path) -> Path:
-    """Where an unfinished training of `out` keeps what it needs to go on."""
-    return beside(out, ".state.safetensors")
-
-
-def require_fresh(out: Path) -> None:
-    """Raises CheckpointError where an unfinished training of `out` would be lost."""
-    if state_path(out).exists():
-        raise CheckpointError(
-            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
-        )
-
-
 def train(
-    recording: Path,
+    recording: AnyRecording,
     out: Path,
-    config: Config,
+    config: Config | str = "small",
     *,
     split: Split | None = None,
     resume: bool = False,
@@ -82,19 +71,30 @@ def train(
 ) -> Checkpoint:
     """Train on a recording and write the best checkpoint by validation objects to `out`.
 
-    split: drawn from the configuration where None. resume: go on from the state beside `out`. cache: folder where
-    decoded images are kept (`retrieval.training.kept`), for towers that are trained. The number of fingers is the
-    recording's. Ctrl-C ends after the current step with a usable checkpoint and raises Interrupted; a second
-    one stops at once. Raises DatasetError, ConfigError or CheckpointError for what cannot be trained.
+    Ctrl-C ends after the current step with a usable checkpoint; a second one stops at once.
+
+    Args:
+        recording: A folder, or what `robot.read_recording` returns. It decides the number of fingers.
+        out: The checkpoint (.safetensors).
+        config: As an object (`Config.using` takes towers and losses of your own) or as `load_config` takes it.
+        split: Objects of each part; drawn from the configuration where None.
+        resume: Continue from the state next to `out`.
+        cache: Folder of decoded images (`retrieval.training.kept`), for towers that are trained.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        Interrupted: After Ctrl-C.
 
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
     >>> config = dataclasses.replace(config, training=config.training.of_steps(2))  # a real one takes thousands
-    >>> made = retrieval.train(Path("lab"), Path("lab.safetensors"), config, quiet=True)
+    >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
     >>> made.provenance["step"], len(made.split.train)
     (2, 7)
     """
+    recording, (config, _) = folder_of(recording), named_config(config)
     if cache and config.training.freeze_towers:
         raise ConfigError(
             "images are kept for towers that are trained; frozen ones look at each once: leave out the cache"
@@ -145,8 +145,8 @@ class Trainer:
         self.matcher = build_matcher(self.unpruned).to(self.device)
         self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
-        learnt = [*self.matcher.parameters(), *self.losses.parameters()]
-        trained = [parameter for parameter in learnt if parameter.requires_grad]
+        self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
+        trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
@@ -156,6 +156,7 @@ class Trainer:
             self.features = FrozenFeatures(config, self.device, by_image(grasps, known, self.device) if known else {})
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
+        self._passed, self._busy_s = 0, 0.0
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
@@ -185,26 +186,32 @@ class Trainer:
             fit(
                 self.optimizer,
                 plan,
-                one_ahead(self._prepare, range(self.step, plan.steps)),
+                ahead(map(self._prepare, range(self.step, plan.steps)), settings.prefetch),
                 self.loss,
                 bar=bar,
                 done=self.step,
                 stepping=self.features.stepping,
-                before_step=self._share_gradients,
+                before_step=lambda: distributed.average_gradients(self.modules),
                 after_step=self._stepped,
                 note=self._note,
                 validate=lambda _: self._validate_and_save(),
                 # All ranks stop after the same step: one that went on would wait for the others for ever.
                 stopped=lambda: distributed.any_rank(stop.is_set(), self.device),
             )
+        if not quiet and not settings.freeze_towers:
+            say(self._rates())
         if self.step < plan.steps:
             raise Interrupted(
                 f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
             )
 
-    def _share_gradients(self) -> None:
-        for module in (self.matcher, self.losses):
-            distributed.average_gradients(module)
+    def _rates(self) -> str:
+        """Say how fast the loader decodes and the towers compute: the slower one decides how long a step takes."""
+        towers = f"the towers take {self._passed / self._busy_s:.0f} images/s"
+        if (rate := self.features.decode_rate) is None:
+            return f"loader: no image was decoded; {towers}"
+        count = worker_count(self.config.training.workers)
+        return f"loader: {count} worker(s) can decode {rate:.0f} images/s; {towers}"
 
     def _prepare(self, step: int) -> "Future[Loaded]":
         batch = self.sampler.batch(step, self.config.training.touches_per_batch)
@@ -213,6 +220,8 @@ class Trainer:
     def loss(self, loaded: Loaded) -> Tensor:
         """The loss of a prepared batch."""
         settings, batch = self.config.training, loaded.batch
+        self._passed += loaded.touches.shape[:2].numel() + len(loaded.photos)
+        self._began = time.perf_counter()
         torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
@@ -227,6 +236,7 @@ class Trainer:
         self.matcher.clamp_scale()
         self.losses.clamp()
         self.step = done
+        self._busy_s += time.perf_counter() - self._began
 
     def _note(self) -> str:
         logits, labels = self._judged
@@ -305,35 +315,20 @@ class Trainer:
         }
 
     def _save_state(self) -> None:
-        frozen = FROZEN if self.config.training.freeze_towers else ()  # these stand in the checkpoint beside it
-        state = {name: tensor for name, tensor in self.matcher.state_dict().items() if not name.startswith(frozen)}
-        tensors = {f"model.{name}": tensor for name, tensor in state.items()}
-        tensors |= {f"losses.{name}": tensor for name, tensor in self.losses.state_dict().items()}
-        for module in (self.matcher, self.losses):
-            tensors |= optimizer_tensors(module, self.optimizer)
-        best = self.best if self.validation is not None else None
-        write_tensors(state_path(self.out), tensors, {"step": self.step, "best": best, **self._identity()})
+        left_out = FROZEN if self.config.training.freeze_towers else ()  # these are in the checkpoint
+        header = {"step": self.step, "best": None if self.validation is None else self.best, **self._identity()}
+        save_state(self.out, self.modules, self.optimizer, header, left_out=left_out)
 
     def resume(self) -> None:
-        """Take over the state beside `out`. Raises CheckpointError where it belongs to another run."""
-        path = state_path(self.out)
-        tensors, header = read_tensors(path)
-        for name, value in self._identity().items():
-            if header.get(name) != value:
-                raise CheckpointError(
-                    f"{path} was made with another {name.replace('_', ' ')}; resume with the same recording and "
-                    "configuration, or delete the file to start afresh"
-                )
-        kept = self._own_checkpoint().matcher.state_dict()
-        self.matcher.load_state_dict(
-            {name: tensors.get(f"model.{name}", kept[name]) for name in self.matcher.state_dict()}
-        )
-        load_weights(
-            self.losses, {name.removeprefix("losses."): tensors[name] for name in tensors if name.startswith("losses.")}
-        )
-        for module in (self.matcher, self.losses):
-            restore_optimizer(module, self.optimizer, tensors)
+        """Continue from the state next to `out`. Raises CheckpointError where it belongs to another run."""
+        header = load_state(self.out, self.modules, self.optimizer, self._identity(), left_out=self._frozen_weights)
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
+
+    def _frozen_weights(self) -> dict[str, Tensor]:
+        weights = self._own_checkpoint().matcher.state_dict().items()
+        named = {f"matcher.{name}": tensor for name, tensor in weights}
+        frozen = self.config.training.freeze_towers
+        return {name: tensor for name, tensor in named.items() if frozen and name.startswith(FROZEN)}
 
     def _own_checkpoint(self) -> Checkpoint:
         """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
@@ -347,8 +342,8 @@ class Trainer:
         return kept
 
 
-FROZEN = ("touch_tower.", "photo_tower.")
-"""How the names of weights begin that stand still where towers are frozen."""
+FROZEN = ("matcher.touch_tower.", "matcher.photo_tower.")
+"""How the names of the weights of frozen towers begin."""
 
 
 def labelled_pairs(config: Config) -> list[Grasp]:

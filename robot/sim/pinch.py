@@ -63,7 +63,11 @@ class Hand:
 
 @dataclass(frozen=True)
 class Grip:
-    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger."""
+    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger.
+
+    >>> robot.Grip(robot.Pose(x_mm=0, y_mm=0, z_mm=40, yaw_rad=0), force_n=12).force_n
+    12
+    """
 
     pose: Pose
     force_n: float

@@ -34,6 +34,10 @@ class Scene:
 
     `sensors` are the fingers that feel, by letter; leave one out and the finger is bare. Raises SceneError for what
     cannot be: an unknown output, a touch without its sensor or without a grip, a finger that no gripper has.
+
+    >>> scene = robot.Scene(robot.draw_object(seed=0, index=0), outputs={"photo"})
+    >>> scene.run()["photo"].dtype
+    dtype('uint8')
     """
 
     obj: SimObject

@@ -23,7 +23,7 @@ from retrieval.evaluation.real.protocol import Protocol, first_guess
 from retrieval.frontier.points import Row
 from retrieval.methods import METHODS
 from retrieval.methods.base import Setting
-from retrieval.methods.chance import Chance
+from retrieval.methods.trivial import Chance
 from retrieval.metrics import protocols, registry
 from retrieval.metrics.registry import Metric
 from retrieval.metrics.table import ScoreTable

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+from importlib import import_module
 
 import pytest
 
@@ -54,6 +55,7 @@ TINY = {
     },
 }
 LARGEST_BYTES = 400_000
+PACKAGES = ("retrieval", "robot", "indexes")
 LONGEST_CELL = 14
 
 every_notebook = pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.ipynb")))
@@ -128,6 +130,28 @@ def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
         built = [type(node) for node in ast.walk(ast.parse("\n".join(lines)))]
         assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(built)
     assert not set(document["metadata"]) - {"kernelspec", "language_info"}
+
+
+def _readme_blocks():
+    text = (FOLDER.parent / "README.md").read_text("utf-8")
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_notebooks_and_the_readme_import_public_names_of_the_packages_alone():
+    for name in sorted(TINY):
+        _require_public(name, *("".join(cell["source"]) for cell in code_cells(name)))
+    _require_public("README.md", *_readme_blocks())
+
+
+def _require_public(where, *sources):
+    """Of our packages only the roots are imported, and only public names of these are used."""
+    for tree in map(ast.parse, sources):
+        for node in ast.walk(tree):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            modules += [node.module] if isinstance(node, ast.ImportFrom) else []
+            assert not [name for name in modules if name.partition(".")[0] in PACKAGES and "." in name], where
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in PACKAGES:
+                assert node.attr in import_module(node.value.id).__all__, f"{where}: {node.value.id}.{node.attr}"
 
 
 def test_a_cell_shows_what_it_prints_its_last_line_and_its_figures(monkeypatch):

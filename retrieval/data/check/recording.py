@@ -34,6 +34,10 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
 
     Depth pictures are not opened: nothing is trained on them. A grasp that one check names is left out of the later
     ones. Raises DatasetError where the recording cannot be read at all, or holds no accepted grasp.
+
+    >>> from pathlib import Path
+    >>> {finding.severity for finding in retrieval.check_recording(Path("lab"))} <= {"note", "warning", "error"}
+    True
     """
     attempts = load_all(folder)
     accepted = require_accepted(folder, attempts)

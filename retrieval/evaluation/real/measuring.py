@@ -1,8 +1,6 @@
 """From the predictions of one fold to its measures: the galleries of the protocol, then one measure of all of them."""
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -14,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from retrieval.data.dataset import Split
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import BadInput
+from retrieval.evaluation.cache import MadeBy, read_kept, write_kept
 from retrieval.evaluation.calibrate import KWayTest, drawn_choices, pair_rule, stated_first_guesses
 from retrieval.evaluation.real.protocol import Facts, Protocol
 from retrieval.evaluation.scoring import MethodScores
@@ -22,7 +21,6 @@ from retrieval.evaluation.shown import Shown
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import Scored
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.checkpoint import read_tensors, write_tensors
 from retrieval.model.posterior import Posterior
 
 QUARTILES = 4
@@ -153,13 +151,8 @@ def _of(table: ScoreTable, mine: Any) -> ScoreTable:
 # Kept on disk ----------------------------------------------------------------------------------------
 
 
-def digest(made_by: Mapping[str, Any]) -> str:
-    """SHA-256 of what made something, in JSON types."""
-    return hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
-
-
-def write_measured(path: Path, measured: Measured, made_by: str) -> None:
-    """Keep the measures of a fold; `made_by` is a digest."""
+def write_measured(path: Path, measured: Measured, made_by: MadeBy) -> None:
+    """Keep the measures of a fold."""
     tensors = {f"stated/{name}": torch.from_numpy(part) for name, part in measured.stated.items()} | {
         f"{name}/{part}": torch.from_numpy(np.ascontiguousarray(getattr(found, part)))
         for name, found in measured.measures.items()
@@ -167,25 +160,20 @@ def write_measured(path: Path, measured: Measured, made_by: str) -> None:
     }
     galleries = {name: found.gallery for name, found in measured.measures.items()}
     about = {"galleries": galleries, "chosen": dict(measured.chosen), "examples": dict(measured.examples)}
-    write_tensors(path, tensors, {"made_by": made_by, **about})
+    write_kept(path, made_by, tensors, about)
 
 
-def read_measured(path: Path, made_by: str) -> Measured | None:
-    """What `write_measured` kept; None where it lies not there, is damaged, or was made by something else."""
-    if not path.is_file():
+def read_measured(path: Path, made_by: MadeBy) -> Measured | None:
+    """Return what `write_measured` kept; None where it is missing, damaged, or made by something else."""
+    if (kept := read_kept(path, made_by)) is None:
         return None
-    try:
-        tensors, header = read_tensors(path)
-    except CheckpointError:
-        return None
-    if header.get("made_by") != made_by:
-        return None
+    tensors, header = kept
     measures = {
         name: Measure(
-            tensors[f"{name}/values"].numpy(),
-            tensors[f"{name}/owner"].numpy(),
-            tensors[f"{name}/chance"].numpy(),
-            gallery,
+            values=tensors[f"{name}/values"].numpy(),
+            owner=tensors[f"{name}/owner"].numpy(),
+            chance=tensors[f"{name}/chance"].numpy(),
+            gallery=gallery,
         )
         for name, gallery in header["galleries"].items()
     }
@@ -198,11 +186,4 @@ def read_measured(path: Path, made_by: str) -> Measured | None:
 def joined(folds: Sequence[Measured]) -> dict[str, Measure]:
     """The measures of all folds of one seed, over all their queries; those that every fold has."""
     names = [name for name in folds[0].measures if all(name in each.measures for each in folds)]
-    return {name: pooled([each.measures[name] for each in folds], [_Same()] * len(folds)) for name in names}
-
-
-class _Same(dict[int, int]):
-    """Every number stands for itself."""
-
-    def __missing__(self, number: int) -> int:
-        return number
+    return {name: pooled([each.measures[name] for each in folds]) for name in names}

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.evaluation.real.protocol import Protocol
-from retrieval.metrics.binomial import clopper_pearson
 from retrieval.metrics.choices import compare_choices, summarise_choices
+from retrieval.metrics.guesses import clopper_pearson
 from retrieval.metrics.intervals import LEVEL, compare, summarise
 from retrieval.metrics.measure import Measure
 
@@ -37,22 +37,18 @@ class Summing:
 
     def summaries(self, taken: BySeed) -> dict[str, Any]:
         """Values with intervals, by name; those that all have."""
-        return {name: self._summary([one[name] for one in taken]) for name in _shared(taken)}
+        found = {name: [one[name] for one in taken] for name in _shared(taken)}
+        if self.ratio is not None:
+            return {name: summarise_choices(measures, self.ratio) for name, measures in found.items()}
+        return {name: summarise(measures, draws=self.draws, seed=self.seed) for name, measures in found.items()}
 
     def differences(self, a: BySeed, b: BySeed) -> dict[str, Any]:
         """Paired differences `a` - `b`, by name."""
         names = [name for name in _shared(a) if name in _shared(b)]
-        return {name: self._difference([one[name] for one in a], [one[name] for one in b]) for name in names}
-
-    def _summary(self, measures: Sequence[Measure]) -> dict[str, Any]:
+        pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
         if self.ratio is not None:
-            return summarise_choices(measures, self.ratio)
-        return summarise(measures, draws=self.draws, seed=self.seed)
-
-    def _difference(self, a: Sequence[Measure], b: Sequence[Measure]) -> dict[str, Any]:
-        if self.ratio is not None:
-            return compare_choices(a, b, self.ratio)
-        return compare(a, b, draws=self.draws, seed=self.seed)
+            return {name: compare_choices(*pair, self.ratio) for name, pair in pairs.items()}
+        return {name: compare(*pair, draws=self.draws, seed=self.seed) for name, pair in pairs.items()}
 
 
 def _shared(taken: BySeed) -> list[str]:

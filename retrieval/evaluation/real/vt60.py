@@ -2,6 +2,7 @@
 and 02_bottleempty are the same things, and no photo tells them apart."""
 
 from collections import defaultdict
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -136,39 +137,24 @@ CLASSES = Protocol(
     _MEASURES,
     own_photos=True,
 )
-REFERENCE_SEEN_CLASSES = Protocol(
-    "vt60",
-    "VT60, reference touches: an unseen instance of each seen class",
-    f"As vt60-seen-classes, the catalogue holding touches in place of photos. {_PARTED} {_SHARED}",
-    _seen_classes,
-    _OF_REFERENCES,
-    own_photos=True,
-    entry=REFERENCE,
-)
-REFERENCE_RANDOM = Protocol(
-    "vt60",
-    "VT60, reference touches: nine random unseen objects",
-    f"As vt60-random, the catalogue holding touches in place of photos. {_PARTED} {_SHARED}",
-    _random,
-    _OF_REFERENCES,
-    own_photos=True,
-    entry=REFERENCE,
-)
-REFERENCE_AND_PHOTO = Protocol(
-    "vt60",
-    "VT60, reference touches with photos: an unseen instance of each seen class",
-    f"As vt60-seen-classes, the catalogue holding a touch with each photo. {_PARTED} {_SHARED}",
-    _seen_classes,
-    _OF_REFERENCES,
-    own_photos=True,
-    entry=BOTH,
-)
-REFERENCE_AND_PHOTO_RANDOM = Protocol(
-    "vt60",
-    "VT60, reference touches with photos: nine random unseen objects",
-    f"As vt60-random, the catalogue holding a touch with each photo. {_PARTED} {_SHARED}",
-    _random,
-    _OF_REFERENCES,
-    own_photos=True,
-    entry=BOTH,
-)
+
+
+def _with_references(name: str, protocol: Protocol, entry: str) -> Protocol:
+    """The protocol `name` with a catalogue of reference touches."""
+    called, held = {
+        REFERENCE: ("reference touches", "touches in place of photos"),
+        BOTH: ("reference touches with photos", "a touch with each photo"),
+    }[entry]
+    return replace(
+        protocol,
+        title=protocol.title.replace("VT60", f"VT60, {called}"),
+        rule=f"As {name}, the catalogue holding {held}. {_PARTED} {_SHARED}",
+        measures=_OF_REFERENCES,
+        entry=entry,
+    )
+
+
+REFERENCE_SEEN_CLASSES = _with_references("vt60-seen-classes", SEEN_CLASSES, REFERENCE)
+REFERENCE_RANDOM = _with_references("vt60-random", RANDOM, REFERENCE)
+REFERENCE_AND_PHOTO = _with_references("vt60-seen-classes", SEEN_CLASSES, BOTH)
+REFERENCE_AND_PHOTO_RANDOM = _with_references("vt60-random", RANDOM, BOTH)

@@ -27,7 +27,7 @@ from indexes.kinds.scores import Floats, Slots
 from indexes.store.manifest import Manifest
 from indexes.store.tables import Tables
 from retrieval.errors import BadInput
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.search.build.measuring import (
     FEWER,

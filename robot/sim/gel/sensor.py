@@ -167,6 +167,9 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings
     The same seed, finger and optics give the same sensor. `optics`: led, grey, or the name of a fitted sensor. `gel`:
     what is not to be drawn; all else is drawn as without it.
     Raises UnknownName for other optics and RobotConfigError for an empty finger.
+
+    >>> robot.draw_sensor(seed=0, finger="a") == robot.draw_sensor(seed=0, finger="a")
+    True
     """
     if optics not in OPTICS:
         raise UnknownName(f"no optics is called {optics!r}; known are {', '.join(sorted(OPTICS))}")

@@ -65,6 +65,9 @@ def draw_object(seed: int, index: int, *, family: str | None = None, relief: str
     """Object `index` of the world `seed`; `family` and `relief` can be fixed.
 
     A pure function of its arguments, cheap until the body is used. Raises UnknownName, RobotConfigError.
+
+    >>> robot.draw_object(seed=0, index=0).object_id.endswith("-0000-00000")
+    True
     """
     for name, value in (("seed", seed), ("index", index)):
         if not isinstance(value, int | np.integer) or value < 0:

@@ -13,7 +13,7 @@ from retrieval.adaptation import folds
 from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, tell_apart
-from retrieval.adaptation.material import config_for, encode, take_over
+from retrieval.adaptation.material import BESIDE, config_for, encode, take_over
 from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
 from retrieval.commands.options import training_config
@@ -25,6 +25,7 @@ from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
+from retrieval.model.towers.small import Small
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features
 from retrieval.training.train import build_matcher
@@ -173,7 +174,7 @@ def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_p
     preset = training_config("adapt", None, init=str(weights))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    wanted = Matcher(config_for(start, 1, beside=True, seed=0).matcher, 2)
+    wanted = Matcher(config_for(start, 1, BESIDE, seed=0).matcher, 2)
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
         take_over(getattr(wanted, side), getattr(start.matcher, side), str(weights))
@@ -187,7 +188,7 @@ def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_p
 def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path, monkeypatch):
     monkeypatch.setattr(Estimate, "keeps_the_model", False)
     out = tmp_path / "own.safetensors"
-    material, _ = adapt(recording, out, load_checkpoint(model), init="none", quiet=True)
+    material = adapt(recording, out, load_checkpoint(model), init="none", quiet=True).material
     made = load_checkpoint(out)
     assert set(made.split.train) == {grasp.object_id for grasp in load_grasps(recording)}
     assert made.posterior is not None
@@ -210,12 +211,12 @@ def test_a_model_that_knows_more_than_a_fit_is_kept_and_its_probabilities_are_fi
     recording, model, tmp_path, monkeypatch
 ):
     start = load_checkpoint(model)
-    _, estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True)
+    estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     assert estimate.keeps_the_model == (
         estimate.known_below.by_object()[1].mean() >= estimate.below.by_object()[1].mean()
     )
     monkeypatch.setattr(Estimate, "keeps_the_model", True)
-    _, estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True)
+    estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
     assert "it is kept" in estimate.lines()[-1]
     assert made.config == start.config
@@ -234,9 +235,9 @@ def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tm
     monkeypatch.setattr(Estimate, "keeps_the_model", False)
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
-    material, _ = adapt(
+    material = adapt(
         recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split, quiet=True
-    )
+    ).material
     assert set(material.features.object_ids) == set(names[3:])
     assert set(load_checkpoint(tmp_path / "own.safetensors").split.train) == set(names[3:])
 
@@ -245,7 +246,7 @@ def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tm
 def test_too_few_objects_to_be_judged_give_a_checkpoint_that_claims_nothing(recording, model, tmp_path, capsys):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[:4]), (), tuple(names[4:]))
-    _, estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split)
+    estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
     assert (estimate, made.posterior, made.provenance["metrics"]) == (None, None, {})
     assert "6 objects or more can be judged" in capsys.readouterr().err
@@ -265,7 +266,7 @@ def beside(tmp_path_factory):
 
 def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
     start = load_checkpoint(model)
-    config = config_for(start, 2, beside=True, seed=0)
+    config = config_for(start, 2, BESIDE, seed=0)
     matcher = Matcher(config.matcher, 2).eval()
     take_over(matcher.touch_tower, start.matcher.touch_tower, str(beside))
     own, published = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
@@ -274,6 +275,13 @@ def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
     with torch.inference_mode():
         together = torch.cat([own(images), published(images)], 1)
         assert torch.allclose(matcher.touch_tower(images), together, atol=1e-5)
+
+
+def test_the_published_tower_is_chosen_by_name_or_as_a_class(model):
+    start = load_checkpoint(model)
+    assert config_for(start, 2, "resnet18", seed=0).matcher.tower == "small+resnet18"
+    assert config_for(start, 2, Small, seed=0).matcher.tower == "small+small"
+    assert config_for(start, 2, None, seed=0).matcher.tower == "small"
 
 
 def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):

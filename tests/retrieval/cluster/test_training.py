@@ -11,7 +11,8 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.training.train import state_path, train
+from retrieval.training.state import state_path
+from retrieval.training.train import train
 from tests import on_ray
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import with_training

@@ -24,6 +24,7 @@ from retrieval.data.dataset import (
     recording_source,
 )
 from retrieval.errors import DatasetError
+from robot.recording.folder import read_recording
 from tests import synthetic
 
 
@@ -80,6 +81,11 @@ def test_grasps_come_in_the_order_of_collection_with_their_files_in_the_order_of
         assert item.photo == small_recording / row["photo_file_name"]
         assert item.touches == tuple(small_recording / row[f"touch_{finger}_file_name"] for finger in "ab")
         assert item.backgrounds == tuple(small_recording / row[f"touch_{finger}_before_file_name"] for finger in "ab")
+
+
+def test_a_recording_is_given_by_its_folder_or_as_it_was_read(small_recording):
+    by_folder = load_grasps(small_recording)
+    assert by_folder == load_grasps(str(small_recording)) == load_grasps(read_recording(small_recording))
 
 
 def test_grasps_that_closed_on_nothing_are_left_out(small_recording):

@@ -18,9 +18,8 @@ from retrieval.evaluation.calibrate import (
     questions,
     reliability,
 )
-from retrieval.metrics.pairs import fit_calibration
+from retrieval.metrics.pairs import fit_calibration, reliability_bins
 from retrieval.metrics.protocols import pair_accuracy
-from retrieval.metrics.reliability import reliability_bins
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 

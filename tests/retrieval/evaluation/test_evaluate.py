@@ -13,11 +13,10 @@ import torch
 from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, Split, load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
-from retrieval.evaluation.ceilings import CEILINGS, ceiling_experiments
-from retrieval.evaluation.controls import score_beside, thinned
+from retrieval.evaluation.controls import CEILINGS, ceiling_experiments, score_beside, thinned
+from retrieval.evaluation.evaluate import evaluate
 from retrieval.evaluation.experiment import Experiment, _shuffled
 from retrieval.evaluation.queries import draw_queries
-from retrieval.evaluation.run import evaluate
 from retrieval.methods.base import Method
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.report.evaluation import write_report
@@ -240,7 +239,7 @@ def test_two_runs_give_the_same_results_to_the_byte_and_no_paths_or_times(made, 
 def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkeypatch):
     with monkeypatch.context() as during:
         no_fits(during)
-        during.setattr("retrieval.evaluation.run.audit", lambda *_, **__: pytest.fail("audited"))
+        during.setattr("retrieval.evaluation.evaluate.audit", lambda *_, **__: pytest.fail("audited"))
         assert run(made[1], seeds=2) == made[0]
     added = run(made[1], methods=(*FEW, "chance"), seeds=2)
     assert {name: added["methods"][name] for name in FEW} == made[0]["methods"]
@@ -314,8 +313,7 @@ def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_
     experiment = Experiment(tmp_path, CONFIG, split, features, None, asked, None, shuffled=False, quiet=True)
     found = {}
     for name, ceiling in ceiling_experiments(experiment).items():
-        ceiling.predict("cca", 0)
-        entry = score_beside(CEILINGS[name], "cca", ceiling, 0, draws=100, seed=0)
+        entry = score_beside(CEILINGS[name], "cca", ceiling, 0, draws=100)
         found[name] = entry["measures"]["guesses_k5"]["value"][0]
     assert found["photo_to_photo"] > 0.99
     assert found["touch_to_touch"] < 0.4  # chance is .2

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from retrieval.data.dataset import Grasp, Split
-from retrieval.errors import BadInput, CheckpointError, DatasetError
+from retrieval.errors import DatasetError
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import MOST_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
 from retrieval.methods.base import Setting
-from retrieval.methods.chance import Chance
+from retrieval.methods.trivial import Chance
 from retrieval.model.checkpoint import write_tensors
 from retrieval.training.features import Features
 from tests.conftest import TINY
@@ -147,32 +147,24 @@ def test_what_was_written_is_read(predictions, tmp_path):
     assert (found.chosen, found.seconds) == (predictions.chosen, predictions.seconds)
 
 
-@pytest.mark.parametrize("key", list(MADE_BY))
-def test_scores_that_something_else_made_are_refused(key, predictions, tmp_path):
+@pytest.mark.parametrize("key", [*MADE_BY, "model"])
+def test_scores_that_something_else_made_are_not_read(key, predictions, tmp_path):
     write_predictions(tmp_path / "p.safetensors", predictions, MADE_BY)
-    with pytest.raises(BadInput, match=f"of another {key} than is to be scored; delete"):
-        read_predictions(tmp_path / "p.safetensors", {**MADE_BY, key: "other"})
-    with pytest.raises(BadInput, match="of another model"):
-        read_predictions(tmp_path / "p.safetensors", {**MADE_BY, "model": "m"})
+    assert read_predictions(tmp_path / "p.safetensors", {**MADE_BY, key: "other"}) is None
 
 
-def test_a_flipped_bit_a_missing_file_and_a_nan_are_refused(predictions, tmp_path):
+def test_a_flipped_bit_a_missing_file_and_a_nan_are_not_read(predictions, tmp_path):
     path = tmp_path / "p.safetensors"
-    with pytest.raises(CheckpointError, match="there is no"):
-        read_predictions(path, MADE_BY)
+    assert read_predictions(path, MADE_BY) is None
     write_predictions(path, predictions, MADE_BY)
     data = bytearray(path.read_bytes())
     data[-3] ^= 4
     path.write_bytes(data)
-    with pytest.raises(CheckpointError, match="damaged"):
-        read_predictions(path, MADE_BY)
-    spoilt = Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {})
-    write_predictions(path, spoilt, MADE_BY)
-    with pytest.raises(CheckpointError, match="NaN"):
-        read_predictions(path, MADE_BY)
+    assert read_predictions(path, MADE_BY) is None
+    write_predictions(path, Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {}), MADE_BY)
+    assert read_predictions(path, MADE_BY) is None
     write_tensors(path, {}, {})
-    with pytest.raises(BadInput, match="of another features"):
-        read_predictions(path, MADE_BY)
+    assert read_predictions(path, MADE_BY) is None
 
 
 def test_showing_the_true_object_by_fewer_photos_would_favour_a_method_that_knows_nothing():

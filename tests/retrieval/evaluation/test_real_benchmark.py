@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from retrieval.commands.main import main
-from retrieval.evaluation.real import PROTOCOLS, run, vt60
-from retrieval.evaluation.real.measuring import read_measured, write_measured
+from retrieval.evaluation.real import PROTOCOLS, vt60
+from retrieval.evaluation.real import benchmark as real_benchmark
+from retrieval.evaluation.real.measuring import Measured, read_measured, write_measured
 from retrieval.methods.base import Method
+from retrieval.metrics.measure import Measure
 from tests import real_data_sets
 from tests.data import touch_data
 
@@ -179,19 +181,18 @@ def test_a_stopped_run_goes_on(data, out, tmp_path, monkeypatch, capsys):
     assert (again / "results.json").read_bytes() == (out / "results.json").read_bytes()
 
 
-def test_measures_of_other_settings_and_damaged_ones_are_not_taken(out, tmp_path):
-    path = next((out / "cache" / "measures" / "vt60-random").glob("cca_pca-touch-*"))
-    made_by = json.loads(path.read_bytes()[8 : 8 + int.from_bytes(path.read_bytes()[:8], "little")])
-    key = json.loads(made_by["__metadata__"]["touch_retrieval"])["made_by"]
-    kept = read_measured(path, key)
-    assert kept is not None
-    write_measured(tmp_path / "copy.safetensors", kept, key)
-    copy = read_measured(tmp_path / "copy.safetensors", key)
-    np.testing.assert_array_equal(copy.measures["guesses_k9"].values, kept.measures["guesses_k9"].values)
-    assert read_measured(path, "other") is None
-    assert read_measured(tmp_path / "none.safetensors", key) is None
-    (tmp_path / "copy.safetensors").write_bytes(path.read_bytes()[:-9])
-    assert read_measured(tmp_path / "copy.safetensors", key) is None
+def test_measures_of_other_settings_and_damaged_ones_are_not_taken(tmp_path):
+    path, made_by = tmp_path / "kept.safetensors", {"seed": 0, "split": {"test": ("a", "b")}}
+    values, owner = np.array([[1.0], [0.5]]), np.array([0, 1])
+    measured = Measured({"k9": Measure(values, owner, np.array([0.1]), "nine")}, {"power": 1}, {"best": []}, {})
+    write_measured(path, measured, made_by)
+    kept = read_measured(path, made_by)
+    np.testing.assert_array_equal(kept.measures["k9"].values, values)
+    assert (kept.measures["k9"].gallery, kept.chosen, kept.examples) == ("nine", {"power": 1}, {"best": []})
+    assert read_measured(path, made_by | {"seed": 1}) is None
+    assert read_measured(tmp_path / "none.safetensors", made_by) is None
+    path.write_bytes(path.read_bytes()[:-9])
+    assert read_measured(path, made_by) is None
 
 
 def test_no_scores_and_no_fits_are_left_on_the_disk(out):
@@ -273,7 +274,7 @@ def test_real_bottles_and_balls_are_told_better_by_touch_than_by_its_blur(tmp_pa
     """VT60, seen classes: the number of docs/real.md, with one seed."""
     weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     data = touch_data("vt60").parent
-    monkeypatch.setattr(run, "MOST", {"train": 1, "validation": 12, "test": 20})
+    monkeypatch.setattr(real_benchmark, "MOST", {"train": 1, "validation": 12, "test": 20})
     asked = ["--protocols", "vt60-seen-classes", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
     assert benchmark(data, tmp_path, methods=asked) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["vt60-seen-classes"]

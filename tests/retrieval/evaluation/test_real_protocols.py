@@ -9,7 +9,7 @@ import pytest
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS
-from retrieval.evaluation.real.controls import by_clock, clock, why_not_untouched
+from retrieval.evaluation.real.lines import by_clock, clock, why_not_untouched
 from retrieval.evaluation.real.measuring import contact_quartiles
 from retrieval.evaluation.real.protocol import Facts
 from retrieval.evaluation.real.references import ASKED, references_of, shown_by_references, with_references

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from retrieval.errors import ConfigError, DatasetError
-from retrieval.frontier import APPROXIMATIONS, load_approximation, run
+from retrieval.frontier import APPROXIMATIONS, load_approximation
+from retrieval.frontier import measure as measuring_module
 from retrieval.frontier.candidates import default_k, ranks
 from retrieval.frontier.clock import timed
 from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.pixels import load_touch
 from retrieval.frontier.points import Panel, Row, Tradeoff, duration, missed, number
 from retrieval.frontier.sample import Sample, Scale, blend
-from retrieval.metrics.binomial import binomial_interval
+from retrieval.metrics.guesses import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
 from retrieval.search.build.measuring import WinnerBench
@@ -264,7 +265,7 @@ def test_winners_are_the_photos_of_the_highest_logit_and_are_found_once(sample, 
 
 
 TABLE = {"one": "nowhere:one", "other": "nowhere:other"}
-measure = partial(run.measure, table=TABLE, need_no_model=TABLE)
+measure = partial(measuring_module.measure, table=TABLE, need_no_model=TABLE)
 
 
 def nobody():
@@ -281,7 +282,7 @@ def bare(model, tmp_path, monkeypatch):
             return load_approximation(name, table)
         return lambda sample: calls.append(name) or Row(name, "text", (panel((1e-3, 2)),))
 
-    monkeypatch.setattr(run, "load_approximation", measuring)
+    monkeypatch.setattr(measuring_module, "load_approximation", measuring)
     return Sample(model, nobody, tmp_path / "features", TINY, quiet=True), calls
 
 
@@ -315,14 +316,16 @@ def test_a_damaged_part_is_measured_again(bare, tmp_path):
 
 def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, monkeypatch):
     made, calls = bare
-    measuring = run.load_approximation
+    measuring = measuring_module.load_approximation
 
     def stop(sample):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as stopping:
         stopping.setattr(
-            run, "load_approximation", lambda name, table: stop if name == "other" else measuring(name, table)
+            measuring_module,
+            "load_approximation",
+            lambda name, table: stop if name == "other" else measuring(name, table),
         )
         with pytest.raises(KeyboardInterrupt):
             measure(made, tmp_path, ["one", "other"])

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from retrieval.methods.held_out import by_looks, held_out_folds
+from retrieval.methods.selection import by_looks, held_out_folds
 from retrieval.training.features import Features
 
 KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]

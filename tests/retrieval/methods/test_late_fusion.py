@@ -14,8 +14,8 @@ from retrieval.methods.prune_rerank import PruneRerank, candidates
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.training.features import Features, encode_recording
-from retrieval.training.finish import unfinished
-from retrieval.training.train import Trainer, build_matcher, state_path, train
+from retrieval.training.state import state_path, unfinished
+from retrieval.training.train import Trainer, build_matcher, train
 from tests.conftest import TINY
 
 FROZEN = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, freeze_towers=True))

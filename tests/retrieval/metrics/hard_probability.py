@@ -8,8 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, log_expit, softmax
 
 from retrieval.evaluation.reject import galleries, statistic
-from retrieval.metrics.pairs import fit_calibration
-from retrieval.metrics.reliability import reliability_bins
+from retrieval.metrics.pairs import fit_calibration, reliability_bins
 from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
 from tests.hard_case import HardCase, refused
 

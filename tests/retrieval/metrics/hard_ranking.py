@@ -9,8 +9,7 @@ from scipy import special
 from torch import nn
 
 from retrieval.methods.selection import ranking_auc
-from retrieval.metrics.binomial import binomial_interval
-from retrieval.metrics.guesses import guess_curve
+from retrieval.metrics.guesses import binomial_interval, guess_curve
 from retrieval.metrics.intervals import bootstrap_interval, sign_flip_p
 from retrieval.metrics.pairs import pair_auc
 from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.binomial import binomial_interval
-from retrieval.metrics.guesses import grouped_interval, guess_curve, guess_curves
+from retrieval.metrics.guesses import binomial_interval, grouped_interval, guess_curve, guess_curves
 
 
 def curve_by_enumeration(true_score, others, k):

@@ -260,11 +260,24 @@ def test_a_loss_that_is_not_finite_stops_the_training_and_writes_nothing(misses,
 # What is refused -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("outcome", ["held", "missed"])
-def test_a_recording_of_one_kind_alone_is_refused(tmp_path, outcome):
-    folder = write(tmp_path / "r", (outcome,))
-    with pytest.raises(DatasetError, match=r"must hold both successful and failed grasps; got [08] successful of 8"):
-        train_gate(folder, tmp_path / "g.safetensors", quiet=True)
+REFUSED = {
+    "held grasps alone": (
+        {"outcomes": ("held",)},
+        r"must hold both successful and failed grasps; got 8 successful of 8",
+    ),
+    "failed ones alone": ({"outcomes": ("missed",)}, r"must hold both successful and failed grasps; got 0 successful"),
+    "no frame before": ({"columns": ("during",)}, r"a-0 has 0 before for 2 finger\(s\)"),
+    "no frame after": ({"columns": ("during", "before")}, r"a-0 has 0 after for 2 finger\(s\)"),
+    "too few objects": ({"objects": OBJECTS[:3]}, "needs two objects in each"),
+}
+
+
+@pytest.mark.parametrize("why", REFUSED)
+def test_a_recording_that_teaches_no_gate_is_refused(tmp_path, why):
+    given, said = REFUSED[why]
+    settings = AFTER if "after" in why else DURING
+    with pytest.raises(DatasetError, match=said):
+        train_gate(write(tmp_path / "r", **given), tmp_path / "g.safetensors", settings=settings, quiet=True)
 
 
 def test_training_objects_of_one_kind_alone_are_refused(tmp_path):
@@ -272,21 +285,6 @@ def test_training_objects_of_one_kind_alone_are_refused(tmp_path):
     folder = write(tmp_path / "r", ("held",), objects="abdfgh")
     write(folder, ("missed",), objects="ce")
     with pytest.raises(DatasetError, match=r"training objects of seed 0 must have both .*got 6 successful of 6"):
-        train_gate(folder, tmp_path / "g.safetensors", quiet=True)
-
-
-@pytest.mark.parametrize(
-    ("columns", "frame", "lacking"), [("during", "during", "before"), ("before", "after", "after")]
-)
-def test_grasps_without_the_frames_to_compare_are_refused(tmp_path, columns, frame, lacking):
-    folder = write(tmp_path / "r", columns=tuple({"during", columns}))
-    with pytest.raises(DatasetError, match=rf"a-0 has 0 {lacking} for 2 finger\(s\)"):
-        train_gate(folder, tmp_path / "g.safetensors", settings=GateSettings(frame=frame), quiet=True)
-
-
-def test_too_few_objects_to_judge_by_are_refused(tmp_path):
-    folder = write(tmp_path / "r", objects=OBJECTS[:3])
-    with pytest.raises(DatasetError, match="needs two objects in each"):
         train_gate(folder, tmp_path / "g.safetensors", quiet=True)
 
 

@@ -128,7 +128,7 @@ def test_what_was_interrupted_goes_on_with_whole_parts(photos, tmp_path, monkeyp
             raise RuntimeError("the power failed")
         return LOAD(path)
 
-    monkeypatch.setattr(kept, "_BATCH", 1)
+    monkeypatch.setattr(kept, "_AHEAD", 1)
     with pytest.raises(RuntimeError, match="the power failed"):
         KeptImages(failing, folder, "photo", TINY.preprocessing.digest()).keep(photos, quiet=True)
     assert len(list(folder.iterdir())) == 1
@@ -173,7 +173,7 @@ def test_an_image_that_was_not_kept_is_loaded(photos, tmp_path):
 
 def test_few_images_are_in_memory_while_a_part_is_written(photos, tmp_path, monkeypatch):
     alive, most = [], []
-    monkeypatch.setattr(kept, "_BATCH", 2)
+    monkeypatch.setattr(kept, "_AHEAD", 2)
 
     class Noted(np.ndarray):
         def __del__(self):

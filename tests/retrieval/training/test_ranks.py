@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.training.train import state_path
+from retrieval.training.state import state_path
 from tests import on_ray
 from tests.retrieval.training.test_train import TINY_TOML
 from tests.waiting import running, until

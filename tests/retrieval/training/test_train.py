@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -20,11 +21,10 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss
 from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
-from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
-from retrieval.training.judgement import with_verdicts
+from retrieval.training.state import state_path
 from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
-from retrieval.training.train import Trainer, build_matcher, set_training_mode, state_path, train
+from retrieval.training.train import Trainer, build_matcher, set_training_mode, train
 from tests.conftest import TINY
 from tests.labelled import label_recording
 from tests.waiting import running, until
@@ -234,19 +234,20 @@ def power_cut_before_deleting(path):
     return guarded
 
 
-@pytest.mark.parametrize("written", [False, True])
-def test_a_power_cut_while_the_pruner_is_taught_changes_no_bit(written, recording, tmp_path, monkeypatch):
-    """Before its checkpoint is written, and after that, while the state of the training still lies there."""
+@pytest.mark.parametrize("where", ["while the pruner is taught", "before the state is deleted", "at the posterior"])
+def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_path, monkeypatch):
+    """Before the complete checkpoint is written, and after that, while the state of the training still lies there."""
     trainer_for(recording, tmp_path / "a.safetensors", PRUNED).run(quiet=True)
     broken = trainer_for(recording, tmp_path / "b.safetensors", PRUNED)
     with monkeypatch.context() as cut:
-        if written:
+        if where == "before the state is deleted":
             cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
         else:
-            cut.setattr("retrieval.training.distil.order_loss", power_cut)
+            step = "distil.order_loss" if where == "while the pruner is taught" else "train.with_verdicts"
+            cut.setattr(f"retrieval.training.{step}", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
-    assert (load_checkpoint(broken.out).matcher.pruner is not None) == written
+    assert (load_checkpoint(broken.out).matcher.pruner is not None) == (where == "before the state is deleted")
     resumed = trainer_for(recording, broken.out, PRUNED)
     resumed.resume()
     assert resumed.step == PRUNED.training.iterations
@@ -255,39 +256,25 @@ def test_a_power_cut_while_the_pruner_is_taught_changes_no_bit(written, recordin
     assert not state_path(broken.out).exists()
 
 
-def test_ctrl_c_while_the_pruner_is_taught_leaves_a_usable_checkpoint_without_one(recording, tmp_path, monkeypatch):
-    out, taught = tmp_path / "m.safetensors", distil.order_loss
-
-    def interrupted(*given):
-        os.kill(os.getpid(), signal.SIGINT)
-        return taught(*given)
-
-    monkeypatch.setattr("retrieval.training.distil.order_loss", interrupted)
-    with pytest.raises(
-        Interrupted, match=r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
-    ):
-        train(recording, out, PRUNED, quiet=True)
-    left = load_checkpoint(out)
-    assert left.config == TINY_UNPRUNED
-    assert left.posterior is None
-    monkeypatch.undo()
-    made = train(recording, out, PRUNED, resume=True, quiet=True)
-    assert made.config == PRUNED
-    assert made.posterior is not None
-
-
-def test_ctrl_c_while_the_posterior_is_fitted_leaves_a_checkpoint_that_resuming_completes(
-    recording, tmp_path, monkeypatch
+@pytest.mark.parametrize("step", ["distil.order_loss", "train.with_verdicts"])
+def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_completes(
+    step, recording, tmp_path, monkeypatch
 ):
     whole, broken = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
-    train(recording, whole, TINY, quiet=True)
+    train(recording, whole, PRUNED, quiet=True)
+    module, name = step.split(".")
+    function = getattr(import_module(f"retrieval.training.{module}"), name)
+    said = r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
     with monkeypatch.context() as interrupting:
-        interrupting.setattr("retrieval.training.train.with_verdicts", interrupted_before(with_verdicts))
-        with pytest.raises(Interrupted, match=r"before the checkpoint was complete; .* ranks photos"):
-            train(recording, broken, TINY, quiet=True)
-    assert load_checkpoint(broken).posterior is None
+        interrupting.setattr(f"retrieval.training.{step}", interrupted_before(function))
+        with pytest.raises(Interrupted, match=said):
+            train(recording, broken, PRUNED, quiet=True)
+    left = load_checkpoint(broken)
+    assert (left.config, left.posterior) == (TINY_UNPRUNED, None)
     assert state_path(broken).exists()
-    assert train(recording, broken, TINY, resume=True, quiet=True).posterior is not None
+    made = train(recording, broken, PRUNED, resume=True, quiet=True)
+    assert made.config == PRUNED
+    assert made.posterior is not None
     assert whole.read_bytes() == broken.read_bytes()
     assert not state_path(broken).exists()
 
@@ -300,20 +287,6 @@ def interrupted_before(function):
         return function(*given, **named)
 
     return interrupted
-
-
-def test_a_power_cut_while_the_posterior_is_fitted_changes_no_bit(recording, tmp_path, monkeypatch):
-    trainer_for(recording, tmp_path / "a.safetensors").run(quiet=True)
-    broken = trainer_for(recording, tmp_path / "b.safetensors")
-    with monkeypatch.context() as cut:
-        cut.setattr("retrieval.training.train.with_verdicts", power_cut)
-        with pytest.raises(RuntimeError, match="power cut"):
-            broken.run(quiet=True)
-    resumed = trainer_for(recording, broken.out)
-    resumed.resume()
-    assert resumed.step == TINY.training.iterations
-    resumed.run(quiet=True)
-    assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
 
 
 def stop_after(trainer, steps):

@@ -1,6 +1,5 @@
 """One evaluation from recording to results.json: encode, fit, predict, score. What is done is not done again."""
 
-import json
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -11,41 +10,49 @@ from typing import Any
 import numpy as np
 import torch
 
-from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Split
-from retrieval.errors import BadInput, Interrupted
+from retrieval.data.dataset import AnyRecording, Split, folder_of
+from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
-from retrieval.evaluation.ceilings import CEILING_METHOD, CEILINGS, ceiling_experiments
-from retrieval.evaluation.controls import CONTROL_METHOD, CONTROLS, control_experiments, score_beside
+from retrieval.evaluation.cache import kept_document, resumable, write_document
+from retrieval.evaluation.controls import (
+    CEILING_METHOD,
+    CEILINGS,
+    CONTROL_METHOD,
+    CONTROLS,
+    ceiling_experiments,
+    control_experiments,
+    score_beside,
+)
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.faint import faint_touches, score_faint
 from retrieval.evaluation.material import Material, prepare
+from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.methods import METHODS
 from retrieval.methods.base import Method
 from retrieval.metrics.intervals import compare
-from retrieval.model.config import Config
+from retrieval.model.config import Config, named_config
 from retrieval.model.encode import one_thread, photo_features, touch_features
 from retrieval.training.batches import BatchImages
 from retrieval.training.features import encode_recording
 from retrieval.version import __version__
 
-Jobs = Mapping[str, Sequence[int]]
-"""Training seeds by method."""
+BySeed = Mapping[str, Sequence[Predictions]]
+"""Predictions of each training seed, by method."""
 DRAWS = 10_000
 COMPARED = ("pair_accuracy", "guesses_k5")
 """Measures by which the first method is compared with each of the others."""
 
 
 def evaluate(
-    recording: Path,
+    recording: AnyRecording,
     out: Path,
     *,
-    config: Config,
-    preset: str,
+    config: Config | str = "small",
+    preset: str | None = None,
     methods: Sequence[str | type[Method]] = tuple(METHODS),
     model: Path | None = None,
     seeds: int = 1,
@@ -53,60 +60,76 @@ def evaluate(
     cache: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Judge methods on objects they never saw; writes results.json and timings.json under `out`, returns the results.
+    """Compare methods on objects that they never saw; write results.json and timings.json.
 
-    config: towers, heads and split (its `seed` is that of everything drawn); preset: what it is called. methods: names
-    (`retrieval.methods.METHODS`), or classes of one's own, which the report calls by their names. model: a
-    checkpoint to judge instead of one fitted here. seeds: trainings of each method, from `config`'s seed on. cache:
-    where features are kept (`out`/features where None). What lies under `out` from the same settings is used again,
-    so that a run which was stopped goes on; equal settings give equal results to the byte. Raises ConfigError for an
-    unknown method, DatasetError, CheckpointError, and Interrupted after Ctrl-C.
+    Files under `out` that the same settings made are read, so that a stopped run goes on. Equal settings give equal
+    results to the byte.
+
+    Args:
+        recording: A folder, or what `robot.read_recording` returns.
+        out: Folder of the results.
+        config: Towers, heads and split, as an object (`Config.using` takes towers and losses of your own) or as
+            `load_config` takes it. Its seed is the seed of everything drawn.
+        preset: What the report calls the configuration; its name where None.
+        methods: Names, or classes of your own, which the report calls by their names.
+        model: A checkpoint to evaluate instead of one fitted here.
+        seeds: Trainings of each method, from the seed of `config` on.
+        split: Objects of each part; drawn where None.
+        cache: Folder of kept features; `out`/features where None.
+        quiet: No progress on stderr.
+
+    Returns:
+        The content of results.json.
+
+    Raises:
+        ConfigError: A method is unknown.
+        DatasetError: The recording cannot be evaluated.
+        CheckpointError: `model` cannot be read.
+        Interrupted: After Ctrl-C.
 
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny")
     >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
-    >>> given = {"config": config, "preset": "tiny", "methods": ["cca", "chance"], "quiet": True}
-    >>> results = retrieval.evaluate(Path("lab"), Path("report"), **given)
+    >>> results = retrieval.evaluate("lab", Path("report"), config=config, methods=["cca", "chance"], quiet=True)
     >>> list(results["methods"])
     ['cca', 'chance']
     """
     names = [METHODS.name_of(method) for method in methods]
     if not names or seeds < 1:
         raise BadInput(f"give one method and one seed at least; got {len(names)} and {seeds}")
+    config, called = named_config(config, preset)
     out.mkdir(parents=True, exist_ok=True)
     seed = config.training.seed
     wanted = list(range(seed, seed + seeds))
-    try:
-        material = prepare(recording, out, config, model=model, split=split, quiet=quiet)
+    with resumable(out):
+        material = prepare(folder_of(recording), out, config, model=model, split=split, quiet=quiet)
         experiment, controls = _experiments(material, out, cache or out / "features", seed, quiet)
         jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(names)}
-        for name, some in jobs.items():
-            for one in some:
-                experiment.predict(name, one)
-        for control in controls.values():
-            control.predict(CONTROL_METHOD, seed)
-        ceilings = ceiling_experiments(experiment)
-        for ceiling in ceilings.values():
-            ceiling.predict(CEILING_METHOD, seed)
-    except Interrupted as error:
-        raise Interrupted(f"stopped; what was made is kept in {out}, and the same command goes on with it") from error
+        predictions = {name: [experiment.run(name, one) for one in some] for name, some in jobs.items()}
+        sides = [
+            ("controls", CONTROLS, CONTROL_METHOD, controls),
+            ("ceilings", CEILINGS, CEILING_METHOD, ceiling_experiments(experiment)),
+        ]
+        beside = {
+            side: {name: score_beside(words[name], method, one, seed, draws=DRAWS) for name, one in experiments.items()}
+            for side, words, method, experiments in sides
+        }
+    asked = experiment.queries
+    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
     results = {
-        **_about(material, experiment, preset, wanted),
-        "audit": _audited(material, out, quiet),
-        **_scored(experiment, jobs, seed, quiet),
-        "faint": _faint(material, experiment, jobs, seed, quiet),
-        "controls": {
-            name: score_beside(CONTROLS[name], CONTROL_METHOD, control, seed, draws=DRAWS, seed=seed)
-            for name, control in controls.items()
-        },
-        "ceilings": {
-            name: score_beside(CEILINGS[name], CEILING_METHOD, ceiling, seed, draws=DRAWS, seed=seed)
-            for name, ceiling in ceilings.items()
-        },
+        **_about(material, experiment, called, wanted),
+        "audit": kept_document(
+            out / "audit.json",
+            {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT},
+            lambda: audit(material.grasps, material.split, quiet=quiet),  # it reads every image
+        ),
+        **_scored(experiment, predictions, seed, quiet),
+        "faint": score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed),
+        **beside,
     }
-    _write(out / "results.json", results)
-    _write(out / "timings.json", _timings(material, experiment, jobs))
+    write_document(out / "results.json", results)
+    write_document(out / "timings.json", _timings(material, predictions))
     return results
 
 
@@ -159,26 +182,17 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
     }
 
 
-def _scored(experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any]:
+def _scored(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool) -> dict[str, Any]:
     """ "methods" and "comparisons" of results.json."""
     entries: dict[str, Any] = {}
     measures: dict[str, list[Measures]] = {}
-    with Bar("score", len(jobs), "methods", quiet=quiet) as bar:
-        for name, seeds in jobs.items():
-            predictions = [experiment.predictions(name, one) for one in seeds]
+    with Bar("score", len(predictions), "methods", quiet=quiet) as bar:
+        for name, by_seed in predictions.items():
             entries[name], measures[name] = score_method(
-                experiment.queries, experiment.features.grasp_ids, predictions, draws=DRAWS, seed=seed
+                experiment.queries, experiment.features.grasp_ids, by_seed, draws=DRAWS, seed=seed
             )
             bar.advance(note=name)
     return {"methods": entries, "comparisons": _compared(measures, seed)}
-
-
-def _faint(material: Material, experiment: Experiment, jobs: Jobs, seed: int, quiet: bool) -> dict[str, Any] | None:
-    """ "faint" of results.json."""
-    asked = experiment.queries
-    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
-    predictions = {name: [experiment.predictions(name, one) for one in seeds] for name, seeds in jobs.items()}
-    return score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed)
 
 
 def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:
@@ -192,24 +206,8 @@ def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[st
     ]
 
 
-def _audited(material: Material, out: Path, quiet: bool) -> dict[str, Any]:
-    """The leakage audit; it reads every image, so it is kept."""
-    path = out / "audit.json"
-    of = {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT}
-    if path.is_file():
-        try:
-            kept = read_json(path)
-            if kept["of"] == json.loads(json.dumps(of)):
-                return dict(kept["audit"])
-        except (ValueError, KeyError, TypeError):  # damaged: made again
-            pass
-    found = audit(material.grasps, material.split, quiet=quiet)
-    _write(path, {"of": of, "audit": found})
-    return found
-
-
-def _timings(material: Material, experiment: Experiment, jobs: Jobs) -> dict[str, Any]:
-    found = {name: _method_times([experiment.predictions(name, seed).seconds for seed in jobs[name]]) for name in jobs}
+def _timings(material: Material, predictions: BySeed) -> dict[str, Any]:
+    found = {name: _method_times([one.seconds for one in by_seed]) for name, by_seed in predictions.items()}
     if {"late_fusion", "prune_rerank"} <= set(found):  # one training serves both
         found["prune_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
     return {
@@ -246,8 +244,3 @@ def _tower_times(material: Material, count: int = 4, repeats: int = 3) -> dict[s
         times["touch_ms"].append(1e3 * (middle - start))
         times["photo_ms"].append(1e3 * (time.perf_counter() - middle))
     return {**{name: float(np.median(found)) for name, found in times.items()}, "where": "towers"}
-
-
-def _write(path: Path, document: Mapping[str, Any]) -> None:
-    """Whole or not at all, and equal documents to the byte."""
-    write_atomically(path, f"{json.dumps(document, sort_keys=True, indent=1, allow_nan=False)}\n".encode())

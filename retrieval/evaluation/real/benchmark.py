@@ -1,120 +1,124 @@
 """The benchmark of real data: every protocol, seed, fold and line is measured once and kept; then all is summed up."""
 
 import dataclasses
-import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from _touch_retrieval.files import read_json, write_atomically
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, Split, data_digest
-from retrieval.errors import BadInput, Interrupted
-from retrieval.evaluation.experiment import Experiment, code_of
+from retrieval.data.dataset import AnyRecording, Grasp, Split, data_digest, folder_of
+from retrieval.errors import BadInput
+from retrieval.evaluation.cache import kept_document, resumable, write_document
+from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.faint import change
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
-from retrieval.evaluation.real.controls import CONTROL_METHOD, CONTROLS, by_clock, why_not_untouched
-from retrieval.evaluation.real.measuring import Measured, digest, joined, measure, read_measured, write_measured
+from retrieval.evaluation.real.lines import CONTROL_METHOD, CONTROLS, Line, Row, Towers, why_not_untouched
+from retrieval.evaluation.real.measuring import Measured, joined, measure, read_measured, write_measured
 from retrieval.evaluation.real.protocol import PHOTO, Facts, Protocol, read_facts
 from retrieval.evaluation.real.references import FITTED, referenced, references_of, shown_by_references
-from retrieval.evaluation.real.towers import Row, Towers
 from retrieval.evaluation.real.verdict import BySeed, Summing, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import KNOW_NOTHING, METHODS
 from retrieval.methods.base import Method
-from retrieval.model.config import Config
+from retrieval.model.config import Config, named_config
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
+PRESET = "real"
+METHODS_ASKED = ("cca_towers", "cca_pca", "cca", "late_fusion", "chance")
 DRAWS = 10_000
 MOST = {"train": 1, "validation": 12, "test": 40}
 """Judged grasps of an object, by part."""
 EXAMPLES = 6
 
 
-@dataclass(frozen=True, eq=False)
-class Line:
-    """What is fitted and asked in every fold: a row of the table, and what stands for touch and photo in it.
-
-    kind: "touch", "blurred" or one of `CONTROLS`.
-    """
-
-    row: Row
-    kind: str
-
-    @property
-    def method(self) -> str:
-        """The method that is fitted."""
-        return CONTROL_METHOD if self.kind in CONTROLS else self.row.method
-
-    @property
-    def key(self) -> str:
-        """What files of it are called."""
-        return self.kind if self.kind in CONTROLS else f"{self.row.name}-{self.kind}"
-
-    def features(self) -> Features:
-        """What it is fitted on and asked."""
-        towers = self.row.towers
-        if self.kind == "order":
-            return by_clock(towers.features())
-        if self.kind == "background":
-            return towers.features(shown="margin")
-        return towers.features({"blurred": "blurred", "untouched": "before"}.get(self.kind, "touch"))
-
-
 def benchmark(
-    recordings: Mapping[str, Path],
+    recordings: AnyRecording | Mapping[str, AnyRecording],
     out: Path,
     *,
-    config: Config,
-    preset: str,
     protocols: Sequence[str | Protocol],
-    methods: Sequence[str | type[Method]],
-    models: Mapping[str, Path],
-    seeds: int,
-    skipped: Mapping[str, str],
-    cache: Path,
+    config: Config | str = PRESET,
+    preset: str | None = None,
+    methods: Sequence[str | type[Method]] = METHODS_ASKED,
+    models: Mapping[str, Path] = MappingProxyType({}),
+    seeds: int = 3,
+    skipped: Mapping[str, str] = MappingProxyType({}),
+    cache: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Ask the protocols; writes `out`/results.json and returns its content.
+    """Evaluate methods by protocols of real data, with controls; write results.json.
 
-    recordings: by data set. protocols: names, or protocols of one's own, of data sets that are there. methods: names or
-    classes, fitted on the frozen towers of `config`, which is called `preset`; models: name -> checkpoint, each a row
-    that is asked as it is. seeds: how often folds are drawn and methods are fitted. skipped: protocol -> why it is not
-    asked. What is kept under `cache` from the same settings is used again. Raises ConfigError, DatasetError,
-    CheckpointError, and Interrupted after Ctrl-C.
+    Files under `cache` that the same settings made are read, so that a stopped run goes on.
+
+    Args:
+        recordings: A folder, or what `robot.read_recording` returns; or one for each data set, by its name.
+        out: Folder of the results.
+        protocols: Names, or protocols of your own, which are called by their titles.
+        config: Frozen towers, and heads, as an object (`Config.using` takes a tower of your own) or as `load_config`
+            takes it.
+        preset: What the report calls the configuration; its name where None.
+        methods: Names, or classes of your own.
+        models: Name to checkpoint; each is a row of its own, which is not fitted.
+        seeds: How often folds are drawn and methods fitted.
+        skipped: Protocol to the reason why it is left out, for the report.
+        cache: Folder of features and measures; `out`/cache where None.
+        quiet: No progress on stderr.
+
+    Returns:
+        The content of results.json.
+
+    Raises:
+        BadInput: No protocol can be asked, or there is neither method nor model.
+        ConfigError: A protocol or method is unknown.
+        DatasetError: A recording does not fit a protocol.
+        CheckpointError: A model cannot be read.
+        Interrupted: After Ctrl-C.
+
+    >>> from pathlib import Path
+    >>> from retrieval.evaluation.real.protocol import first_guess, folds
+    >>> def halves(facts, seed):
+    ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
+    >>> protocol = retrieval.Protocol("mine", "Halves", "Objects are halved by name.", halves, first_guess(5))
+    >>> asked = {"protocols": [protocol], "methods": ["cca", "chance"], "config": "tiny", "seeds": 1}
+    >>> results = retrieval.benchmark("lab", Path("halves"), **asked, quiet=True)
+    >>> list(results["protocols"]["halves"]["rows"])
+    ['cca', 'chance']
     """
     fitted = [METHODS.name_of(method) for method in methods]
     if not (fitted or models) or seeds < 1:
         raise BadInput("give one method or model and one seed at least")
-    facts = {name: read_facts(folder) for name, folder in recordings.items()}
+    config, called = named_config(config, preset)
+    kept = cache or out / "cache"
+    asked = dict(map(_named, protocols))
+    if not isinstance(recordings, Mapping):
+        recordings = dict.fromkeys((protocol.data_set for protocol in asked.values()), recordings)
+    facts = {name: read_facts(folder_of(recording)) for name, recording in recordings.items()}
     tables: dict[str, Any] = {}
     left_out = dict(skipped)
     rows: dict[str, list[Row]] = {}
-    try:
-        for name, protocol in map(_named, protocols):
+    with resumable(kept):
+        for name, protocol in asked.items():
             of = protocol.data_set
             if of not in rows:
-                rows[of] = _rows(facts[of], config, fitted, models, cache / "features", quiet)
+                rows[of] = _rows(facts[of], config, fitted, models, kept / "features", quiet)
             taken = [row for row in rows[of] if protocol.entry == PHOTO or row.method in FITTED]
             if not taken:
                 left_out[name] = f"it shows objects by touches, which of the methods only {', '.join(FITTED)} can take"
                 continue
-            tables[name] = _Asked(name, protocol, facts[of], taken, list(range(seeds)), cache, quiet).entry()
-    except Interrupted as error:
-        raise Interrupted(f"stopped; what was made is kept in {cache}, and the same command goes on with it") from error
+            tables[name] = _Asked(name, protocol, facts[of], taken, list(range(seeds)), kept, quiet).entry()
     if not tables:
         raise BadInput(f"no protocol could be asked; {'; '.join(f'{name}: {why}' for name, why in left_out.items())}")
     results = {
         "schema_version": SCHEMA_VERSION,
         "software": __version__,
         "setting": {
-            "preset": preset,
+            "preset": called,
             "config": config.without_paths(),
             "seeds": list(range(seeds)),
             "draws": DRAWS,
@@ -123,9 +127,7 @@ def benchmark(
         "protocols": tables,
         "skipped": left_out,
     }
-    out.mkdir(parents=True, exist_ok=True)
-    text = f"{json.dumps(results, sort_keys=True, indent=1, allow_nan=False)}\n"
-    write_atomically(out / "results.json", text.encode())
+    write_document(out / "results.json", results)
     return results
 
 
@@ -166,16 +168,16 @@ class _Asked:
         grasps = self.all_facts.grasps
         if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
             return None
-        path = self.cache / "contact" / f"{data_digest(grasps)[:32]}.json"
-        if path.is_file():
-            return dict(read_json(path))
+        digest = data_digest(grasps)
+        return kept_document(self.cache / "contact" / f"{digest[:32]}.json", {"grasps": digest}, self._compare)
+
+    def _compare(self) -> dict[str, float]:
+        grasps = self.all_facts.grasps
+        found = {}
         with Bar("compare with untouched", len(grasps), "grasps", quiet=self.quiet) as bar:
-            found = {}
             for grasp in grasps:
                 found[grasp.grasp_id] = change(grasp)
                 bar.advance()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(found).encode())
         return found
 
     @cached_property
@@ -295,29 +297,6 @@ class _Asked:
         measures are kept. Scores are not kept: those of all folds fill gigabytes."""
         self._require_unseen(line, split)
         features, towers = self._features(line), line.row.towers
-        made_by = digest(
-            {
-                "protocol": self.name,
-                "measures": list(self.protocol.measures),
-                "shown": [
-                    self.protocol.own_photos,
-                    self.protocol.by_sequence,
-                    self.protocol.gallery_of(self.facts, split),
-                ],
-                "line": [line.key, line.method],
-                "features": features.digest,
-                "split": split.to_dict(),
-                "seed": seed,
-                "config": towers.config.without_paths(),
-                "model": towers.checkpoint.digest if towers.checkpoint else None,
-                "judged": MOST,
-                "software": __version__,
-                **code_of(METHODS.load(line.method)),
-            }
-        )
-        path = self.cache / "measures" / self.name / f"{line.key}-{seed}-{number}.safetensors"
-        if (kept := read_measured(path, made_by)) is not None:
-            return kept
         work = self.cache / "fits" / f"{self.name}-{line.key}-{seed}-{number}"
         experiment = Experiment(
             folder=work,
@@ -332,10 +311,19 @@ class _Asked:
             all_teach=True,
             kind_of=self.facts.kind_of,
         )
-        experiment.predict(line.method, seed)
-        judged = MethodScores(experiment.queries, experiment.predictions(line.method, seed), seed)
-        measured = measure(judged, self.protocol, self.facts, split, features.grasp_ids, self._contact)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        protocol = self.protocol
+        made_by = experiment.made_by(line.method, seed) | {
+            "protocol": self.name,
+            "measures": list(protocol.measures),
+            "shown": [protocol.own_photos, protocol.by_sequence, protocol.gallery_of(self.facts, split)],
+            "line": line.key,
+            "contact": self._contact is not None,
+        }
+        path = self.cache / "measures" / self.name / f"{line.key}-{seed}-{number}.safetensors"
+        if (kept := read_measured(path, made_by)) is not None:
+            return kept
+        judged = MethodScores(experiment.queries, experiment.run(line.method, seed), seed)
+        measured = measure(judged, protocol, self.facts, split, features.grasp_ids, self._contact)
         write_measured(path, measured, made_by)
         shutil.rmtree(work)
         return measured

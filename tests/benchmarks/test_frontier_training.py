@@ -5,9 +5,9 @@ import torch
 from packaging.version import Version
 from torch import nn
 
-from retrieval.frontier import training
+from benchmarks.frontier import training
+from benchmarks.frontier.training import _with_no_layer_spared, training_formats
 from retrieval.frontier.sample import Sample, Scale
-from retrieval.frontier.training import _with_no_layer_spared, training_formats
 from retrieval.model.encode import has_fast_bfloat16
 from retrieval.model.towers.small import Small
 

@@ -1,4 +1,4 @@
-"""Chance as a method: what the harness says of scores that know nothing."""
+"""Trivial baselines: what the harness says of scores that know nothing."""
 
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -37,3 +37,21 @@ class Chance(Method):
             content = int.from_bytes(blake2b(item.tobytes(), digest_size=8).digest())
             drawn[row] = np.random.default_rng([self.setting.seed, modality, content]).standard_normal(DIM)
         return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
+
+
+class Constant(Method):
+    """Scores of 0: every pair is equally good, so every metric must give exactly chance."""
+
+    is_seeded = False
+
+    def _fit(self, train: "Features", validation: "Features") -> None:
+        pass
+
+    def _encode_touch(self, touch: Array) -> Array:
+        return np.zeros((len(touch), 1), dtype=np.float32)
+
+    def _encode_photo(self, photo: Array) -> Array:
+        return np.zeros((len(photo), 1), dtype=np.float32)
+
+    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+        return np.zeros((len(touch_codes), len(photo_codes)), dtype=np.float32)

@@ -1,0 +1,135 @@
+"""Measure the approximations: every row once, kept under the folder, so that a stopped run goes on."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from _touch_retrieval.files import file_digest
+from retrieval.console.files import PAGE, RESULTS, require_ours
+from retrieval.console.output import say
+from retrieval.data.dataset import AnyRecording, folder_of
+from retrieval.evaluation.cache import kept_document, write_document
+from retrieval.frontier import APPROXIMATIONS, load_approximation
+from retrieval.frontier.clock import machine
+from retrieval.frontier.points import Row
+from retrieval.frontier.report import write_frontier
+from retrieval.frontier.sample import QUICK, Sample, Scale
+from retrieval.search.defaults import shipped_model
+from retrieval.version import __version__
+
+FORMAT = 2
+
+
+def measure_frontier(
+    out: Path,
+    model: str | Path | None,
+    recording: AnyRecording | Callable[[], Path],
+    *,
+    only: Iterable[str] = (),
+    photos: int = Scale.photos,
+    queries: int = Scale.queries,
+    repeats: int = Scale.repeats,
+    quick: bool = False,
+    table: Mapping[str, str] = APPROXIMATIONS,
+    need_no_model: Collection[str] = (),
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Measure error against run time of every approximation; write frontier.json, frontier.html and figures/.
+
+    Rows that the same software measured before with the same model, recording and scale on the same machine are read.
+
+    Args:
+        out: Folder of the results.
+        model: A checkpoint; the shipped one where None.
+        recording: Grasps of objects that the model has not seen; a function that returns the folder is called only
+            where a row needs it.
+        only: Names of rows; all where empty.
+        photos: Of the catalogue that is blended from those of the recording.
+        queries: Touches that are asked there.
+        repeats: Of each time, whose median is taken.
+        quick: Smallest grids and sizes, to see that it runs.
+        table: Name to "module:function" of what can be measured.
+        need_no_model: Names whose rows depend on neither the model nor the grasps.
+        quiet: No lines and bars on stderr.
+
+    Returns:
+        The content of frontier.json.
+
+    Raises:
+        ConfigError: A name is unknown. What the measurements raise passes through.
+
+    >>> from pathlib import Path
+    >>> asked = {"only": ["halves"], "quick": True, "quiet": True}
+    >>> document = retrieval.measure_frontier(Path("frontier"), "model.safetensors", "lab", **asked)
+    >>> document["rows"]["halves"]["title"]
+    'Number format of stored halves'
+    """
+    require_ours(out / "frontier.json", RESULTS)
+    require_ours(out / "frontier.html", PAGE)
+    out.mkdir(parents=True, exist_ok=True)
+    smaller = {name: min(getattr(QUICK, name), value) for name, value in (("photos", photos), ("queries", queries))}
+    scale = dataclasses.replace(QUICK, **smaller) if quick else Scale(photos, queries, repeats=repeats)
+    grasps = recording if callable(recording) else lambda: folder_of(recording)
+    sample = Sample(Path(model or shipped_model()), grasps, out / "features", scale, quiet)
+    document = measure(sample, out, only, table=table, need_no_model=need_no_model)
+    write_frontier(out, document)
+    return document
+
+
+def measure(
+    sample: Sample,
+    out: Path,
+    only: Iterable[str] = (),
+    *,
+    table: Mapping[str, str] = APPROXIMATIONS,
+    need_no_model: Collection[str] = (),
+) -> dict[str, Any]:
+    """Measure approximations and write `out`/frontier.json.
+
+    Rows that the same software measured before with the same model, recording and scale on the same machine are read.
+    Each row is printed on stderr as soon as it is measured, one line per panel.
+
+    Args:
+        sample: Model, grasps and scale.
+        out: Folder of the results.
+        only: Names of `table`; all of them where empty.
+        table: Name -> "module:function" of what can be measured.
+        need_no_model: Names whose rows depend on neither the model nor the grasps.
+
+    Returns:
+        The content of frontier.json.
+
+    Raises:
+        ConfigError: A name is unknown. What the measurements raise passes through.
+    """
+    asked = list(dict.fromkeys(only)) or list(table)
+    works = {name: load_approximation(name, table) for name in asked}
+    rows = {name: _row(sample, out, name, work, name in need_no_model) for name, work in works.items()}
+    document = {
+        "software": __version__,
+        "machine": machine(),
+        "model": file_digest(sample.model),
+        "scale": dataclasses.asdict(sample.scale),
+        "rows": {name: row.to_dict() for name, row in rows.items()},
+    }
+    write_document(out / "frontier.json", document)
+    return document
+
+
+def _row(sample: Sample, out: Path, name: str, work: Callable[[Sample], Row], by_itself: bool) -> Row:
+    made_by: dict[str, Any] = {"name": name, "format": FORMAT, "software": __version__, "machine": machine()}
+    made_by["scale"] = dataclasses.asdict(sample.scale)
+    if not by_itself:
+        made_by |= {"model": file_digest(sample.model), "grasps": sample.digest}
+
+    def make() -> dict[str, Any]:
+        if not sample.quiet:
+            say(f"frontier: measuring {name}")
+        return work(sample).to_dict()
+
+    row = Row.from_dict(kept_document(out / "parts" / f"{name}.json", made_by, make))
+    if not sample.quiet:
+        for line in row.lines():
+            say(f"{name}: {line}")
+    return row

@@ -1,0 +1,133 @@
+"""The state of an unfinished training, next to its output: weights, optimiser, step, and what must not change."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from retrieval.errors import CheckpointError
+from retrieval.model.checkpoint import Checkpoint, beside, load_checkpoint, load_weights, read_tensors, write_tensors
+
+if TYPE_CHECKING:
+    from retrieval.training.train import Trainer
+
+
+_MODEL, _OPTIMIZER = "model.", "optimizer."
+
+
+def state_path(out: Path) -> Path:
+    """Return the file of an unfinished training of `out`."""
+    return beside(out, ".state.safetensors")
+
+
+def require_fresh(out: Path) -> None:
+    """Raise CheckpointError where an unfinished training of `out` would be lost."""
+    if state_path(out).exists():
+        raise CheckpointError(
+            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
+        )
+
+
+def save_state(
+    out: Path,
+    modules: nn.ModuleDict,
+    optimizer: torch.optim.Optimizer,
+    header: Mapping[str, Any],
+    *,
+    left_out: tuple[str, ...] = (),
+) -> None:
+    """Write the state of an unfinished training of `out`.
+
+    Args:
+        out: The output of the training.
+        modules: Everything with parameters.
+        optimizer: The optimiser of these parameters.
+        header: The step, and the settings that `load_state` compares; JSON types.
+        left_out: How the names of weights begin that are stored elsewhere.
+    """
+    tensors = {
+        f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(left_out)
+    }
+    for name, parameter in modules.named_parameters():
+        for quantity, tensor in optimizer.state.get(parameter, {}).items():
+            tensors[f"{_OPTIMIZER}{name}.{quantity}"] = tensor
+    write_tensors(state_path(out), tensors, header)
+
+
+def load_state(
+    out: Path,
+    modules: nn.ModuleDict,
+    optimizer: torch.optim.Optimizer,
+    identity: Mapping[str, Any],
+    *,
+    left_out: Callable[[], Mapping[str, Tensor]] = dict,
+) -> dict[str, Any]:
+    """Load what `save_state` wrote into `modules` and `optimizer`.
+
+    Args:
+        out: The output of the training.
+        modules: As in `save_state`.
+        optimizer: As in `save_state`.
+        identity: Settings that the header must hold unchanged.
+        left_out: Gives the weights that the file does not hold, by name.
+
+    Returns:
+        The header.
+
+    Raises:
+        CheckpointError: There is no state, or it belongs to another training.
+    """
+    path = state_path(out)
+    tensors, header = read_tensors(path)
+    for name, value in json.loads(json.dumps(identity)).items():
+        if header.get(name) != value:
+            raise CheckpointError(
+                f"{path} is of another training, with another {name.replace('_', ' ')}; resume with the same data and "
+                "configuration, or delete the file to start afresh"
+            )
+    weights = {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
+    load_weights(modules, weights | dict(left_out()))
+    for name, parameter in modules.named_parameters():
+        prefix = f"{_OPTIMIZER}{name}."
+        stored = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+        if stored:  # the count of steps stays on the CPU, as PyTorch itself keeps it
+            optimizer.state[parameter] = {
+                quantity: tensor if quantity == "step" else tensor.to(parameter.device)
+                for quantity, tensor in stored.items()
+            }
+    return header
+
+
+def unfinished(done: Path) -> Path:
+    """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
+    return done.parent / "unfinished" / done.name
+
+
+def finish(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
+    """Train to the end and return the checkpoint, once: a finished training is read, an unfinished one resumed.
+
+    Args:
+        trainer: A training whose `out` is `unfinished(done)`.
+        done: Where the finished checkpoint lies afterwards. One of another training is replaced.
+        quiet: No progress on stderr.
+
+    Raises:
+        Interrupted: After Ctrl-C; the next call resumes.
+    """
+    mine = (trainer.config, trainer.split, trainer.data_digest)
+    if done.is_file():
+        kept = load_checkpoint(done)
+        if (kept.config, kept.split, kept.provenance.get("data_digest")) == mine:
+            return kept
+    if state_path(trainer.out).is_file():
+        try:
+            trainer.resume()
+        except CheckpointError:  # of another training
+            state_path(trainer.out).unlink()
+    trainer.run(quiet)
+    for ending in (".md", ".safetensors"):
+        beside(trainer.out, ending).replace(beside(done, ending))
+    return load_checkpoint(done)

@@ -1,0 +1,111 @@
+"""The loader: its settings change how fast images come, and nothing else."""
+
+import dataclasses
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+import torch
+
+from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.errors import ConfigError
+from retrieval.model.config import Config, load_config
+from retrieval.training.batches import TrainedFeatures
+from retrieval.training.loading import ahead, in_order, worker_count
+from tests.conftest import TINY
+from tests.retrieval.training.test_train import same_weights, trainer_for, with_training
+
+SLOW = {"workers": 1, "prefetch": 1, "pinned_memory": False}
+FAST = {"workers": 3, "prefetch": 4, "pinned_memory": True}
+
+
+def test_batches_and_trained_weights_are_bit_equal_whatever_the_loader_is_set_to(recording, tmp_path):
+    made = []
+    for name, settings in (("slow", SLOW), ("fast", FAST)):
+        config = with_training(TINY, **settings)
+        with TrainedFeatures(config, torch.device("cpu")) as source:
+            loaded = source.prepare(None, PairSampler(load_grasps(recording), seed=0).batch(0, 6)).result()
+        trainer = trainer_for(recording, tmp_path / f"{name}.safetensors", config)
+        trainer.run(quiet=True)
+        made.append((loaded, trainer.matcher.state_dict()))
+    (slow, weights), (fast, others) = made
+    assert torch.equal(slow.touches, fast.touches)
+    assert torch.equal(slow.photos, fast.photos)
+    assert same_weights(weights, others)
+    assert (tmp_path / "slow.safetensors").read_bytes() == (tmp_path / "fast.safetensors").read_bytes()
+
+
+def test_a_training_resumes_with_another_loader(recording, tmp_path):
+    out = tmp_path / "m.safetensors"
+    first = trainer_for(recording, out, with_training(TINY, **SLOW))
+    first._validate_and_save()
+    other = trainer_for(recording, out, with_training(TINY, **FAST))
+    other.resume()
+    assert first.config == other.config
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_results_come_in_order_while_so_many_later_ones_are_prepared(depth):
+    begun = []
+
+    def work(number):
+        begun.append(number)
+        done = Future()
+        done.set_result(number)
+        return done
+
+    for number, result in enumerate(ahead(map(work, range(6)), depth)):
+        assert result == number
+        assert begun == list(range(min(6, number + depth + 1)))
+
+
+def test_as_many_workers_as_are_set_load_at_once():
+    together = threading.Barrier(3, timeout=10)
+    with ThreadPoolExecutor(3) as pool:
+        assert list(in_order(pool, lambda item: (together.wait(), item)[1], range(6))) == list(range(6))
+
+
+def test_auto_is_a_worker_for_each_core_of_a_rank(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: set(range(8)), raising=False)
+    assert (worker_count("auto"), worker_count(3)) == (8, 3)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    assert worker_count("auto") == 2
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "16")
+    assert worker_count("auto") == 1
+
+
+def test_a_file_sets_the_loader_and_a_checkpoint_says_nothing_of_it(tmp_path):
+    file = tmp_path / "loader.toml"
+    file.write_text("[training]\nworkers = 4\nprefetch = 3\npinned_memory = false\n")
+    training = load_config(str(file)).training
+    assert (training.workers, training.prefetch, training.pinned_memory) == (4, 3, False)
+    assert not {"workers", "prefetch", "pinned_memory"} & training.to_dict().keys()
+    file.write_text('[training]\nworkers = "auto"\n')
+    assert load_config(str(file)).training.workers == "auto"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"workers": 0}, 'workers must be "auto" or at least 1; got 0'),
+        ({"workers": "many"}, "workers must be \"auto\" or at least 1; got 'many'"),
+        ({"workers": True}, "training.workers must be of type int or str; got True"),
+        ({"prefetch": 0}, "prefetch must be at least 1; got 0"),
+        ({"pinned_memory": 1}, "training.pinned_memory must be of type bool; got 1"),
+    ],
+)
+def test_a_wrong_setting_of_the_loader_is_refused(settings, said):
+    with pytest.raises(ConfigError) as refused:
+        Config.from_dict({"training": settings})
+    assert str(refused.value) == said
+
+
+def test_a_training_says_once_what_the_loader_and_the_towers_can_do(recording, tmp_path, capsys):
+    trainer_for(recording, tmp_path / "m.safetensors", with_training(TINY, workers=2)).run()
+    said = [line for line in capsys.readouterr().err.splitlines() if "loader:" in line]
+    assert len(said) == 1
+    assert "loader: 2 worker(s) can decode" in said[0]
+    assert "images/s; the towers take" in said[0]
+    frozen = dataclasses.replace(with_training(TINY, freeze_towers=True))
+    trainer_for(recording, tmp_path / "frozen.safetensors", frozen).run()
+    assert "loader:" not in capsys.readouterr().err
