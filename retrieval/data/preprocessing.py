@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
-from retrieval.data.resize import Resize, RgbImage, Samples, check_rgb, resize, resized
+from retrieval.data.resize import RgbImage, check_rgb, resize
 from retrieval.data.views import VIEWS, Box, find_object, least_side, least_side_of_crop, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
@@ -108,23 +108,19 @@ class Preprocessing:
         box: where its object lies, where that is known.
         """
         check_rgb(image, "photo")
-        return self._seen(_finite(image, "photo"), box)
+        return strip(_finite(image, "photo"), self.views, self.photo_px, box)
 
-    def photo_of(self, data: bytes, name: str | Path, resize: Resize = resized) -> RgbImage:
-        """The bytes of a photo's file as `photo` gives the picture in them. resize: where there are many photos,
-        `retrieval.data.photo_resize.resize_photo`. Raises ImageError."""
+    def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
+        """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
         if not self.reduced:
-            return self._seen(decode(data, name), None, resize)
+            return strip(decode(data, name), self.views, self.photo_px)
         image = decode(data, name, least_side(self.views, self.photo_px))
         short, box = min(image.shape[:2]), None
         if "crop" in self.views and short < min(picture_size(data, name)):
-            box = find_object(image, resize)
+            box = find_object(image)
             if (more := least_side_of_crop(box, short, self.photo_px)) > short:
                 image, box = decode(data, name, more), None
-        return self._seen(image, box, resize)
-
-    def _seen(self, image: Samples, box: Box | None, resize: Resize = resized) -> RgbImage:
-        return strip(image, self.views, self.photo_px, box, resize)
+        return strip(image, self.views, self.photo_px, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.

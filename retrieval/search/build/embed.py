@@ -8,7 +8,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import chain
 from typing import Any, TypeAlias, TypeVar
 
@@ -43,8 +42,7 @@ BATCH = 16
 READ = 32
 """Files that a thread reads at a time: what a task costs by itself is a tenth of reading and hashing a photo."""
 MANY = 256
-"""New photos from which on a faster encoder is looked for, which takes as long as encoding a hundred, and machine code
-that resizes is loaded."""
+"""New photos from which on a faster encoder is looked for, which takes as long as encoding a hundred."""
 HELD = 256
 """Embeddings that were made before and stand in one part, at most: what waits between threads stays small."""
 
@@ -136,7 +134,6 @@ class Embedder:
         self.photos, self.embedded, self.resumed, self.remade, self.renamed, self.known, self.unread = (0,) * 7
         self.half_error = 0.0
         self._encode_photos = on_torch(checkpoint)
-        self._see = checkpoint.config.preprocessing.photo_of
 
     @property
     def removed(self) -> int:
@@ -149,10 +146,6 @@ class Embedder:
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
         new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
-        if new >= MANY:
-            from retrieval.data.photo_resize import resize_photo
-
-            self._see = partial(self._see, resize=resize_photo)
         if new >= MANY and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
             self._encode_photos = fastest(self.checkpoint)
         known = self.looked.known(self.parent)
@@ -249,7 +242,8 @@ class Embedder:
             if not isinstance(item, _Found):
                 part.skipped.extend([item] if isinstance(item, SkippedPhoto) else [])
                 continue
-            image = None if item.file is None else decode_photo(item.file, self._see)
+            see = self.checkpoint.config.preprocessing.photo_of
+            image = None if item.file is None else decode_photo(item.file, see)
             if isinstance(image, SkippedPhoto):
                 part.skipped.append(image)
                 continue
