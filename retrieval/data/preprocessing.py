@@ -5,13 +5,15 @@ bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background-->
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
+from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
 from retrieval.data.views import VIEWS, Box, find_object, least_side, least_side_of_crop, strip
@@ -59,39 +61,33 @@ def _missing_reference(policy: str) -> ConfigError:
     )
 
 
+Side = Annotated[int, Meta(ge=1, le=4096)]
+"""Of a square, in pixels."""
+
+
 @dataclass(frozen=True)
 class Preprocessing:
     """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, which views of a
     photo stand side by side (`retrieval.data.views.VIEWS`), and whether a JPEG photo is decoded no larger than these
     need (`reduced`)."""
 
-    touch_px: int = 128
-    photo_px: int = 256
+    touch_px: Side = 128
+    photo_px: Side = 256
     background: str = "none"
     views: tuple[str, ...] = ("whole",)
     reduced: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "views", tuple(self.views))
+        check_fields(self, "preprocessing", ConfigError)
         if not self.views or not set(self.views) <= set(VIEWS) or len(set(self.views)) < len(self.views):
-            raise ConfigError(f"views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}")
-        for key in ("touch_px", "photo_px"):
-            side = getattr(self, key)
-            if type(side) is not int or not 1 <= side <= 4096:
-                raise ConfigError(f"{key} must be a whole number of pixels from 1 to 4096, got {side!r}")
+            raise ConfigError(
+                f"preprocessing.views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}"
+            )
         _check_policy(self.background)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON types; `from_dict` reads them back."""
+        """Return the settings as JSON types."""
         return asdict(self) | {"views": list(self.views)}
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":
-        """Make from named settings; one left out takes its default. Raises ConfigError for an unknown one."""
-        known = [field.name for field in fields(cls)]
-        if unknown := sorted(set(settings) - set(known)):
-            raise ConfigError(f"unknown preprocessing setting {unknown[0]!r}; known: {', '.join(known)}")
-        return cls(**settings)
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""

@@ -245,14 +245,6 @@ def test_a_setting_out_of_range_is_refused_by_name(change):
         Preprocessing(**change)
 
 
-def test_settings_survive_a_dictionary_and_unknown_ones_are_refused():
-    chosen = Preprocessing(64, 96, "abs")
-    assert Preprocessing.from_dict(chosen.to_dict()) == chosen
-    assert Preprocessing.from_dict({}) == Preprocessing()
-    with pytest.raises(ConfigError, match="'crop'; known: touch_px, photo_px, background"):
-        Preprocessing.from_dict({"crop": 1})
-
-
 def test_the_digest_is_of_the_settings_and_the_version():
     text = '{"background": "none", "photo_px": 256, "touch_px": 128, "version": 2}'
     assert Preprocessing().digest() == hashlib.sha256(text.encode()).hexdigest()
