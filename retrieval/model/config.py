@@ -288,7 +288,7 @@ def load_config(name_or_path: str) -> Config:
         config = Config.from_dict(tomllib.loads(read_regular(file).decode()))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # what TOML or UTF-8 forbids
+    except ValueError as error:  # what TOML or UTF-8 forbids
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
     return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 

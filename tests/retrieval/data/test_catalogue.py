@@ -250,7 +250,7 @@ BAD_LINES = {
     '{"object_id": "mug", "x": 1e999}': "1e999 is not a finite number",
     '{"file_name": "mug/1.png", "object_id": "cup"}': "lies in object mug, but the line says cup",
     '{"object_id": "first"}': "first has a line already; join the two",
-    '{"object_id": ' + "[" * 100_000: "recursion",
+    '{"object_id": ' + "[" * 100_000: "nested deeper than 64 levels",
 }
 
 

@@ -162,7 +162,7 @@ def test_a_checkpoint_that_is_no_file_is_refused_without_being_read(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["a = " + "[" * 100_000, "[matcher]\nhidden = 1" + "0" * 5000, "\x00", "[training]\nlearning_rate = 1" + "0" * 400],
+    ["[matcher]\nhidden = 1" + "0" * 5000, "\x00", "[training]\nlearning_rate = 1" + "0" * 400],
 )
 def test_hostile_settings_are_refused(tmp_path, text):
     (tmp_path / "c.toml").write_text(text)
