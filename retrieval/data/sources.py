@@ -127,10 +127,7 @@ def _folder(url: str, naming: Naming) -> Catalogue:
             skipped.append(not_utf8(name))
     source = FolderSource(url)
     lines = tried(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
-    return _fetched(catalogue_of(Path(), url, files, skipped, naming, lines), source, url)
-
-
-def _fetched(listed: Catalogue, source: Source, url: str) -> Fetched:
+    listed = catalogue_of(Path(), url, files, skipped, naming, lines)
     return Fetched(**{one.name: getattr(listed, one.name) for one in fields(listed)}, source=source, url=url)
 
 

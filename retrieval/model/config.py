@@ -81,7 +81,7 @@ class TrainingConfig:
     init: "random", "imagenet", "shipped" or the path of a state dict. init_touch, init_photo: the same for one tower
     alone, where they are not empty (`retrieval.training.relief` makes such weights); of towers side by side the part
     "init" is what init says. photos, touches: folders of labelled pictures
-    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pairs`);
+    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled`);
     both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
     pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
     files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without one on embeddings these

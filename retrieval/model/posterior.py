@@ -21,6 +21,16 @@ Objects that were not judged keep their share of the probability, estimated from
 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
 from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(none) rounds to 1.
+
+From a query to its probabilities, in four files:
+
+    judge.py                Judge.logits sums the match logits z of a photo over the grasps
+    search/query/objects.py Objects.judged gives each object the logit l(o) of its photos (Posterior.object_logits)
+    search/query/shard.py   FolderShard.ask chooses the photos that are scored and samples the other objects (Mass)
+    posterior.py            Mass.joined adds the shards; Posterior.share gives P(o), P(none) and the verdict's rule;
+                            fit_posterior fits slope, offset and dependence
+
+Reference touches change l(o) before the third step (references.py).
 """
 
 import math
@@ -62,6 +72,11 @@ class Belief:
     objects: Floats
     unjudged: float
     objects_if_present: Floats
+
+    @property
+    def is_match(self) -> bool:
+        """Whether the best object is likelier than "none of these": the rule of the verdict."""
+        return bool(self.objects.max() > self.none)
 
 
 @dataclass(frozen=True)
