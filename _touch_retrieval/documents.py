@@ -70,7 +70,7 @@ def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) 
     Raises:
         ValueError: As `typed` does.
     """
-    for field, hint in _hints(type(instance)).items():
+    for field, hint in _hints(instance.__class__).items():
         value = typed(getattr(instance, field), hint, f"{name}.{field}", error=error)
         object.__setattr__(instance, field, value)
 

@@ -52,7 +52,8 @@ def _shrink(image: Samples, axis: int, length: int) -> RgbImage:
     count = min(image.shape[other], -(-image[..., 0].size // _BAND))
     for band in np.array_split(image, count, axis=other):
         shape = (length, *band.shape[1:]) if axis == 0 else (len(band), length, band.shape[2])
-        bands.append(cv2.resize(to_unit(band), shape[1::-1], interpolation=cv2.INTER_AREA).reshape(shape))
+        unit = to_unit(band)  # type: ignore[arg-type]
+        bands.append(cv2.resize(unit, shape[1::-1], interpolation=cv2.INTER_AREA).reshape(shape))
     return np.concatenate(bands, axis=other)
 
 

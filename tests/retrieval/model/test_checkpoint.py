@@ -286,16 +286,28 @@ def with_header(text):
 
 
 FOREIGN = r"holds weights but not our header; .*`retrieve train --init`"
+DEEP = '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}"
 OTHERS = {
     "no header": (with_header(None), FOREIGN),
+    "no tensors": (b"\x08" + bytes(7) + b"{}      ", FOREIGN),
     "another header": (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
     **{
         repr(content): (content, r"m\.safetensors is not a readable \.safetensors file .*truncated")
-        for content in (b"", b"\x80\x04\x95", b"PK\x03\x04", b"\x08" + bytes(7) + b"{}      ", b"text\n" * 99)
+        for content in (b"", b"\x80\x04\x95", b"PK\x03\x04", b"text\n" * 99)
     },
     **{
         text: (with_header(text), r"header of .*m\.safetensors is damaged")
-        for text in ("", "{", "[]", "3", '"format"', "{}", "null", "[" * 100_000, "[" * 900 + "]" * 900)
+        for text in (
+            "",
+            "{",
+            "[]",
+            "3",
+            '"format"',
+            "{}",
+            "null",
+            "[" * 100_000,
+            '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}",
+        )
     },
     **{
         f"format {version}": (
