@@ -16,7 +16,7 @@ from msgspec import Meta
 from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
-from retrieval.data.views import VIEWS, Box, find_object, least_side, least_side_of_crop, strip
+from retrieval.data.views import VIEWS, find_object, least_side, least_side_of_crop, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -98,13 +98,10 @@ class Preprocessing:
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def photo(self, image: RgbImage, box: Box | None = None) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError.
-
-        box: where its object lies, where that is known.
-        """
+    def photo(self, image: RgbImage) -> RgbImage:
+        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
         check_rgb(image, "photo")
-        return strip(_finite(image, "photo"), self.views, self.photo_px, box)
+        return strip(_finite(image, "photo"), self.views, self.photo_px)
 
     def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
         """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
