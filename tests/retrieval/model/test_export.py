@@ -351,11 +351,11 @@ def test_the_command_says_what_it_measured(own, onnx_wins, capsys):
 
 
 def test_nothing_is_written_where_onnx_runtime_does_not_win_and_an_older_export_stays(own, monkeypatch, capsys):
-    own.with_suffix(".onnx").write_bytes(b"older")
+    own.with_suffix(".onnx").write_bytes(sealed(b"older"))
     timed(monkeypatch, 1.0, 1.0)
     assert main(["export", str(own)]) == 1
     assert "nothing is exported, as PyTorch is as fast on this machine" in capsys.readouterr().err
-    assert own.with_suffix(".onnx").read_bytes() == b"older"
+    assert own.with_suffix(".onnx").read_bytes() == sealed(b"older")
 
 
 def test_nothing_is_written_where_the_numbers_differ(own, onnx_wins, monkeypatch):
