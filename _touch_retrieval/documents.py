@@ -3,7 +3,8 @@
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from functools import cache
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -23,16 +24,21 @@ _PLACE = re.compile(r" - at `\$(?P<place>.*)`$")
 _STEP = re.compile(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]")
 
 
-def typed(document: Any, kind: type[T], name: str = "") -> T:
+def typed(
+    document: Any, kind: type[T], name: str = "", *, complete: bool = False, error: type[Exception] = ValueError
+) -> T:
     """Return a plain document as a value of a type.
 
-    Lists become tuples and whole numbers become floats where the type says so; nothing else is converted. A table with
+    Lists become tuples and whole numbers become floats where the type says so, a scalar of numpy becomes a number;
+    nothing else is converted. A table with
     a key that its dataclass does not have is refused, and so is a number that is not finite or not within 64 bits.
 
     Args:
         document: What `json.loads` or `tomllib.loads` returns, or a part of it.
         kind: Any type that msgspec checks, often a dataclass. `Annotated[int, msgspec.Meta(ge=1)]` states a range.
         name: What messages call the document, such as the table of a file.
+        complete: Refuse a table without a key for each field of its dataclass; else the fields' defaults stand in.
+        error: What to raise instead of ValueError.
 
     Raises:
         ValueError: Says which value must be what, and what it is.
@@ -40,22 +46,52 @@ def typed(document: Any, kind: type[T], name: str = "") -> T:
     >>> typed({"low": 1, "high": 2}, dict[str, float])
     {'low': 1.0, 'high': 2.0}
     """
-    _require_known(document, kind, name)
-    _require_finite(document, name)
+    document = document.item() if hasattr(document, "item") else document
     try:
+        _require_known(document, kind, name, complete)
+        _require_finite(document, name)
         return msgspec.convert(document, kind)
-    except msgspec.ValidationError as error:
-        raise ValueError(_refusal(str(error), document, name)) from error
+    except msgspec.ValidationError as refused:
+        raise error(_refusal(str(refused), document, name)) from refused
+    except ValueError as refused:
+        raise error(str(refused)) from refused
 
 
-def _require_known(document: Any, kind: Any, name: str) -> None:
-    if not (is_dataclass(kind) and isinstance(document, Mapping)):
+def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) -> None:
+    """Check the fields of a dataclass in its `__post_init__`, as `typed` checks those of a document.
+
+    Each field then holds the converted value.
+
+    Args:
+        instance: A frozen dataclass.
+        name: What messages call it.
+        error: What to raise instead of ValueError.
+
+    Raises:
+        ValueError: As `typed` does.
+    """
+    for field, hint in _hints(instance.__class__).items():
+        value = typed(getattr(instance, field), hint, f"{name}.{field}", error=error)
+        object.__setattr__(instance, field, value)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {each.name: hints[each.name] for each in fields(kind) if each.init}
+
+
+def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
+    tables = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and is_dataclass(each)]
+    if not tables or not isinstance(document, Mapping):
         return
-    hints, known = get_type_hints(kind), [each.name for each in fields(kind) if each.init]
+    known = _hints(tables[0])
+    if complete and (lacking := [key for key in known if key not in document]):
+        raise ValueError(f"{name or 'it'} must hold {', '.join(known)}; {lacking[0]} is missing")
     for key, value in document.items():
         if key not in known:
             raise ValueError(f"{name or 'it'} has no setting {key!r}; it knows {', '.join(sorted(known))}")
-        _require_known(value, hints[key], f"{name}.{key}" if name else key)
+        _require_known(value, known[key], f"{name}.{key}" if name else key, complete)
 
 
 def _require_finite(document: Any, name: str) -> None:

@@ -11,6 +11,7 @@ import errno
 import fcntl
 import hashlib
 import json
+import math
 import os
 import secrets
 import shutil
@@ -194,10 +195,14 @@ def read_json(path: str | Path, most: int = MAX_JSON_BYTES) -> Any:
     return parse_json(read_regular(path, most))
 
 
-def parse_json(text: str | bytes) -> Any:
-    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `DEEPEST`."""
+def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
+    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `DEEPEST`.
+
+    finite: refuse numbers that are not finite too, which Python reads: NaN, Infinity and 1e999.
+    """
+    number = _finite if finite else None
     try:
-        document = json.loads(text, object_pairs_hook=_object)
+        document = json.loads(text, object_pairs_hook=_object, parse_constant=number, parse_float=number)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {DEEPEST} levels") from error
     if is_deep(document):
@@ -219,6 +224,13 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         names = [name for name, _ in pairs]
         raise ValueError(f"it has the key {next(name for name in names if names.count(name) > 1)!r} twice")
     return found
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is not a finite number")
+    return number
 
 
 def _inside(each: Any) -> Iterable[Any]:

@@ -17,7 +17,6 @@ import torch
 
 from benchmarks.common import Line, Times, as_text, duration, in_turns, matcher_of
 from retrieval.data.images import read_bytes
-from retrieval.data.photo_resize import resize_photo
 from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
@@ -71,7 +70,7 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
     photo_of = checkpoint.config.preprocessing.photo_of
 
     def see(path: Path) -> RgbImage:
-        return photo_of(read_bytes(path), path, resize_photo)
+        return photo_of(read_bytes(path), path)
 
     with tempfile.TemporaryDirectory() as name:
         images, build = _ready(Path(name), checkpoint, photos, photo_px)

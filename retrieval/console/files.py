@@ -1,6 +1,5 @@
 """Files that commands write: whole or not at all, and never over a file of another kind."""
 
-import json
 import os
 import stat
 from collections.abc import Callable
@@ -9,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from _touch_retrieval.files import naming, open_regular, write_atomically
+from _touch_retrieval.files import naming, open_regular, parse_json, write_atomically
 from retrieval.errors import BadInput
 
 GENERATOR = "touch-retrieval"
@@ -89,8 +88,8 @@ def _holds(*keys: str) -> Callable[[BinaryIO], bool]:
 def _parsed(text: bytes) -> dict[str, Any]:
     """The JSON object that a text holds; an empty one where it holds none."""
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
+        found = parse_json(text)
+    except ValueError:
         return {}
     return found if isinstance(found, dict) else {}
 

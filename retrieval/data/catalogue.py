@@ -12,15 +12,13 @@ Listing opens no photo; `read_photo` reads one, and one broken file never stops 
 """
 
 import hashlib
-import json
-import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
 
-from _touch_retrieval.files import read_regular
+from _touch_retrieval.files import parse_json, read_regular
 from indexes.store.seen_folders import SeenFolders
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
@@ -272,7 +270,7 @@ def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_Table, _Ta
             table = by_photo if is_photo else by_object
             if name in table:
                 raise ValueError(f"{name} has a line already; join the two")
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             raise DatasetError(f"{where}, line {number}: {error}") from error
         table[name] = metadata
     return by_object, by_photo
@@ -280,7 +278,7 @@ def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_Table, _Ta
 
 def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys). Raises ValueError."""
-    row = json.loads(line.decode(), parse_constant=_finite, parse_float=_finite)
+    row = parse_json(line.decode(), finite=True)
     if not isinstance(row, dict):
         raise ValueError("must hold one JSON object in braces")
     if b"\\u" in line:
@@ -298,11 +296,3 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     if row.get("object_id", name) != name:
         raise ValueError(f"{path} lies in object {name}, but the line says {row['object_id']}")
     return path, True, metadata
-
-
-def _finite(text: str) -> float:
-    """A number of JSON, or "NaN" and "Infinity", which Python takes for numbers too."""
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text} is not a finite number")
-    return number

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import typed
 from _touch_retrieval.files import read_regular
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
@@ -172,14 +173,9 @@ class Split:
     @classmethod
     def from_dict(cls, data: Any) -> "Split":
         """Inverse of `to_dict`. Raises DatasetError for anything else."""
-        found = data if isinstance(data, dict) else {}
-        parts = {name: found.get(name) for name in ("train", "validation", "test")}
-        if any(not isinstance(part, list) or any(type(item) is not str for item in part) for part in parts.values()):
-            raise DatasetError('a split must be {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}')
-        seed = found.get("seed", 0)
-        if type(seed) is not int:
-            raise DatasetError(f"the seed of a split must be a whole number; got {seed!r}")
-        return cls(seed=seed, **{name: tuple(part or ()) for name, part in parts.items()})
+        return typed(
+            {"seed": 0} | data if isinstance(data, dict) else data, cls, "split", complete=True, error=DatasetError
+        )
 
     def select(self, grasps: Iterable[Grasp], part: str) -> list[Grasp]:
         """Grasps whose object lies in `part` ("train", "validation" or "test")."""

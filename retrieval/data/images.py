@@ -281,8 +281,10 @@ def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
     bits = set(_tiff_tag(image, _BITS, (16,)))
     if image.mode not in _DEEP_MODES or bits != {16} or layout not in (((1,), (1,)), ((2,), (1,))):
         raise ImageError(name, f"this pixel type ({image.mode}, {max(bits)} bits) is not supported; save it as PNG")
-    if image.format == "PNG" and not _chunks_fit(data):
-        raise ImageError(name, "damaged or truncated: a PNG chunk is longer than the file")
+    if image.format == "PNG":  # of which OpenCV allocates what a chunk claims
+        kind, end = list(png_chunks(data))[-1]
+        if kind != b"IEND" or end > len(data):
+            raise ImageError(name, "damaged or truncated: a PNG chunk is longer than the file")
     samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if samples is None or samples.dtype != np.uint16 or samples.shape[:2] != (image.height, image.width):
         raise ImageError(name, "its 16-bit samples cannot be decoded; save it as 8-bit PNG")
@@ -295,12 +297,6 @@ def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
         opaque = (rgb != np.asarray(image.info["transparency"])).any(axis=2, keepdims=True)
         return _on_white(to_float(rgb), opaque.astype(np.float32))
     return to_float(rgb)
-
-
-def _chunks_fit(data: bytes) -> bool:
-    """Whether a PNG file ends with IEND and all its chunks end inside it; OpenCV allocates what a chunk claims."""
-    kind, end = list(png_chunks(data))[-1]
-    return kind == b"IEND" and end <= len(data)
 
 
 def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32], premultiplied: bool = False) -> RgbImage:

@@ -1,15 +1,26 @@
 """Pictures with what is known of the objects they show, as `retrieve collect --photos-only` and `--touches-only` make
-them; the format stands in robot.sim.pictures."""
+them, and pairs of them; the format stands in robot.sim.pictures.
+
+Photographed objects and pressed objects come from worlds of their own, and no object is both; but what two labelled
+objects of one shape and relief, of like pitch, amplitude, aspect and sharpness, feel and look like, teaches a matcher
+what goes with what. One pressed object and one photographed object cost a third and a tenth of a felt one.
+"""
 
 import hashlib
 import json
 import math
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
 from _touch_retrieval.files import read_json, read_regular
+from retrieval.data.dataset import Grasp
 from retrieval.errors import DatasetError
 
 KINDS = ("photo", "touch")
@@ -17,6 +28,11 @@ FAMILIES = ("relief", "shape")
 SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
 LEAST_MM = 0.05
 """An amplitude below this is as none."""
+WEIGHTS = (2.0, 1.0, 1.0, 0.5)
+"""Of the squared differences in `LabelledPicture.learnt_sizes`, each in standard deviations; a pitch is felt and
+seen best."""
+OTHER_SHAPE = 3.0
+"""How far apart two objects of different shapes are, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -99,3 +115,74 @@ def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
             f"sharpness within 0..1; got {sizes}"
         )
     return found
+
+
+# Pairs ---------------------------------------------------------------------------------------------------------------
+
+
+def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
+    """Grasps made of labelled pictures: each press with the photo of the object most like the pressed one, each photo
+    with the press of the object most like the photographed one.
+
+    photos, touches: folders that `retrieve collect --photos-only` and `--touches-only` wrote. fingers: gel
+    images of one touch; where it is 1, each finger's press is a touch of its own. Like is of the same relief and
+    nearest in sizes, another shape being as far as OTHER_SHAPE; where no object has the relief, a picture is left out.
+    The photographed object names the grasp's object, `like <object_id>`, so that two presses with one photo are of one
+    object. Raises DatasetError for folders of the wrong kind or where nothing pairs.
+    """
+    photographed, pressed = _of_kind(photos, "photo"), _of_kind(touches, "touch")
+    of_object: dict[str, list[LabelledPicture]] = defaultdict(list)
+    for picture in sorted(pressed, key=lambda each: each.finger or ""):
+        of_object[picture.object_id].append(picture)
+    touched = [[one] for one in pressed] if fingers == 1 else of_object.values()
+    whole = [part for part in touched if len(part) == fingers]
+    if not whole:
+        raise DatasetError(f"no object in {touches} was pressed by {fingers} fingers, as the recording's were grasped")
+    grasps = [_grasp(whole[row], photographed[match]) for row, match in _pairs([one[0] for one in whole], photographed)]
+    if not grasps:
+        raise DatasetError(f"no object in {touches} has the relief of one in {photos}; collect more")
+    return grasps
+
+
+def _of_kind(folder: Path, kind: str) -> list[LabelledPicture]:
+    found, pictures = load_labelled(folder)
+    if found != kind:
+        raise DatasetError(f"{folder} must hold labelled pictures of kind {kind}; it holds those of kind {found}")
+    return pictures
+
+
+def _pairs(pressed: list[LabelledPicture], photographed: list[LabelledPicture]) -> list[tuple[int, int]]:
+    """(row of the press, row of the photo), in order."""
+    rows_of: dict[str, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
+    for side, pictures in enumerate((pressed, photographed)):
+        for row, picture in enumerate(pictures):
+            rows_of[picture.relief][side].append(row)
+    shapes = [np.array([each.shape for each in pictures]) for pictures in (pressed, photographed)]
+    felt, seen = _scaled(pressed, photographed), _scaled(photographed, photographed)
+    pairs: set[tuple[int, int]] = set()
+    for presses, photos in rows_of.values():
+        if presses and photos:
+            other = shapes[0][presses][:, None] != shapes[1][photos]
+            apart = np.hypot(cdist(felt[presses], seen[photos]), OTHER_SHAPE * other)
+            pairs |= {(press, photos[match]) for press, match in zip(presses, apart.argmin(1), strict=True)}
+            pairs |= {(presses[match], photo) for photo, match in zip(photos, apart.argmin(0), strict=True)}
+    return sorted(pairs)
+
+
+def _scaled(pictures: list[LabelledPicture], over: list[LabelledPicture]) -> NDArray[np.float64]:
+    """(N, sizes) in weighted standard deviations over `over`; all alike for smooth objects, which have none."""
+    deviation = np.array([each.learnt_sizes for each in over]).std(0) + 1e-6
+    sizes = np.array([each.learnt_sizes for each in pictures]) / deviation * np.sqrt(WEIGHTS)
+    sizes[[each.is_smooth for each in pictures]] = 0.0
+    return np.asarray(sizes)
+
+
+def _grasp(fingers: list[LabelledPicture], photo: LabelledPicture) -> Grasp:
+    return Grasp(
+        grasp_id=f"{fingers[0].file.name} like {photo.object_id}",
+        object_id=f"like {photo.object_id}",
+        sequence_id=None,
+        photo=photo.file,
+        touches=tuple(each.file for each in fingers),
+        backgrounds=tuple(each.before for each in fingers if each.before),
+    )

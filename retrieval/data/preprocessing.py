@@ -5,16 +5,18 @@ bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background-->
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
+from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
-from retrieval.data.resize import Resize, RgbImage, Samples, check_rgb, resize, resized
-from retrieval.data.views import VIEWS, Box, find_object, least_side, least_side_of_crop, strip
+from retrieval.data.resize import RgbImage, check_rgb, resize
+from retrieval.data.views import VIEWS, find_object, least_side, least_side_of_crop, strip
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -59,39 +61,33 @@ def _missing_reference(policy: str) -> ConfigError:
     )
 
 
+Side = Annotated[int, Meta(ge=1, le=4096)]
+"""Of a square, in pixels."""
+
+
 @dataclass(frozen=True)
 class Preprocessing:
     """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, which views of a
     photo stand side by side (`retrieval.data.views.VIEWS`), and whether a JPEG photo is decoded no larger than these
     need (`reduced`)."""
 
-    touch_px: int = 128
-    photo_px: int = 256
+    touch_px: Side = 128
+    photo_px: Side = 256
     background: str = "none"
     views: tuple[str, ...] = ("whole",)
     reduced: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "views", tuple(self.views))
+        check_fields(self, "preprocessing", ConfigError)
         if not self.views or not set(self.views) <= set(VIEWS) or len(set(self.views)) < len(self.views):
-            raise ConfigError(f"views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}")
-        for key in ("touch_px", "photo_px"):
-            side = getattr(self, key)
-            if type(side) is not int or not 1 <= side <= 4096:
-                raise ConfigError(f"{key} must be a whole number of pixels from 1 to 4096, got {side!r}")
+            raise ConfigError(
+                f"preprocessing.views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}"
+            )
         _check_policy(self.background)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON types; `from_dict` reads them back."""
+        """Return the settings as JSON types."""
         return asdict(self) | {"views": list(self.views)}
-
-    @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "Preprocessing":
-        """Make from named settings; one left out takes its default. Raises ConfigError for an unknown one."""
-        known = [field.name for field in fields(cls)]
-        if unknown := sorted(set(settings) - set(known)):
-            raise ConfigError(f"unknown preprocessing setting {unknown[0]!r}; known: {', '.join(known)}")
-        return cls(**settings)
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
@@ -102,29 +98,22 @@ class Preprocessing:
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def photo(self, image: RgbImage, box: Box | None = None) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError.
-
-        box: where its object lies, where that is known.
-        """
+    def photo(self, image: RgbImage) -> RgbImage:
+        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
         check_rgb(image, "photo")
-        return self._seen(_finite(image, "photo"), box)
+        return strip(_finite(image, "photo"), self.views, self.photo_px)
 
-    def photo_of(self, data: bytes, name: str | Path, resize: Resize = resized) -> RgbImage:
-        """The bytes of a photo's file as `photo` gives the picture in them. resize: where there are many photos,
-        `retrieval.data.photo_resize.resize_photo`. Raises ImageError."""
+    def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
+        """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
         if not self.reduced:
-            return self._seen(decode(data, name), None, resize)
+            return strip(decode(data, name), self.views, self.photo_px)
         image = decode(data, name, least_side(self.views, self.photo_px))
         short, box = min(image.shape[:2]), None
         if "crop" in self.views and short < min(picture_size(data, name)):
-            box = find_object(image, resize)
+            box = find_object(image)
             if (more := least_side_of_crop(box, short, self.photo_px)) > short:
                 image, box = decode(data, name, more), None
-        return self._seen(image, box, resize)
-
-    def _seen(self, image: Samples, box: Box | None, resize: Resize = resized) -> RgbImage:
-        return strip(image, self.views, self.photo_px, box, resize)
+        return strip(image, self.views, self.photo_px, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.

@@ -12,7 +12,6 @@ embedded. What the storage refuses is asked for again; where it goes on, the job
 left out for what it is, never for what the network did.
 """
 
-import json
 import math
 import re
 import tarfile
@@ -23,6 +22,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
+from _touch_retrieval.files import parse_json
 from indexes.store.seen_folders import SeenFolders
 from retrieval.data.catalogue import (
     METADATA_FILE,
@@ -127,10 +127,7 @@ def _folder(url: str, naming: Naming) -> Catalogue:
             skipped.append(not_utf8(name))
     source = FolderSource(url)
     lines = tried(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
-    return _fetched(catalogue_of(Path(), url, files, skipped, naming, lines), source, url)
-
-
-def _fetched(listed: Catalogue, source: Source, url: str) -> Fetched:
+    listed = catalogue_of(Path(), url, files, skipped, naming, lines)
     return Fetched(**{one.name: getattr(listed, one.name) for one in fields(listed)}, source=source, url=url)
 
 
@@ -337,8 +334,8 @@ def _key(name: str) -> str:
 def _metadata(where: str, data: bytes) -> dict[str, Any]:
     """The plain keys of a document; none where it is no JSON object. Raises DatasetError for text that is not UTF-8."""
     try:
-        document = json.loads(data)
-    except (ValueError, RecursionError):
+        document = parse_json(data)
+    except ValueError:
         return {}
     try:
         require_utf8(document)

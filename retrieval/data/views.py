@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import Resize, RgbImage, Samples, resized, to_unit
+from retrieval.data.resize import RgbImage, Samples, resized, to_unit
 
 _CROP_MARGIN = 1.12
 _ZOOM_SHARE = 7 / 16
@@ -44,17 +45,15 @@ class Box(NamedTuple):
     bottom: float
 
 
-def find_object(image: Samples, resize: Resize = resized) -> Box:
+def find_object(image: Samples) -> Box:
     """Where the one object of a photo (H, W, 3) lies that stands before a plain ground; the whole photo if none does.
 
     The ground is what the photo's border shows: planes of colour and lightness, fitted without what sticks out. An
     object differs from it in colour, or is lighter, or darker than a shadow: a shadow is the ground with less light
     and a tint between the lamp's and the sky's. Where depth was recorded it would say better; a catalogue has none.
     """
-    import cv2  # a query of a touch needs none
-
     height, width = image.shape[:2]
-    linear = np.clip(resize(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
+    linear = np.clip(resized(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
     channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # a plane after the other: sums in a tenth of the time
     lightness = _summed(channels) / 3
     (red, green, blue, lighter), scatter = _off_the_ground(np.stack([*(channels / lightness), np.log(lightness)]))
@@ -119,8 +118,6 @@ def _medians(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np
 
 def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
     """Sides of the box around the largest region near the middle, with those a tenth as large; None for too little."""
-    import cv2
-
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     count, _, about, middles = cv2.connectedComponentsWithStats(mask)
@@ -137,8 +134,6 @@ def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | No
 def square(image: Samples, box: Box, side: float) -> Samples:
     """The square of `side` pixels about the middle of a box in the photo; beyond the photo's edge its last pixels go
     on."""
-    import cv2
-
     size = max(round(side), 1)
     left, top = (round(middle - size / 2) for middle in ((box.left + box.right) / 2, (box.top + box.bottom) / 2))
     inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
@@ -189,11 +184,11 @@ def least_side_of_crop(box: Box, short: int, px: int) -> int:
     return math.ceil(OVERSAMPLED * px / float(share))
 
 
-def strip(image: Samples, names: Sequence[str], px: int, box: Box | None = None, resize: Resize = resized) -> RgbImage:
+def strip(image: Samples, names: Sequence[str], px: int, box: Box | None = None) -> RgbImage:
     """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
     if box is None:
-        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image, resize)
+        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
     found = np.empty((px, len(names) * px, 3), np.float32)
     for place, name in enumerate(names):
-        found[:, place * px : (place + 1) * px] = resize(VIEWS[name](image, box), (px, px))
+        found[:, place * px : (place + 1) * px] = resized(VIEWS[name](image, box), (px, px))
     return found

@@ -8,8 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from msgspec import Meta
+
+from _touch_retrieval.documents import check_fields, typed
 from _touch_retrieval.files import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
@@ -19,6 +22,11 @@ from retrieval.model.towers import TOGETHER, architectures_of, tower_name
 if TYPE_CHECKING:
     from retrieval.model.losses.loss import Loss
     from retrieval.model.towers.base import Tower
+
+Count = Annotated[int, Meta(ge=1)]
+Share = Annotated[float, Meta(ge=0, lt=1)]
+Weight = Annotated[float, Meta(ge=0)]
+
 
 # How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
 
@@ -41,12 +49,12 @@ class MatcherConfig:
 
     tower: str = "resnet50"
     tower_output: str = "classes"
-    fingers: int = 2
-    hidden: int = 1024
-    dropout: float = 0.5
+    fingers: Count = 2
+    hidden: Count = 1024
+    dropout: Share = 0.5
     standardise: bool = False
-    embedding_dim: int = 128
-    pruner_width: int = 0
+    embedding_dim: Count = 128
+    pruner_width: Annotated[int, Meta(ge=0)] = 0
     pruner_linear: int = 0
     cosine: bool = False
     architectures: Mapping[str, Any] = field(default_factory=dict)
@@ -57,16 +65,13 @@ class MatcherConfig:
         return self.hidden + (self.embedding_dim if self.cosine else 0)
 
     def __post_init__(self) -> None:
-        _require(self.pruner_width >= 0, f"pruner_width must be at least 0; got {self.pruner_width}")
+        check_fields(self, "matcher", ConfigError)
         most = self.embedding_dim - 1 if self.cosine else 0
         _require(
             0 <= self.pruner_linear <= most,
-            f"pruner_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine); got "
+            f"matcher.pruner_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine), got "
             f"{self.pruner_linear}",
         )
-        for name in ("fingers", "hidden", "embedding_dim"):
-            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
-        _require(0 <= self.dropout < 1, f"dropout must be in [0, 1); got {self.dropout}")
 
 
 @dataclass(frozen=True)
@@ -76,7 +81,7 @@ class TrainingConfig:
     init: "random", "imagenet", "shipped" or the path of a state dict. init_touch, init_photo: the same for one tower
     alone, where they are not empty (`retrieval.training.relief` makes such weights); of towers side by side the part
     "init" is what init says. photos, touches: folders of labelled pictures
-    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pairs`);
+    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled`);
     both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
     pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
     files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without one on embeddings these
@@ -98,57 +103,44 @@ class TrainingConfig:
     init_photo: str = ""
     photos: str = ""
     touches: str = ""
-    iterations: int = 26_000
-    touches_per_batch: int = 6
-    positives_per_touch: int = 4
-    negatives_per_touch: int = 4
-    learning_rate: float = 1e-4
+    iterations: Count = 26_000
+    touches_per_batch: Count = 6
+    positives_per_touch: Count = 4
+    negatives_per_touch: Count = 4
+    learning_rate: Annotated[float, Meta(gt=0)] = 1e-4
     schedule: str = "constant"
     weights: Mapping[str, float] = field(default_factory=dict)
     shuffle_fingers: bool = False
     negatives: str = "auto"
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
-    distil_steps: int = 600
-    validation_fraction: float = 0.1
-    test_fraction: float = 0.184
-    validate_every: int = 500
+    distil_steps: Count = 600
+    validation_fraction: Share = 0.1
+    test_fraction: Share = 0.184
+    validate_every: Count = 500
     precision: str = "auto"
-    seed: int = 0
-    workers: int | str = field(default="auto", compare=False)
-    prefetch: int = field(default=2, compare=False)
+    seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
+    workers: Count | Literal["auto"] = field(default="auto", compare=False)
+    prefetch: Count = field(default=2, compare=False)
     pinned_memory: bool = field(default=True, compare=False)
 
     def __post_init__(self) -> None:
-        auto = self.workers == "auto" or (isinstance(self.workers, int) and self.workers >= 1)
-        _require(auto, f'workers must be "auto" or at least 1; got {self.workers!r}')
-        for name in (
-            "prefetch",
-            "iterations",
-            "touches_per_batch",
-            "positives_per_touch",
-            "negatives_per_touch",
-            "distil_steps",
-            "validate_every",
-        ):
-            _require(getattr(self, name) >= 1, f"{name} must be at least 1; got {getattr(self, name)}")
-        _require(0 < self.learning_rate < math.inf, f"learning_rate must be positive; got {self.learning_rate}")
-        for name, weight in self.weights.items():
-            _require(0 <= weight < math.inf, f"{name}_weight must be a number from 0; got {weight}")
         own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
-        object.__setattr__(self, "weights", {name: self.weights.get(name, 0.0) for name in LOSSES} | own)
-        _require(0 <= self.seed < 2**32, f"seed must be in [0, 2^32); got {self.seed}")
+        weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | own
+        for name, weight in weights.items():
+            weights[name] = typed(weight, Weight, f"training.{name}{WEIGHT}", error=ConfigError)
+        object.__setattr__(self, "weights", weights)
+        check_fields(self, "training", ConfigError)
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
-            _require(value in known, f"{name} must be one of {', '.join(known)}; got {value!r}")
+            _require(value in known, f"training.{name} must be one of {', '.join(known)}, got {value!r}")
         _require(
             bool(self.photos) == bool(self.touches),
             f"labelled photos are paired with labelled touches; got photos {self.photos!r}, touches {self.touches!r}",
         )
         held_out = (self.validation_fraction, self.test_fraction)
         _require(
-            min(held_out) >= 0 and sum(held_out) < 1,
-            f"validation_fraction and test_fraction must not be negative and leave objects to train on; got {held_out}",
+            sum(held_out) < 1, f"validation_fraction and test_fraction must leave objects to train on; got {held_out}"
         )
 
     def first_weights(self, of_one: str) -> str:
@@ -174,17 +166,21 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "TrainingConfig":
-        """Inverse of `to_dict`; a setting left out keeps its default."""
+        """Inverse of `to_dict`; a setting left out keeps its default. Raises ConfigError."""
         weights = {name.removesuffix(WEIGHT): value for name, value in table.items() if name.endswith(WEIGHT)}
-        return cls(**{name: value for name, value in table.items() if not name.endswith(WEIGHT)}, weights=weights)
+        rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT)}
+        known = {*cls().to_dict(), *LOADER}
+        if unknown := [name for name in rest if name not in known]:
+            raise ConfigError(f"training has no setting {unknown[0]!r}; it knows {', '.join(sorted(known))}")
+        return cls(**rest, weights=weights)
 
     def of_steps(self, iterations: int) -> "TrainingConfig":
         """The same with so many optimiser steps, and at most as many to teach the pruner."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
-LOADER: dict[str, tuple[type[Any], ...]] = {"workers": (int, str), "prefetch": (int,), "pinned_memory": (bool,)}
-"""Settings of the loader, which decide no result, with their types."""
+LOADER = ("workers", "prefetch", "pinned_memory")
+"""Settings of the loader, which decide no result."""
 WEIGHT = "_weight"
 """What ends the setting of a loss's weight."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
@@ -279,16 +275,10 @@ class Config:
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
         """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
-        if not isinstance(tables, Mapping):
-            raise ConfigError(f"a configuration must be tables of settings; got {tables!r}")
-        defaults = cls().to_dict()
-        _refuse_unknown("configuration", tables, defaults)
-        typed = {name: _typed_settings(name, table, defaults[name]) for name, table in tables.items()}
-        return cls(
-            MatcherConfig(**typed.get("matcher", {})),
-            TrainingConfig.from_dict(typed.get("training", {})),
-            Preprocessing(**typed.get("preprocessing", {})),
-        )
+        training = tables.get("training") if isinstance(tables, Mapping) else None
+        if isinstance(training, Mapping):  # whose weights are settings of their own in a file
+            tables = {**tables, "training": TrainingConfig.from_dict(training)}
+        return typed(tables, cls, error=ConfigError)
 
 
 def load_config(name_or_path: str) -> Config:
@@ -311,7 +301,7 @@ def load_config(name_or_path: str) -> Config:
         config = Config.from_dict(tomllib.loads(read_regular(file).decode()))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # what TOML or UTF-8 forbids
+    except ValueError as error:  # what TOML or UTF-8 forbids
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
     return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 
@@ -327,30 +317,6 @@ def preset_names() -> list[str]:
     """Names of the presets that come with the package."""
     files = (resources.files("retrieval") / "configs").iterdir()
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
-
-
-def _typed_settings(table_name: str, table: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
-    if not isinstance(table, Mapping):
-        raise ConfigError(f"[{table_name}] must be a table of settings; got {table!r}")
-    types = {name: (type(default),) for name, default in defaults.items()}
-    if table_name == "training":
-        types |= LOADER | {name: (float,) for name in table if name.endswith(WEIGHT)}
-    _refuse_unknown(f"[{table_name}]", table, types)
-    return {name: _typed(f"{table_name}.{name}", types[name], value) for name, value in table.items()}
-
-
-def _typed(name: str, wanted: tuple[type[Any], ...], value: Any) -> Any:
-    if wanted == (float,) and type(value) is int and abs(value) < 2**63:
-        return float(value)
-    if type(value) not in wanted or (wanted == (list,) and not all(isinstance(each, str) for each in value)):
-        raise ConfigError(f"{name} must be of type {' or '.join(one.__name__ for one in wanted)}; got {value!r}")
-    return value
-
-
-def _refuse_unknown(where: str, given: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    for key in given:
-        if key not in known:
-            raise ConfigError(f"unknown setting {key!r} in {where}; known: {', '.join(known)}")
 
 
 def _require(holds: bool, message: str) -> None:

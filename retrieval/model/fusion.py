@@ -78,10 +78,7 @@ class FusionHead(nn.Module):
         self.dropout = nn.Dropout(dropout)
         self.second = nn.Linear(hidden, hidden)
         self.out = nn.Linear(hidden, 1)
-        self._initialise_as_one_layer()
-
-    def _initialise_as_one_layer(self) -> None:
-        """PyTorch's default for the concatenated layer: uniform within 1 / sqrt(all inputs)."""
+        # PyTorch's default for the concatenated layer: uniform within 1 / sqrt(all inputs).
         bound = 1 / math.sqrt(self.touch_half.in_features + self.photo_half.in_features)
         for parameter in (self.touch_half.weight, self.touch_half.bias, self.photo_half.weight):
             nn.init.uniform_(parameter, -bound, bound)

@@ -12,17 +12,19 @@ photos at once; what comes before and after it is done in place, so that the pro
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import typed
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, NumericalError
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
 BLOCKS = 16
-_MOST = 1e6
+Threshold = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
 @dataclass(frozen=True)
@@ -35,10 +37,10 @@ class GelCheck:
     validation touches, untouched gels and foreign pictures.
     """
 
-    foreign_above: float | None
-    contact_above: float | None
-    level_above: float | None
-    shares: Mapping[str, float]
+    foreign_above: Threshold | None
+    contact_above: Threshold | None
+    level_above: Threshold | None
+    shares: Mapping[str, Threshold]
 
     def judge(self, readings: NDArray[np.float32], levels: NDArray[np.float32] | None = None) -> list[str]:
         """What each grasp is: CONTACT, NO_CONTACT or NOT_A_GEL.
@@ -66,14 +68,7 @@ class GelCheck:
     @classmethod
     def from_dict(cls, data: Any) -> "GelCheck":
         """Inverse of `to_dict`. Raises BadInput for anything else."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(data, Mapping) or set(data) != set(names) or not isinstance(data["shares"], Mapping):
-            raise BadInput(f"a check of gel images must hold {', '.join(names)}; got {data!r}")
-        thresholds = [(name, data[name]) for name in names[:-1] if data[name] is not None]
-        for name, value in [*thresholds, *data["shares"].items()]:
-            if not isinstance(name, str) or type(value) not in (int, float) or not abs(value) <= _MOST:
-                raise BadInput(f"a check of gel images must hold finite numbers; {name} is {value!r}")
-        return cls(**{**data, "shares": dict(data["shares"])})
+        return typed(data, cls, "gel_check", complete=True, error=BadInput)
 
 
 def contact_level(touch: RgbImage, untouched: RgbImage) -> float:

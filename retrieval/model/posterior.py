@@ -21,17 +21,28 @@ Objects that were not judged keep their share of the probability, estimated from
 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
 from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(none) rounds to 1.
+
+From a query to its probabilities, in four files:
+
+    judge.py                Judge.logits sums the match logits z of a photo over the grasps
+    search/query/objects.py Objects.judged gives each object the logit l(o) of its photos (Posterior.object_logits)
+    search/query/shard.py   FolderShard.ask chooses the photos that are scored and samples the other objects (Mass)
+    posterior.py            Mass.joined adds the shards; Posterior.share gives P(o), P(none) and the verdict's rule;
+                            fit_posterior fits slope, offset and dependence
+
+Reference touches change l(o) before the third step (references.py).
 """
 
-import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
+from _touch_retrieval.documents import check_fields, typed
 from retrieval.errors import BadInput, NumericalError
 
 Floats = NDArray[np.float64]
@@ -41,7 +52,6 @@ NONE_PRIOR = 0.5
 SLOPE_BOUNDS = (0.01, 100.0)
 MAX_GRASPS = 5
 """Grasps of an object that the dependence is fitted on; of larger sets nothing is known."""
-_MOST = 1e300
 FORMULA = (
     "P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset), P(none of these) ~ none_prior, "
     "w = slope / (1 + dependence * (grasps - 1)), logit = log mean exp(w * z) / w over the photos of o, "
@@ -62,6 +72,11 @@ class Belief:
     objects: Floats
     unjudged: float
     objects_if_present: Floats
+
+    @property
+    def is_match(self) -> bool:
+        """Whether the best object is likelier than "none of these": the rule of the verdict."""
+        return bool(self.objects.max() > self.none)
 
 
 @dataclass(frozen=True)
@@ -102,20 +117,16 @@ class Mass:
 class Posterior:
     """The formula's numbers, and how many catalogues they were fitted on."""
 
-    slope: float = 1.0
+    formula: str = field(default=FORMULA, kw_only=True, repr=False)
+    slope: Annotated[float, Meta(ge=SLOPE_BOUNDS[0], le=SLOPE_BOUNDS[1])] = 1.0
     offset: float = 0.0
-    dependence: float = 1.0
-    tests: int = 0
+    dependence: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    tests: Annotated[int, Meta(ge=0)] = 0
 
     def __post_init__(self) -> None:
-        for name, value in dataclasses.asdict(self).items():
-            if type(value) not in (int, float) or not abs(value) <= _MOST:
-                raise BadInput(f"a posterior must hold finite numbers; {name} is {value!r}")
-        if not SLOPE_BOUNDS[0] <= self.slope <= SLOPE_BOUNDS[1] or not 0 <= self.dependence <= 1:
-            raise BadInput(
-                f"a posterior must have a slope within {SLOPE_BOUNDS} and a dependence within 0 and 1; got "
-                f"{self.slope} and {self.dependence}"
-            )
+        check_fields(self, "posterior", BadInput)
+        if self.formula != FORMULA:
+            raise BadInput("posterior.formula is not the one of this version; train again, or build the index again")
 
     def weight(self, grasps: int) -> float:
         """What the sum of the match logits of so many grasps is multiplied by."""
@@ -218,15 +229,12 @@ class Posterior:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in `calibration.json`."""
-        return {"formula": FORMULA, **dataclasses.asdict(self)}
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, data: Any) -> "Posterior":
         """Inverse of `to_dict`. Raises BadInput for anything else."""
-        names = {field.name for field in dataclasses.fields(cls)}
-        if not isinstance(data, Mapping) or set(data) != names | {"formula"} or data["formula"] != FORMULA:
-            raise BadInput(f"a posterior must hold {', '.join(sorted(names))} and the formula of this version")
-        return cls(**{name: data[name] for name in names})
+        return typed(data, cls, "posterior", complete=True, error=BadInput)
 
 
 def require_prior(none_prior: float) -> None:

@@ -22,7 +22,9 @@ class Pruner(nn.Module):
         """linear: of the `embedding_dim` numbers, so many are linear in the last `embedding_dim` numbers of a half,
         which then hold the contrastive embedding."""
         super().__init__()
-        self._touch, self._photo = (_student(half, width, embedding_dim - linear) for _ in range(2))
+        self._touch, self._photo = (
+            nn.Sequential(nn.Linear(half, width), nn.ReLU(), nn.Linear(width, embedding_dim - linear)) for _ in range(2)
+        )
         self._touch_axes, self._photo_axes = (nn.Linear(embedding_dim, linear) if linear else None for _ in range(2))
 
     def touch(self, half: Tensor) -> Tensor:
@@ -91,7 +93,3 @@ def _side_by_side(student: nn.Module, axes: nn.Linear | None, half: Tensor) -> T
     """What a network makes of halves and what is linear in their embeddings, in one array (B, embedding_dim)."""
     made: Tensor = student(half)
     return made if axes is None else torch.cat([made, axes(half[..., -axes.in_features :])], dim=-1)
-
-
-def _student(half: int, width: int, embedding_dim: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(half, width), nn.ReLU(), nn.Linear(width, embedding_dim))

@@ -18,13 +18,15 @@ are ranked and believed by one formula, whatever shows them.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import check_fields, typed
 from retrieval.errors import BadInput
 from retrieval.model.posterior import (
     LEAST_OBJECTS,
@@ -55,35 +57,24 @@ class ReferenceWorth:
     where no object had both. objects, touches: on how many it was fitted, and how many touches of these asked."""
 
     alone: Posterior
-    weight: float | None
+    weight: Annotated[float, Meta(ge=0, le=1e9)] | None
     beside: Posterior | None
-    objects: int
-    touches: int
+    objects: Annotated[int, Meta(ge=0)]
+    touches: Annotated[int, Meta(ge=0)]
 
     def __post_init__(self) -> None:
-        numbers = [self.objects, self.touches, 0.0 if self.weight is None else self.weight]
-        if any(type(number) not in (int, float) or not 0 <= number <= 1e9 for number in numbers):
-            raise BadInput(f"what references are worth must be told in finite numbers from 0 on; got {numbers}")
+        check_fields(self, "references", BadInput)
         if (self.weight is None) != (self.beside is None):
             raise BadInput("a weight beside photos and its posterior go together; one of them is missing")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as stored in checkpoints and in the manifests of indexes."""
-        parts = {name: None if one is None else one.to_dict() for name, one in self._posteriors.items()}
-        return {**dataclasses.asdict(self), **parts}
-
-    @property
-    def _posteriors(self) -> dict[str, Posterior | None]:
-        return {"alone": self.alone, "beside": self.beside}
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, data: Any) -> "ReferenceWorth":
         """Inverse of `to_dict`. Raises BadInput for anything else."""
-        names = {field.name for field in dataclasses.fields(cls)}
-        if not isinstance(data, Mapping) or set(data) != names:
-            raise BadInput(f"what references are worth must hold {', '.join(sorted(names))}")
-        beside = None if data["beside"] is None else Posterior.from_dict(data["beside"])
-        return cls(**{**data, "alone": Posterior.from_dict(data["alone"]), "beside": beside})
+        return typed(data, cls, "references", complete=True, error=BadInput)
 
 
 def touch_codes(halves: NDArray[np.floating[Any]], hidden: int) -> Floats:

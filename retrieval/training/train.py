@@ -33,7 +33,7 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.data.labelled_pairs import pair_by_label
+from retrieval.data.labelled import pair_by_label
 from retrieval.errors import CheckpointError, ConfigError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (

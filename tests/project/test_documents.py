@@ -4,10 +4,11 @@ import re
 from dataclasses import dataclass
 from typing import Annotated
 
+import numpy as np
 import pytest
 from msgspec import Meta
 
-from _touch_retrieval.documents import typed
+from _touch_retrieval.documents import check_fields, typed
 
 
 @dataclass(frozen=True)
@@ -52,3 +53,37 @@ def test_tables_become_dataclasses_lists_tuples_and_whole_numbers_floats():
 def test_a_value_that_does_not_fit_is_refused_with_its_place_and_what_it_must_be(changed, said):
     with pytest.raises(ValueError, match="^" + re.escape(said)):
         typed({"gel": {"pitch_mm": 2}} | changed, Sensor, "[sensor]")
+
+
+class Refused(Exception):
+    pass
+
+
+@dataclass(frozen=True)
+class Lamp:
+    watts: Annotated[float, Meta(gt=0)]
+    gel: Gel | None = None
+
+    def __post_init__(self):
+        check_fields(self, "lamp", Refused)
+
+
+def test_fields_given_in_python_are_checked_and_converted_as_those_of_a_document():
+    lamp = Lamp(np.int64(3), Gel(2.0))
+    assert (lamp, type(lamp.watts)) == (Lamp(3.0, Gel(2.0)), float)
+    for make in (lambda watts: Lamp(watts), lambda watts: typed({"watts": watts}, Lamp, "lamp", error=Refused)):
+        with pytest.raises(Refused, match=r"^lamp\.watts must be a number > 0\.0, got -1$"):
+            make(-1)
+        with pytest.raises(Refused, match=r"^lamp\.watts must be a finite number"):
+            make(float("nan"))
+
+
+def test_a_table_may_have_to_be_complete_down_to_the_tables_in_it():
+    gel = {"pitch_mm": 2, "markers": 0}
+    assert typed({"watts": 1, "gel": gel}, Lamp, "lamp", complete=True) == Lamp(1.0, Gel(2.0))
+    with pytest.raises(ValueError, match=r"^lamp must hold watts, gel; gel is missing$"):
+        typed({"watts": 1}, Lamp, "lamp", complete=True)
+    with pytest.raises(ValueError, match=r"^lamp\.gel must hold pitch_mm, markers; markers is missing$"):
+        typed({"watts": 1, "gel": {"pitch_mm": 2}}, Lamp, "lamp", complete=True)
+    with pytest.raises(ValueError, match=r"^lamp\.gel has no setting 'x'"):
+        typed({"watts": 1, "gel": gel | {"x": 1}}, Lamp, "lamp")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from retrieval.errors import BadInput, CheckpointError, NumericalError
-from retrieval.model.towers.files import State, download
+from retrieval.model.towers.weights import State, download
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)

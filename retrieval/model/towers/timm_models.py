@@ -8,7 +8,7 @@ from torch import Tensor
 
 from retrieval.errors import CheckpointError, ConfigError
 from retrieval.model.towers.base import TowerFamily, stage_statistics
-from retrieval.model.towers.files import State
+from retrieval.model.towers.weights import State
 
 
 class TimmTower(TowerFamily):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from retrieval.errors import CheckpointError, ConfigError
 from retrieval.model.towers.base import TowerFamily, stage_statistics
-from retrieval.model.towers.files import State
+from retrieval.model.towers.weights import State
 
 log = logging.getLogger(__name__)
 DEPTHS = 4

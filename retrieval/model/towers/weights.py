@@ -3,21 +3,25 @@
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.error import URLError
 
 import torch
+from torch import Tensor
 
 from retrieval.errors import CheckpointError
 from retrieval.model.towers import TOGETHER
-from retrieval.model.towers.base import Tower
-from retrieval.model.towers.files import State, read_state
-from retrieval.model.towers.side_by_side import SideBySide
 
+if TYPE_CHECKING:
+    from retrieval.model.towers.base import Tower
+
+State = dict[str, Tensor]
 SHIPPED = "shipped"
 """In place of first weights: those of the checkpoint that comes with the package."""
 log = logging.getLogger(__name__)
 
 
-def initialise_tower(tower: Tower, init: str, shipped: Callable[[], State] | None = None) -> None:
+def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | None = None) -> None:
     """Give `tower` its first weights.
 
     init: "random" leaves it as built, "imagenet" takes the weights that are published for it (`Tower.published`),
@@ -25,6 +29,8 @@ def initialise_tower(tower: Tower, init: str, shipped: Callable[[], State] | Non
     the tower's key names, which are torchvision's for our own. Towers side by side take one for all of them, or as
     many, joined alike. Raises CheckpointError where a file is missing, damaged or of another architecture.
     """
+    from retrieval.model.towers.side_by_side import SideBySide  # a tower, which imports this module
+
     if init == "random":
         return
     if isinstance(tower, SideBySide):
@@ -43,7 +49,7 @@ def initialise_tower(tower: Tower, init: str, shipped: Callable[[], State] | Non
     load_tower_state(tower, state, f"the published {type(tower).__name__}" if init == "imagenet" else init)
 
 
-def load_tower_state(tower: Tower, state: State, source: str) -> None:
+def load_tower_state(tower: "Tower", state: State, source: str) -> None:
     """Load `state` into `tower`: every layer must fit, save that either side may lack an optional one."""
     state = tower.rename_state(state)
     wanted = tower.state_dict()
@@ -62,3 +68,42 @@ def load_tower_state(tower: Tower, state: State, source: str) -> None:
     if any(key.startswith(classes) and key not in state for key in wanted):
         log.warning("%s has no 1000-way layer; that layer starts random", source)
     tower.load_state_dict({key: state.get(key, value) for key, value in wanted.items()})
+
+
+def read_state(path: Path) -> State:
+    """Read a state dict without unpickling anything but tensors."""
+    if not path.is_file():
+        raise CheckpointError(f"initial weights must be a file; there is none at {path}")
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # third-party loaders raise a dozen kinds; each means the same to the user
+        # What PyTorch says is long, and advises to unpickle the file after all.
+        raise CheckpointError(f"{path} is not a readable state dict ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
+        raise CheckpointError(f"{path} must hold a plain state dict (name -> tensor); got {type(state).__name__}")
+    return dict(state)
+
+
+def download(url: str) -> State:
+    """Read a published state dict, fetched once into PyTorch's cache. The eight digits in its name begin its SHA-256,
+    and the download is checked against them. Raises CheckpointError."""
+    path = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
+    if path.is_file():
+        return read_state(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    log.warning("downloading %s to %s", url, path)
+    try:
+        torch.hub.download_url_to_file(url, str(path), hash_prefix=path.stem.rsplit("-", 1)[1], progress=True)
+    except (URLError, OSError) as error:
+        raise CheckpointError(
+            f"ImageNet weights could not be downloaded ({error}); fetch {url} elsewhere and put it at {path}"
+        ) from error
+    except RuntimeError as error:  # torch reports a wrong hash so
+        raise CheckpointError(f"the download of {url} is damaged ({error}); try again") from error
+    return read_state(path)

@@ -37,8 +37,7 @@ BATCH = 16
 READ = 32
 """Files that a thread reads at a time: the overhead of a task is a tenth of the time to read and hash a photo."""
 MANY = 256
-"""New photos from which on a faster encoder is tried, which takes as long as encoding a hundred, and compiled code
-that resizes is loaded."""
+"""New photos from which on a faster encoder is tried, which takes as long as encoding a hundred."""
 HELD = 256
 """Reused codes in one part, at most, so that little memory waits between the threads."""
 EMBEDDED, RENAMED, REMADE, RESUMED = "embedded", "renamed", "remade", "resumed"
@@ -167,12 +166,9 @@ class Embedder:
         """
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
-        if len(catalogue.photos) - (self.parent.count if self.parent else 0) >= MANY:
-            from retrieval.data.photo_resize import resize_photo
-
-            self._see = partial(self._see, resize=resize_photo)
-            if next(self.checkpoint.matcher.parameters()).device.type == "cpu":
-                self._encode_photos = fastest(self.checkpoint)
+        new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
+        if new >= MANY and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
+            self._encode_photos = fastest(self.checkpoint)
         found = ahead(partial(self._find, catalogue), _steps(catalogue.photos, known, kept), threads, 2 * threads)
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
             for part in ahead(self._encode, _full(found), threads, 2 * threads):

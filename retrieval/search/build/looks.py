@@ -98,7 +98,7 @@ def _is_row(photo: CataloguePhoto, parent: Generation, number: int) -> bool:
     try:
         row = json.loads(parent.rows.line(number))
         said = {**row, "metadata": repr(row["metadata"])}  # 1, 1.0 and true are equal, and not the same
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError):
         return False
     return bool(said == row_of(photo, row.get("digest")) | {"metadata": repr(photo.metadata)})
 

@@ -116,7 +116,7 @@ class Objects:
         if top < len(near):  # and all that equal the least of them
             near = np.flatnonzero(judged.logits >= np.partition(judged.logits, -top)[-top])
         logits = judged.logits[near]
-        if len(np.unique(logits)) == len(near):  # no tie asks for names, for which rows are parsed
+        if len(set(logits.tolist())) == len(near):  # no tie asks for names, for which rows are parsed
             order = np.argsort(-logits)
         else:
             names = np.array([listed_photo(self._rows[row]).object_id for row in judged.rows[near]])

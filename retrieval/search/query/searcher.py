@@ -382,7 +382,7 @@ def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
         return NO_CONTACT
     if belief is None:
         return UNCALIBRATED
-    return MATCH if belief.objects.max() > belief.none else NONE_OF_THESE
+    return MATCH if belief.is_match else NONE_OF_THESE
 
 
 def require_counts(top: int, candidates: int | None) -> None:

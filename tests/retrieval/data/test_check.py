@@ -41,6 +41,10 @@ class Broken:
     def file(self, number, column):
         return self.folder / self.rows[number][f"{column}_file_name"]
 
+    def names(self, numbers):
+        """The grasps of these lines."""
+        return tuple(self.rows[number]["grasp_id"] for number in numbers)
+
     def findings(self, split=None):
         return remarks(self.folder, split)
 

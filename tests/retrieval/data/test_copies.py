@@ -60,19 +60,6 @@ def test_a_changed_copy_is_nearer_than_its_limit_and_no_other_picture_is(change)
     assert found.checked.all()
 
 
-def test_a_hash_of_the_whole_picture_sees_the_gel_that_all_touches_share():
-    """64 bits of the lowest cosines: other objects' light touches are no farther than a copy."""
-
-    def bits(image):
-        low = cv2.dct(cv2.resize(image.mean(axis=2), (32, 32), interpolation=cv2.INTER_AREA))[:8, :8].ravel()
-        return low > np.median(low)
-
-    images = [0.2 * scene(seed) + 0.8 * scene(99) for seed in range(12)]
-    copy = np.roll(images[0], (2, 2), axis=(0, 1))
-    others = [np.count_nonzero(bits(images[0]) != bits(image)) for image in images[1:]]
-    assert np.count_nonzero(bits(images[0]) != bits(copy)) >= min(others)
-
-
 def test_without_pictures_there_is_nothing_to_find():
     nothing = np.zeros(0, dtype=np.int64)
     assert len(pictures([]).nearest(nothing, nothing).row) == 0

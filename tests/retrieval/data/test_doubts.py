@@ -26,10 +26,6 @@ def broken(felt, tmp_path):
     return Broken(felt, tmp_path / "r")
 
 
-def names(broken, numbers):
-    return tuple(broken.rows[number]["grasp_id"] for number in numbers)
-
-
 def exchange(*columns):
     """A change of a line: files of the columns, in pairs, exchanged."""
 
@@ -82,7 +78,7 @@ def test_grasps_whose_fingers_are_swapped_are_named(broken, numbers):
     broken.change(numbers, exchange("touch_a", "touch_b", "touch_a_before", "touch_b_before"))
     touch, untouched = broken.findings()
     for finding in (touch, untouched):
-        assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-fingers", names(broken, numbers))
+        assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-fingers", broken.names(numbers))
     assert touch.message.startswith(f"fingers a and b look swapped (touch) in {len(numbers)} of 48 grasps: ")
 
 
@@ -97,7 +93,7 @@ def test_fingers_of_one_look_cannot_be_checked_and_none_is_called_swapped():
 def test_grasps_whose_touch_stands_for_the_untouched_gel_are_named(broken, numbers):
     broken.change(numbers, exchange("touch_a", "touch_a_before", "touch_b", "touch_b_before"))
     (finding,) = broken.findings()
-    assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-moments", names(broken, numbers))
+    assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-moments", broken.names(numbers))
 
 
 def test_touches_and_untouched_gels_swapped_throughout_are_found(broken):
@@ -202,7 +198,7 @@ def test_a_touch_made_from_its_own_photo_is_named(broken):
         cv2.imwrite(str(broken.file(number, "touch_b")), photo)
     found = [finding for finding in broken.findings() if finding.kind in ("same-modality", "swapped-fingers")]
     assert {finding.severity for finding in found} == {"error"}
-    assert {name for finding in found for name in finding.grasps} == set(names(broken, numbers))
+    assert {name for finding in found for name in finding.grasps} == set(broken.names(numbers))
 
 
 COPIES = {
@@ -236,7 +232,7 @@ def test_near_copies_of_another_object_are_named(broken, how):
         kind for kind in ("photo", "touch a", "touch b") if any(f"({kind})" in one.message for one in found)
     } >= found_in(how)
     for finding in found:
-        assert set(finding.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
+        assert set(finding.message.split(": ")[1].split(" and ")) == set(broken.names((3, 20)))
     (note,) = (finding for finding in check_recording(broken.folder) if finding.kind == "compared-copies")
     assert "(touch a)" in note.message
 
@@ -251,7 +247,7 @@ def test_a_photo_that_was_moved_by_several_pixels_is_a_near_copy(broken, by):
     cv2.imwrite(str(broken.file(20, "photo")), copy)
     (found,) = (finding for finding in broken.findings() if finding.kind == "near-copy")
     assert found.severity == "error"
-    assert set(found.message.split(": ")[1].split(" and ")) == set(names(broken, (3, 20)))
+    assert set(found.message.split(": ")[1].split(" and ")) == set(broken.names((3, 20)))
 
 
 def test_a_check_ends_by_saying_in_how_many_pictures_copies_were_looked_for_and_why_not_in_the_others(broken, capsys):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.data.labelled_pairs import pair_by_label
+from retrieval.data.labelled import pair_by_label
 from retrieval.errors import DatasetError
 
 RIBS = {"relief": "ribs", "shape": "tube", "pitch_mm": 4.0, "amplitude_mm": 1.0, "aspect": 1.5, "sharpness": 0.3}

@@ -25,10 +25,6 @@ def broken(clean, tmp_path):
     return Broken(clean, tmp_path / "r")
 
 
-def names(broken, numbers):
-    return tuple(broken.rows[number]["grasp_id"] for number in numbers)
-
-
 # Dead and repeated frames ------------------------------------------------------------------------------------
 
 
@@ -40,7 +36,7 @@ def test_dead_frames_are_named(broken, column, what, level):
     for number in (4, 17):
         cv2.imwrite(str(broken.file(number, column)), np.full((120, 160, 3), level, np.uint8))
     (finding,) = [finding for finding in broken.findings() if finding.kind == "dead-frame"]
-    assert (finding.severity, finding.grasps) == ("error", names(broken, (4, 17)))
+    assert (finding.severity, finding.grasps) == ("error", broken.names((4, 17)))
     assert finding.message.startswith(f"{what} is of one colour alone, a dead frame, in 2 of 24 grasps: ")
 
 
@@ -50,14 +46,14 @@ def test_a_dead_frame_with_what_jpeg_adds_is_dead_and_a_dark_one_with_noise_is_n
     assert [finding for finding in broken.findings() if finding.kind == "dead-frame"] == []
     cv2.imwrite(str(broken.file(2, "photo")), np.full((120, 160, 3), (3, 90, 201), np.uint8))  # a .jpg
     (finding,) = [finding for finding in broken.findings() if finding.kind == "dead-frame"]
-    assert finding.grasps == names(broken, (2,))
+    assert finding.grasps == broken.names((2,))
 
 
 def test_a_frozen_sensor_whose_touch_is_the_frame_before_is_named(broken):
     broken.file(5, "touch_b").write_bytes(broken.file(5, "touch_b_before").read_bytes())
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("error", "frozen-frame")
-    assert message == f"touch and untouched gel are the same image in 1 of 24 grasps: {names(broken, (5,))[0]}"
+    assert message == f"touch and untouched gel are the same image in 1 of 24 grasps: {broken.names((5,))[0]}"
 
 
 def test_a_touch_repeated_within_an_object_is_a_warning_and_a_shared_photo_is_none(broken):
@@ -66,7 +62,7 @@ def test_a_touch_repeated_within_an_object_is_a_warning_and_a_shared_photo_is_no
     broken.file(4, "photo").write_bytes(broken.file(3, "photo").read_bytes())
     (finding,) = broken.findings()
     assert (finding.severity, finding.kind) == ("warning", "repeated-touch")
-    assert finding.grasps == names(broken, (3, 5))
+    assert finding.grasps == broken.names((3, 5))
 
 
 # Backgrounds -------------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
 
 import indexes
 import retrieval
@@ -115,10 +115,7 @@ def test_a_weight_that_float16_cannot_hold_is_refused_before_a_file_is_there(tmp
 def test_a_checkpoint_without_split_posterior_and_gel_check_says_none(tmp_path):
     save(tmp_path / "m.safetensors", split=None, posterior=None)
     loaded = load_checkpoint(tmp_path / "m.safetensors")
-    assert loaded.split is None
-    assert loaded.posterior is None
-    assert loaded.gel_check is None
-    assert loaded.matcher.gel_head is None
+    assert (loaded.split, loaded.posterior, loaded.gel_check, loaded.matcher.gel_head) == (None,) * 4
 
 
 def test_the_check_of_gel_images_comes_back_with_its_layer_and_is_known_without_the_weights(tmp_path):
@@ -215,18 +212,13 @@ def test_the_model_card_says_what_the_model_is(saved):
     ]
 
 
-def test_the_model_card_says_what_the_check_of_gel_images_refuses(tmp_path):
-    save(tmp_path / "m.safetensors", gel_check=GEL_CHECK)
-    last = (tmp_path / "m.md").read_text().splitlines()[-1]
-    assert last == "* Check of gel images, on validation objects: touches called foreign 0.062"
-
-
 def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
     save(tmp_path / "m.safetensors", split=None, posterior=None, provenance=PROVENANCE | {"metrics": {}})
     card = (tmp_path / "m.md").read_text()
-    assert "Objects" not in card
-    assert "Probabilities" not in card
-    assert "Check of gel images" not in card
+    assert not any(word in card for word in ("Objects", "Probabilities", "Check of gel images"))
+    save(tmp_path / "m.safetensors", gel_check=GEL_CHECK)
+    last = (tmp_path / "m.md").read_text().splitlines()[-1]
+    assert last == "* Check of gel images, on validation objects: touches called foreign 0.062"
 
 
 @pytest.mark.parametrize("name", ["m.md", "m.txt", "m"])
@@ -246,14 +238,6 @@ def test_no_file_and_a_folder_are_told_apart(tmp_path):
         load_checkpoint(tmp_path)
 
 
-@pytest.mark.parametrize("share", [0.0, 1e-6, 0.001, 0.3, 0.9, 0.999999])
-def test_a_truncated_checkpoint_is_called_so(saved, share):
-    data = saved.read_bytes()
-    saved.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(CheckpointError, match=r"m\.safetensors is not a readable \.safetensors file .*truncated"):
-        load_checkpoint(saved)
-
-
 def small_file(folder):
     state = {"weight": torch.tensor([1.5, -2.0, 0.25]), "steps": torch.tensor(7)}
     write_tensors(folder / "t.safetensors", state, {"split": {"train": ["mug"]}, "best": 0.125, "lr": 1e-05})
@@ -265,7 +249,7 @@ def test_a_file_cut_at_any_length_is_refused(tmp_path):
     data = path.read_bytes()
     for length in range(0, len(data), 3):
         path.write_bytes(data[:length])
-        with pytest.raises(CheckpointError):
+        with pytest.raises(CheckpointError, match=r"t\.safetensors is not a readable \.safetensors file .*truncated"):
             read_tensors(path)
 
 
@@ -296,45 +280,50 @@ def loads_naively(path):
         return False
 
 
-def test_a_flipped_bit_in_a_weight_is_called_damage(saved):
-    data = bytearray(saved.read_bytes())
-    data[-1001] ^= 4
-    saved.write_bytes(data)
-    with pytest.raises(CheckpointError, match="is damaged: its checksum does not fit; restore the file or train again"):
-        load_checkpoint(saved)
+def with_header(text):
+    """The bytes of a well-formed file with that text where our header stands; None: without one."""
+    return safetensors.torch.save({"weight": torch.ones(2)}, None if text is None else {"touch_retrieval": text})
 
 
-def test_weights_of_others_are_sent_to_init(tmp_path):
-    save_file({"layer.weight": torch.ones(2)}, tmp_path / "foreign.safetensors")
-    with pytest.raises(CheckpointError, match=r"holds weights but not our header; .*`retrieve train --init`"):
-        load_checkpoint(tmp_path / "foreign.safetensors")
-    save_file({"layer.weight": torch.ones(2)}, tmp_path / "foreign.safetensors", {"format": "pt"})
-    with pytest.raises(CheckpointError, match="not our header"):
-        load_checkpoint(tmp_path / "foreign.safetensors")
+FOREIGN = r"holds weights but not our header; .*`retrieve train --init`"
+DEEP = '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}"
+OTHERS = {
+    "no header": (with_header(None), FOREIGN),
+    "no tensors": (b"\x08" + bytes(7) + b"{}      ", FOREIGN),
+    "another header": (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
+    **{
+        repr(content): (content, r"m\.safetensors is not a readable \.safetensors file .*truncated")
+        for content in (b"", b"\x80\x04\x95", b"PK\x03\x04", b"text\n" * 99)
+    },
+    **{
+        text: (with_header(text), r"header of .*m\.safetensors is damaged")
+        for text in (
+            "",
+            "{",
+            "[]",
+            "3",
+            '"format"',
+            "{}",
+            "null",
+            "[" * 100_000,
+            '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}",
+        )
+    },
+    **{
+        f"format {version}": (
+            with_header(json.dumps({"format": version, "software": "9.9"})),
+            rf"has checkpoint format {version}, this version reads 1; install the touch-retrieval that wrote it "
+            r"\(9\.9\)",
+        )
+        for version in (0, 2, "1", None)
+    },
+}
 
 
-@pytest.mark.parametrize("content", [b"\x80\x04\x95", b"PK\x03\x04", b"\x08" + bytes(7) + b"{}      ", b"text\n" * 99])
-def test_other_files_are_not_taken_for_a_checkpoint(tmp_path, content):
+@pytest.mark.parametrize(("content", "said"), OTHERS.values(), ids=[name[:20] for name in OTHERS])
+def test_a_file_that_is_no_checkpoint_of_this_version_is_called_what_it_is(tmp_path, content, said):
     (tmp_path / "m.safetensors").write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"m\.safetensors"):
-        load_checkpoint(tmp_path / "m.safetensors")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", '"format"', "{}", "null"])
-def test_a_damaged_header_is_called_so(tmp_path, text):
-    save_file({"weight": torch.ones(2)}, tmp_path / "m.safetensors", {"touch_retrieval": text})
-    with pytest.raises(CheckpointError, match=r"header of .*m\.safetensors is damaged"):
-        load_checkpoint(tmp_path / "m.safetensors")
-
-
-@pytest.mark.parametrize("version", [0, 2, "1", None])
-def test_another_format_names_both_versions_and_the_software(tmp_path, version):
-    text = json.dumps({"format": version, "software": "9.9"})
-    save_file({"weight": torch.ones(2)}, tmp_path / "m.safetensors", {"touch_retrieval": text})
-    message = (
-        rf"has checkpoint format {version}, this version reads 1; install the touch-retrieval that wrote it \(9\.9\)"
-    )
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(CheckpointError, match=said):
         load_checkpoint(tmp_path / "m.safetensors")
 
 
@@ -358,17 +347,29 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"config": {"matcher": {"colour": 1}}}, r"unknown setting 'colour' in \[matcher\]"),
+        ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; it knows"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
-        ({"config": [1]}, "configuration must be tables"),
-        ({"split": {"train": ["a"]}}, "a split must be"),
-        ({"split": []}, "a split must be"),
-        ({"posterior": {"slope": 1.0}}, "a posterior must hold dependence, offset, slope, tests and the formula"),
-        ({"posterior": POSTERIOR.to_dict() | {"formula": "another"}}, "the formula of this version"),
-        ({"posterior": POSTERIOR.to_dict() | {"slope": None}}, "must hold finite numbers; slope is None"),
-        ({"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}}, "a dependence within 0 and 1; got 1.25 and 1.5"),
-        ({"gel_check": {"shares": {}}}, "a check of gel images must hold foreign_above, contact_above, level_above"),
-        ({"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}}, "must hold finite numbers; level_above is '1'"),
+        ({"config": [1]}, "it must be a table"),
+        ({"split": {"train": ["a"]}}, "split must hold seed, train, validation, test; validation is missing"),
+        ({"split": []}, "split must be a table"),
+        (
+            {"posterior": {"slope": 1.0}},
+            "posterior must hold formula, slope, offset, dependence, tests; formula is missing",
+        ),
+        (
+            {"posterior": POSTERIOR.to_dict() | {"formula": "another"}},
+            "posterior.formula is not the one of this version",
+        ),
+        ({"posterior": POSTERIOR.to_dict() | {"slope": None}}, "posterior.slope must be a number, got None"),
+        (
+            {"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}},
+            "posterior.dependence must be a number <= 1.0, got 1.5",
+        ),
+        ({"gel_check": {"shares": {}}}, "gel_check must hold foreign_above, contact_above, level_above"),
+        (
+            {"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}},
+            "gel_check.level_above must be a number or nothing, got '1'",
+        ),
     ],
 )
 def test_a_header_of_another_version_is_refused_by_what_is_in_it(saved, entry, message):
@@ -417,13 +418,6 @@ def test_a_write_that_fails_leaves_the_old_checkpoint_and_nothing_beside_it(save
     assert saved.read_bytes() == before
     assert sorted(os.listdir(saved.parent)) == files == ["m.md", "m.safetensors"]
     assert load_checkpoint(saved).provenance["step"] == 4
-
-
-def test_a_first_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
-    monkeypatch.setattr("os.fsync", fail(OSError(5, "Input/output error")))
-    with pytest.raises(OSError, match="Input/output error"):
-        save(tmp_path / "m.safetensors")
-    assert os.listdir(tmp_path) == []
 
 
 def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch):

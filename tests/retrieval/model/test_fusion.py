@@ -167,12 +167,6 @@ def test_a_logit_that_is_not_finite_is_an_error_where_sorting_would_rank_it_firs
         score_halves(small_head(), torch.randn(1, 32), photos)
 
 
-def test_ranking_float32_probabilities_ties_where_logits_do_not():
-    logits = torch.tensor([17.5, 18.0, 25.0])
-    assert len(torch.sigmoid(logits).unique()) == 1  # naive: all are exactly 1
-    assert torch.argsort(logits, descending=True).tolist() == [2, 1, 0]
-
-
 def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():
     """Convolutions in training take longer where they lie in memory channel by channel."""
     matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8), views=2)

@@ -11,8 +11,7 @@ from torch import nn
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.towers import TOWERS, build_tower, tower_name
 from retrieval.model.towers.base import Tower, stage_statistics
-from retrieval.model.towers.files import read_state
-from retrieval.model.towers.weights import initialise_tower, load_tower_state
+from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 
 # ResNet-18 and -50 are made of the two kinds of block that there are.
@@ -98,29 +97,19 @@ def test_a_tower_has_the_published_number_of_parameters(name, parameters, pooled
     assert build_tower(name).feature_count == pooled
 
 
-def test_resnet_has_the_key_names_of_published_checkpoints():
-    keys = build_tower("resnet50", "classes").state_dict()
-    for key in (
-        "conv1.weight",
-        "layer1.0.downsample.1.running_var",
-        "layer4.2.bn3.num_batches_tracked",
-        "fc.bias",
-    ):
-        assert key in keys
+PUBLISHED = {
+    "resnet50": (320, "conv1.weight layer1.0.downsample.1.running_var layer4.2.bn3.num_batches_tracked fc.bias"),
+    "mobilenet_v2": (314, "features.0.0.weight features.1.conv.0.0.weight features.2.conv.3.bias classifier.1.weight"),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_tower_has_the_key_names_of_published_checkpoints(name):
+    count, some = PUBLISHED[name]
+    keys = build_tower(name, "classes").state_dict()
+    assert set(some.split()) <= set(keys)
+    assert len(keys) == count
     assert "layer1.0.downsample.0.weight" not in build_tower("resnet18").state_dict()
-    assert len(keys) == 320
-
-
-def test_mobilenet_has_the_key_names_of_published_checkpoints():
-    keys = build_tower("mobilenet_v2", "classes").state_dict()
-    for key in (
-        "features.0.0.weight",
-        "features.1.conv.0.0.weight",
-        "features.2.conv.3.bias",
-        "classifier.1.weight",
-    ):
-        assert key in keys
-    assert len(keys) == 314
 
 
 @every_tower
@@ -287,15 +276,6 @@ def test_stage_statistics_are_those_of_each_map_side_by_side():
     second = torch.full((1, 1, 1, 3), 7.0)  # constant
     wanted = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
     torch.testing.assert_close(stage_statistics([first, second]), wanted)
-
-
-def test_a_constant_map_has_a_finite_gradient():
-    x = torch.ones(1, 1, 2, 2, requires_grad=True)
-    x.var((2, 3), correction=0).sqrt().sum().backward()
-    assert torch.isnan(x.grad).all()  # the naive deviation
-    x.grad = None
-    stage_statistics([x]).sum().backward()
-    assert torch.isfinite(x.grad).all()
 
 
 def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_path):
