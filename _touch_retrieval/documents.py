@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -49,7 +49,13 @@ def typed(document: Any, kind: type[T], name: str = "") -> T:
 
 
 def _require_known(document: Any, kind: Any, name: str) -> None:
-    if not (is_dataclass(kind) and isinstance(document, Mapping)):
+    if not is_dataclass(kind):
+        parts = document.values() if isinstance(document, Mapping) else document if isinstance(document, list) else ()
+        for inner in filter(is_dataclass, get_args(kind)):
+            for part in parts:
+                _require_known(part, inner, name)
+        return
+    if not isinstance(document, Mapping):
         return
     hints, known = get_type_hints(kind), [each.name for each in fields(kind) if each.init]
     for key, value in document.items():

@@ -10,13 +10,12 @@
       vectors.faiss       the structure of the index, for kinds that have one
       NAME.json           documents; NAME.npy those that are arrays, of no row
     LOCK                  held by the writer
-    seen.records          how the files behind the rows looked, of no generation (`indexes.store.seen`)
-    seen.folders          and what folders held that looked so (`indexes.store.seen_folders`)
-    unfinished/           what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
+    files.stat            the stat cache of the files behind the rows, of no generation (`indexes.store.stat_cache`)
+    folders.stat          and of their folders
+    unfinished.sqlite     what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
 
 A generation is written whole and stands alone: its folder and a CURRENT are an index, wherever they are copied to. One
-made from a parent copies what it keeps of the parent's rows: a million photos (1 GB) in 2 to 7 seconds. This is format
-3; format 2 is read as well (`indexes.store.older`).
+made from a parent copies what it keeps of the parent's rows: a million photos (1 GB) in 2 to 7 seconds.
 
 One writer, many readers. A writer killed at any moment leaves the old or the new generation current, whole;
 the next writer sweeps up what the killed one left.

@@ -24,7 +24,6 @@ from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, check_k, row_norms
 from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
-from indexes.store.older import joined, table_files
 from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
@@ -134,7 +133,7 @@ class Generation:
 
     def matching_keys(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
         """As `matching`, for the keys (n,) of ids and digests."""
-        numbers = self.rows.find_keys(ids)
+        numbers = self.rows.by_id.find(ids)
         same = (digests != b"") & (digests == self._digests[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
@@ -235,13 +234,13 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         _check_counts(manifest, rows.table, embeddings)
         if verify:
             _check_vectors(folder, embeddings)
-            _check_rows(folder, rows.table)
+            if not are_distinct(rows.keys("id")):
+                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
         kind = load_kind(manifest.kind)
         index = kind.load(
             folder / STRUCTURE if kind.structure_file else None,
             embeddings,
             kind.parameters_from(manifest.parameters),
-            covered=manifest.counts.structure_slots,
             seed=manifest.seed,
             threads=threads,
         )
@@ -268,38 +267,27 @@ def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
 
 
 def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:
-    """The rows, per-row arrays and embeddings; memory-mapped, but those of a grown generation of format 2."""
-    tables = {name: [folder / file for file in files] for name, files in table_files(manifest).items()}
-    if lacking := sorted({path.name for paths in tables.values() for path in paths} - set(manifest.files)):
+    """The rows, per-row arrays and embeddings, memory-mapped."""
+    files = {ROWS, TABLE, EMBEDDINGS, *(f"{name}.npy" for name in manifest.arrays)}
+    if lacking := sorted(files - set(manifest.files)):
         raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
     # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
-    texts = [np.asarray(np.memmap(path, np.uint8, "r")) for path in tables.pop("rows")]
-    parts = {name: [mapped(path) for path in paths] for name, paths in tables.items()}
-    text, whole = joined(folder, manifest, texts, parts)
-    table, embeddings = np.asarray(whole.pop("table")), whole.pop("embeddings")
-    must = {"fields": RECORD} | dict.fromkeys(whole, len(table))
-    got = {"fields": table.dtype} | {name: len(array) for name, array in whole.items()}
+    text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(mapped(folder / TABLE))
+    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.arrays}
+    must = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
+    got = {"fields": table.dtype} | {name: len(array) for name, array in arrays.items()}
     if got != must:
         raise CorruptIndex(f"{folder}: the tables must hold {must}, hold {got}; {AGAIN}")
-    starts, stops = table["start"], table["stop"]
-    if starts.min() < 0 or stops.max() > len(text) or not (starts < stops).all():
-        raise CorruptIndex(f"{folder}: the lines of {ROWS} must lie in its text, and do not; {AGAIN}")
-    return Rows(text, table), whole, embeddings
+    stops = table["stop"]
+    if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
+        raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
+    return Rows(text, table), arrays, mapped(folder / EMBEDDINGS)
 
 
 def _check_vectors(folder: Path, embeddings: Floats) -> None:
     for start in range(0, len(embeddings), BLOCK_ROWS):
         if not (np.abs(row_norms(embeddings[start : start + BLOCK_ROWS]) - 1.0) <= NORM_TOLERANCE).all():
             raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
-
-
-def _check_rows(folder: Path, table: NDArray[Any]) -> None:
-    """No row comes twice: neither two with one id, nor two with the same bytes of the text."""
-    if not are_distinct(np.ascontiguousarray(table["id"])):
-        raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
-    starts, stops = np.sort(table["start"]), np.sort(table["stop"])
-    if (starts[1:] < stops[:-1]).any():
-        raise CorruptIndex(f"{folder}: the lines of the rows must not overlap, two do; {AGAIN}")
 
 
 def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:

@@ -23,7 +23,7 @@ from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_
 MOST_TOMBSTONES = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
 
-RESERVED = {"rows", "table", "order", "embeddings", "vectors", "manifest"}
+RESERVED = {"rows", "table", "embeddings", "vectors", "manifest"}
 
 Layouts: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
 """Name of a per-row array -> its dtype, and the shape of one row of it."""
@@ -119,17 +119,10 @@ class TableWriter:
         for name, file in (self._arrays or {}).items():
             for start in range(span.start, span.stop, BLOCK_ROWS):
                 file.append(parent.arrays[name][start : min(start + BLOCK_ROWS, span.stop)])
-        records = parent.rows.table[span].copy()
-        first, last = int(records["start"][0]), int(records["stop"][-1])
-        if (records["start"][1:] == records["stop"][:-1]).all():
-            shift = self._text.tell() - first
-            self._text.write(parent.rows.text[first:last].data)
-            records["start"] += shift
-            records["stop"] += shift
-        else:  # of a grown generation of format 2
-            lines = [parent.rows.line(number) + b"\n" for number in numbers]
-            self._place(records, lines)
-            self._text.writelines(lines)
+        records, first = parent.rows.table[span].copy(), parent.rows.start(numbers.start)
+        text = parent.rows.text[first : int(records["stop"][-1])]
+        records["stop"] += self._text.tell() - first
+        self._text.write(text.data)
         self._records.append(records)
 
     def close(self) -> Tables:
@@ -222,23 +215,18 @@ class TableWriter:
             if self.parent is not None and same.any():
                 records[name][same] = self.parent.rows.table[name][numbers[same]]
             records[name][~same] = keys_of(rows[place].get(name) for place in np.flatnonzero(~same).tolist())
-        self._place(records, lines)
+        records["stop"] = self._text.tell() + np.cumsum([len(line) for line in lines])
         self._text.writelines(lines)
         self._records.append(records)
-
-    def _place(self, records: NDArray[Any], lines: Sequence[bytes]) -> None:
-        """Say where lines will stand that are written next."""
-        records["stop"] = self._text.tell() + np.cumsum([len(line) for line in lines])
-        records["start"] = np.concatenate([[self._text.tell()], records["stop"][:-1]])
 
     def _check_distinct(self, table: NDArray[Any]) -> None:
         keys = np.ascontiguousarray(table["id"])
         if are_distinct(keys):
             return
         order = np.argsort(keys, kind="stable")
-        record = table[order[int(np.argmax(keys[order][1:] == keys[order][:-1]))]]
+        number = int(order[int(np.argmax(keys[order][1:] == keys[order][:-1]))])
         with (self.folder / ROWS).open("rb") as text:
-            text.seek(int(record["start"]))
+            text.seek(int(table["stop"][number - 1]) if number else 0)
             name = json.loads(text.readline())["id"]
         raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
 

@@ -99,7 +99,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         asked=asdict(job.asked),
         seed=job.seed,
         recall=_recall(index, job),
-        counts=Counts(len(tables.slots), slots, tombstones, built_slots, index.covered),
+        counts=Counts(len(tables.slots), slots, tombstones, built_slots),
         arrays=sorted(tables.arrays),
         documents=sorted(job.documents),
         files=sealed(folder),

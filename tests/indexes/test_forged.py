@@ -94,7 +94,8 @@ def test_any_field_of_the_manifest_may_be_forged(kept, field, value):
         lambda content: content["arrays"].append("halves"),
         lambda content: content["documents"].append("../../secret"),
         lambda content: content["arrays"].append("../../secret"),
-        lambda content: content.__setitem__("segments", {"records": [1], "vectors": [1]}),
+        lambda content: content["counts"].__setitem__("records", 20),
+        lambda content: content["files"]["calibration.json"].__setitem__("colour", "red"),
         lambda content: content["counts"].__setitem__("rows", 2**70),
         lambda content: content["counts"].__setitem__("rows", True),
         lambda content: content.__setitem__("dim", 10**9),
@@ -126,17 +127,17 @@ def same(field):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("table.npy", out_of("start", -1)),
-        ("table.npy", out_of("start", 2**40)),
+        ("table.npy", out_of("stop", -1)),
         ("table.npy", out_of("stop", 2**40)),
+        ("table.npy", lambda table: table[:-1]),  # lines that no row has
         ("table.npy", lambda table: table[[0, *range(20 - 1)]]),  # two rows of one id
         ("table.npy", same("id")),
-        ("table.npy", same("start")),  # two lines overlap
+        ("table.npy", same("stop")),  # a row without a line
         ("table.npy", same("object_id")),  # of one row, to rank its object twice
         ("table.npy", out_of("slot", -1)),
         ("table.npy", out_of("slot", 10**6)),
         ("table.npy", lambda table: table[:0]),
-        ("table.npy", lambda table: table["start"]),
+        ("table.npy", lambda table: table["stop"]),
         ("halves.npy", lambda halves: halves[:7]),
         ("embeddings.npy", lambda vectors: vectors * np.float32("nan")),
         ("embeddings.npy", lambda vectors: vectors * 1000),

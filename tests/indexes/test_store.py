@@ -104,7 +104,7 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     tables = ["embeddings.npy", "rows.jsonl", "table.npy"]
     assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["format"] == 3
+    assert manifest["format"] == 4
     assert manifest["generation"] == "gen-000001"
     assert manifest["parent"] is None
     assert manifest["fingerprint"] == FINGERPRINT
@@ -113,7 +113,7 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     assert manifest["kind"] == "hnsw"
     assert manifest["metric"] == "inner_product"
     assert manifest["dim"] == DIM
-    assert manifest["counts"] == {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20, "structure_slots": 20}
+    assert manifest["counts"] == {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20}
     assert manifest["recall"]["value"] == 1.0
     assert sorted(manifest["files"]) == [name for name in found if name != "manifest.json"]
     first = json.loads((folder / "rows.jsonl").read_text().splitlines()[0])

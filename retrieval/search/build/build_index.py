@@ -14,7 +14,7 @@ from indexes.kinds.base import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
-from indexes.store.seen_folders import SeenFolders
+from indexes.store.stat_cache import FolderCache
 from indexes.store.tables import Block, Tables
 from indexes.store.unfinished import Unfinished
 from indexes.store.writing import RECALL_QUERIES, Chosen
@@ -63,7 +63,7 @@ def build_index(
     * `kind` (a name or a class), `min_recall`, `max_ms`: what is asked of the search (`retrieval.search.build.operating`);
       where all are None, exact search.
     * `verify`: list every folder and read every file, also those that look as an earlier build found them, by size,
-      times and inode (`indexes.store.seen_folders`, `retrieval.search.build.looks`).
+      times and inode (`indexes.store.stat_cache`, `retrieval.search.build.looks`).
 
     Nothing is written where neither photos, nor their objects, nor what is asked for has changed. Photos that cannot be
     read are skipped and reported. What was embedded until an error, or until the process was killed, is not embedded
@@ -77,7 +77,7 @@ def build_index(
     """
     asked, out = Asked.of(kind, min_recall, max_ms), Path(out)
     naming, note = naming_by(objects_from, _about_before(IndexStore(out)))
-    wanted, seen = Wanted(naming, asked, quiet, verify, note), SeenFolders(out, known=not verify)
+    wanted, seen = Wanted(naming, asked, quiet, verify, note), FolderCache(out, known=not verify)
     report = build_listed(list_photos(folder, naming, seen), checkpoint, out, wanted)
     seen.write()
     return report
