@@ -79,13 +79,15 @@ class FaissIndex(VectorIndex):
         fetch, effort = math.ceil(self._first_fetch(k) * dilution), 1
         pending = np.arange(len(queries))
         while pending.size and fetch < self.count:
-            with guarded("searching", 1 if len(pending) == 1 else self.threads):
-                rough, found = self._named(queries[pending], fetch, effort)
+            rough, found = self._named(queries[pending], fetch, effort)
             gridded, open_still = on_grid(queries[pending]), []
             for place, query in enumerate(pending):
-                ranked = self._rescored(gridded[place], found[place], k, live)
-                if self._settled(ranked[0], rough[place], k):
-                    scores[query], slots[query] = ranked
+                kept = found[place][found[place] >= 0]
+                kept = kept if live is None else kept[live[kept]]
+                ranked, ordered = best(grid_scores(gridded[place], on_grid(self._vectors[kept])), kept, k)
+                reach = float(rough[place].min()) + slack(self.dim)
+                if len(ranked) == k and (not self.exact or float(ranked[-1]) > reach):
+                    scores[query], slots[query] = ranked, ordered
                 else:
                     open_still.append(query)
             pending = np.array(open_still, dtype=np.int64)
@@ -100,8 +102,7 @@ class FaissIndex(VectorIndex):
         dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
         fetch = math.ceil(self._first_fetch(k) * dilution)
         if fetch < self.count:
-            with guarded("searching", 1):
-                rough, found = (row[0] for row in self._named(query, fetch, 1))
+            rough, found = (row[0] for row in self._named(query, fetch, 1))
             kept = found >= 0 if live is None else (found >= 0) & live[found]
             scores: Floats = rough[kept]
             slots: Slots = found[kept]
@@ -122,19 +123,9 @@ class FaissIndex(VectorIndex):
 
     def _named(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
-        rough, found = self._candidates(queries, fetch, effort)
+        with guarded("searching", 1 if len(queries) == 1 else self.threads):
+            rough, found = self._candidates(queries, fetch, effort)
         return rough, check_slots(found, self.count, least=-1)
-
-    def _rescored(self, query: Doubles, found: Slots, k: int, live: Mask | None) -> tuple[Floats, Slots]:
-        kept = found[found >= 0]
-        if live is not None:
-            kept = kept[live[kept]]
-        return best(grid_scores(query, on_grid(self._vectors[kept])), kept, k)
-
-    def _settled(self, scores: Floats, rough: Floats, k: int) -> bool:
-        if len(scores) < k:
-            return False
-        return not self.exact or float(scores[-1]) > float(rough.min()) + slack(self.dim)
 
     def _building_threads(self) -> int | None:
         return self.build_threads if self.threads is None else self.threads

@@ -77,18 +77,13 @@ class IndexStore:
 
         Raises `NoIndex`, `CorruptIndex`, `UnsupportedFormat`, or `MismatchedIndex` (see `indexes.errors`).
         """
-        if name is not None:
-            generation = self._read(name, verify, threads)
-            generation.require(expect or {})
-            return generation
-        name = self.current()
+        wanted = name or self.current()
         try:
-            generation = self._read(name, verify, threads)
+            generation = self._read(wanted, verify, threads)
         except CorruptIndex:
-            newer = self.current()
-            if newer == name:
+            if name is not None or self.current() == wanted:
                 raise
-            generation = self._read(newer, verify, threads)  # a writer replaced it while it was being read
+            generation = self._read(self.current(), verify, threads)  # a writer replaced it while it was being read
         generation.require(expect or {})
         return generation
 
@@ -176,7 +171,9 @@ class IndexStore:
             settle=settle,
             queries=queries,
         )
-        check_about(fingerprint, about or {})
+        json_of(job.about, "about")
+        if odd := [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]:
+            raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
         for what, number in (("self_check", self_check), ("keep", keep)):
             if not is_whole(number, 0, MOST):
                 raise ParameterError(f"{what} must be a whole number of at least 0; got {number!r}")
@@ -251,14 +248,6 @@ class IndexStore:
 def generation_name(number: int) -> str:
     """The name of a generation, such as gen-000007."""
     return f"gen-{number:06d}"
-
-
-def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> None:
-    """The fingerprint is text, and `about` JSON; or `RowError`."""
-    odd = [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]
-    if odd:
-        raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
-    json_of(dict(about), "about")
 
 
 def _discard(folder: Path) -> None:

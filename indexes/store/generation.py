@@ -1,7 +1,6 @@
 """One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from indexes.errors import (
     UnsupportedFormat,
 )
 from indexes.kinds.base import VectorIndex
-from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, check_k, row_norms
+from indexes.kinds.checks import NORM_TOLERANCE, check_k, row_norms
 from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
@@ -127,19 +126,16 @@ class Generation:
         that tie for the last place, and of an approximate kind perhaps more."""
         return [self._rows_of(slots)[1] for slots in self.index.candidates(queries, k, self._live)]
 
-    def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
-        """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
-        return self.matching_keys(keys_of(ids), keys_of(digests))
-
-    def matching_keys(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
-        """As `matching`, for the keys (n,) of ids and digests."""
+    def matching(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
+        """For the keys of each id and digest (`indexes.store.rows.keys_of`) the row (n,) that has both; -1 where there
+        is none, or no digest."""
         numbers = self.rows.by_id.find(ids)
-        same = (digests != b"") & (digests == self._digests[numbers])
+        same = (digests != b"") & (digests == self.rows.by_digest.keys[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
     def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
         """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
-        numbers = self.matching(list(wanted), wanted.values()).tolist()
+        numbers = self.matching(keys_of(wanted), keys_of(wanted.values())).tolist()
         return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
 
     def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
@@ -174,10 +170,6 @@ class Generation:
         top = self.index.search(own, k, self._live)[0][:, 0]
         must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
         return numbers[top < must]
-
-    @cached_property
-    def _digests(self) -> NDArray[np.bytes_]:
-        return self.rows.keys("digest")
 
     def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
         """The rows of the best k of k + 1 slots; where slots tie for the last place, their ids say which stays."""
@@ -233,7 +225,8 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         documents = _documents(folder, manifest)
         _check_counts(manifest, rows.table, embeddings)
         if verify:
-            _check_vectors(folder, embeddings)
+            if not (np.abs(row_norms(embeddings) - 1.0) <= NORM_TOLERANCE).all():
+                raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
             if not are_distinct(rows.keys("id")):
                 raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
         kind = load_kind(manifest.kind)
@@ -282,12 +275,6 @@ def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[A
     if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
         raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
     return Rows(text, table), arrays, mapped(folder / EMBEDDINGS)
-
-
-def _check_vectors(folder: Path, embeddings: Floats) -> None:
-    for start in range(0, len(embeddings), BLOCK_ROWS):
-        if not (np.abs(row_norms(embeddings[start : start + BLOCK_ROWS]) - 1.0) <= NORM_TOLERANCE).all():
-            raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
 
 
 def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:

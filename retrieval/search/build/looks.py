@@ -53,7 +53,7 @@ class Looked:
         if parent is None or self._verify:
             return np.full(len(self.photos), -1)
         digests = self._seen.digests(self.ids, self._looks)
-        return parent.matching_keys(self.ids, digests)
+        return parent.matching(self.ids, digests)
 
     def note(self, made: Generation) -> None:
         """Write down how files look whose content is that of the generation's rows, for the next build."""
