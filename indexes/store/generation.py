@@ -1,6 +1,7 @@
 """One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -222,8 +223,18 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     check_files(folder, manifest, verify=verify)
     try:
         rows, arrays, embeddings = _tables(folder, manifest)
-        documents = _documents(folder, manifest)
-        _check_counts(manifest, rows.table, embeddings)
+        files, names = manifest.files, manifest.documents
+        documents: dict[str, Any] = {name: mapped(folder / f"{name}.npy") for name in names if f"{name}.npy" in files}
+        most = max_document_bytes(manifest.counts.rows, documents.values())
+        documents |= {name: read_json(folder / f"{name}.json", most) for name in names if name not in documents}
+        counts, slots = manifest.counts, rows.table["slot"]
+        if slots.min() < 0 or slots.max() >= counts.slots:
+            raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, are not; {AGAIN}")
+        tombstones = counts.slots - int(np.count_nonzero(np.bincount(slots)))
+        got = {"rows": len(slots), "slots": len(embeddings), "tombstones": tombstones, "dim": embeddings.shape[1]}
+        must = {**asdict(counts), "dim": manifest.dim}
+        if any(must[name] != number for name, number in got.items()):
+            raise CorruptIndex(f"{folder}: the manifest says {must}, the files hold {got}; {AGAIN}")
         if verify:
             if not (np.abs(row_norms(embeddings) - 1.0) <= NORM_TOLERANCE).all():
                 raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
@@ -244,14 +255,6 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise
     except Exception as error:  # damaged files raise anything: OSError, ValueError, KeyError, SyntaxError
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
-
-
-def _documents(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """The documents by name, arrays first: their rows say how long the others may be."""
-    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.documents if f"{name}.npy" in manifest.files}
-    most = max_document_bytes(manifest.counts.rows, arrays.values())
-    texts = [name for name in manifest.documents if name not in arrays]
-    return arrays | {name: read_json(folder / f"{name}.json", most) for name in texts}
 
 
 def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
@@ -275,14 +278,3 @@ def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[A
     if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
         raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
     return Rows(text, table), arrays, mapped(folder / EMBEDDINGS)
-
-
-def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:
-    counts, slots = manifest.counts, table["slot"]
-    if slots.min() < 0 or slots.max() >= counts.slots:
-        raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")
-    rows, slot_count, tombstones = len(slots), len(embeddings), counts.slots - int(np.count_nonzero(np.bincount(slots)))
-    got = {"rows": rows, "slots": slot_count, "tombstones": tombstones, "components": embeddings.shape[1]}
-    must = {name: getattr(counts, name) for name in ("rows", "slots", "tombstones")} | {"components": manifest.dim}
-    if got != must:
-        raise CorruptIndex(f"{manifest.generation}: the manifest says {must}, the files hold {got}; {AGAIN}")

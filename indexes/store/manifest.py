@@ -100,7 +100,12 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
     if not isinstance(content, dict):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
-    _check_format(path, content.get("format"), version)
+    found = content.get("format")
+    if not isinstance(found, int) or isinstance(found, bool):
+        raise CorruptIndex(f"{path}: must say its format version, says {found!r}; {AGAIN}")
+    if found != version:
+        age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
+        raise UnsupportedFormat(f"{path}: has the {age} format {found}, this software reads {version}; {remedy}")
     if content.pop("sha256", None) != own_digest(content):
         raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
     del content["format"]
@@ -133,11 +138,3 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
 def own_digest(content: Mapping[str, Any]) -> str:
     """What a document says of itself under "sha256": the digest of all else in it."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _check_format(path: Path, version: object, known: int) -> None:
-    if not isinstance(version, int) or isinstance(version, bool):
-        raise CorruptIndex(f"{path}: must say its format version, says {version!r}; {AGAIN}")
-    if version != known:
-        age, remedy = ("newer", f"update the software, or {AGAIN}") if version > known else ("older", AGAIN)
-        raise UnsupportedFormat(f"{path}: has the {age} format {version}, this software reads {known}; {remedy}")

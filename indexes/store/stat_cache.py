@@ -42,7 +42,8 @@ class StatRecords:
 
     def __init__(self, index: Path) -> None:
         self._path = index / FILES
-        self.records = np.frombuffer(_read(self._path), RECORD)
+        body = _read(self._path)
+        self.records = np.frombuffer(body, RECORD, count=len(body) // RECORD.itemsize)
 
     def digests(self, ids: Keys, statuses: Statuses) -> Keys:
         """For each file, by its row's id and its status (N, 4), the key of its content's digest; b"" where the status

@@ -88,7 +88,7 @@ class TableWriter:
         """Take the next rows. Raises `RowError`, `VectorError` or `MismatchedIndex`, naming the row."""
         if not block.rows:
             raise RowError("a block must hold at least one row; got none")
-        ids = [row.get("id") for row in block.rows]
+        ids: list[Any] = [row.get("id") for row in block.rows]
         if odd := [name for name in ids if not isinstance(name, str) or not name]:
             raise RowError(f"every row needs a text id; row {ids.index(odd[0])} has {odd[0]!r}")
         numbers = np.full(len(ids), -1)  # of the parent's rows, to take vectors and arrays from
@@ -286,7 +286,7 @@ def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
         raise RowError(f"array {name!r} must hold at least one number for each row; got {array.shape[1:]}")
     if len(array) != len(ids):
         raise RowError(f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}")
-    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     if not finite.all():
         row = ids[int(np.argmin(finite))]
         raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)

@@ -1,5 +1,7 @@
 """What builds note of files, rows that are taken over unparsed, and checks in time of what changed."""
 
+import hashlib
+import os
 import random
 
 import numpy as np
@@ -7,9 +9,10 @@ import pytest
 
 from indexes.errors import MismatchedIndex, RowError
 from indexes.kinds.base import VectorIndex
+from indexes.store import stat_cache
 from indexes.store.folder import IndexStore
 from indexes.store.rows import KeyIndex, are_distinct, keys_of
-from indexes.store.stat_cache import StatRecords
+from indexes.store.stat_cache import FILES, FOLDERS, FolderCache, StatRecords
 from indexes.store.tables import Block
 from tests.indexes.test_store import unit
 
@@ -39,6 +42,26 @@ def test_a_file_is_known_by_all_that_it_looks_like(tmp_path):
         other[1, column] += np.uint64(1)
         assert (cache.digests(ids, other) == b"").tolist() == [False, True, False]
     assert cache.digests(keys_of(["d"]), statuses[:1]).tolist() == [b""]
+
+
+@pytest.mark.parametrize("name", [FILES, FOLDERS])
+@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "longer", "forged", "folder"])
+def test_a_damaged_stat_cache_is_an_empty_one(tmp_path, name, harm, monkeypatch):
+    monkeypatch.setattr(stat_cache.sys, "platform", "linux")
+    StatRecords(tmp_path).write(keys_of(["a"]), keys_of(["1"]), np.ones((1, 4), np.uint64))
+    folders, status = FolderCache(tmp_path), (1, 1, 1, os.makedev(8, 1))
+    folders.note("cup/", status, ["1.jpg", "2.jpg"])
+    folders.write()
+    assert FolderCache(tmp_path).names("cup/", status) == ["1.jpg", "2.jpg"]
+    path = tmp_path / name
+    content = path.read_bytes()
+    flipped = content[:9] + bytes([content[9] ^ 1]) + content[10:]
+    forged = b"\xc1" + hashlib.sha256(b"\xc1").digest()
+    harmed = {"cut": content[:-7], "flipped": flipped, "empty": b"", "longer": content + b"x", "forged": forged}
+    path.unlink()
+    path.mkdir() if harm == "folder" else path.write_bytes(harmed[harm])
+    assert len(StatRecords(tmp_path).records) == (name != FILES)
+    assert (FolderCache(tmp_path).names("cup/", status) is None) == (name == FOLDERS)
 
 
 def test_keys_that_begin_alike_are_told_apart():

@@ -164,27 +164,6 @@ def test_an_index_of_an_older_version_is_read_whole_once_and_that_is_said(own, c
     assert build_index(own, checkpoint, index, quiet=True).unread == 24
 
 
-@pytest.mark.usefixtures("an_hour_later")
-@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "longer", "folder"])
-def test_notes_that_are_damaged_are_none(harm, own, checkpoint, index, read):
-    build_index(own, checkpoint, index, quiet=True)
-    path = index / FILES
-    content = path.read_bytes()
-    middle = len(content) // 2
-    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    harmed = {"cut": content[:-7], "flipped": flipped, "empty": b"", "longer": content + b"x"}
-    if harm == "folder":
-        path.unlink()
-        path.mkdir()
-        assert len(StatRecords(index).records) == 0
-        return
-    path.write_bytes(harmed[harm])
-    read.clear()
-    assert not build_index(own, checkpoint, index, quiet=True).written
-    assert len(read) == 24
-    assert path.read_bytes() == content
-
-
 def test_only_files_that_have_settled_are_noted(own, checkpoint, index):
     for path in own.rglob("*.jpg"):
         path.touch()
