@@ -24,6 +24,9 @@ KEYS = ("id", "digest", "object_id")
 RECORD = np.dtype([("slot", "<i8"), ("stop", "<i8"), *((name, "S16") for name in KEYS)])
 """What the table holds of a row: its slot, where its line ends in the text (and the next one begins), and its keys."""
 
+FEW = 8
+"""Keys that are looked for one by one: sorting all, to find many of them, takes as long."""
+
 MAX_LINE_BYTES = 2**20
 """Of the JSON of a row."""
 
@@ -64,17 +67,21 @@ class KeyIndex:
         tail = _leading(self.keys[::-1][: shared - head] == wanted[::-1][: shared - head])
         last = len(self.keys) - tail
         between = wanted[head : len(wanted) - tail]
-        searched = self._search(between) if len(between) else np.empty(0, np.int64)
-        return np.concatenate([np.arange(head), searched, np.arange(last, len(self.keys))])
+        return np.concatenate([np.arange(head), self._search(between), np.arange(last, len(self.keys))])
 
     def _search(self, wanted: NDArray[np.bytes_]) -> Slots:
+        if len(wanted) <= FEW:
+            return np.array([self._first(key) for key in wanted], np.int64)
         order, ranked = self._sorted
         beginnings = _beginnings(wanted)
         place = np.minimum(np.searchsorted(ranked, beginnings), len(ranked) - 1)
         found: Slots = np.where(self.keys[order[place]] == wanted, order[place], -1)
         for number in np.flatnonzero((found < 0) & (ranked[place] == beginnings)):  # perhaps another one begins so
-            found[number] = next(iter(np.flatnonzero(self.keys == wanted[number])), -1)
+            found[number] = self._first(wanted[number])
         return found
+
+    def _first(self, key: np.bytes_) -> int:
+        return next(iter(np.flatnonzero(self.keys == key).tolist()), -1)
 
     @cached_property
     def _sorted(self) -> tuple[Slots, NDArray[np.uint64]]:

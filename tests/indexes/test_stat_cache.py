@@ -68,6 +68,7 @@ def test_keys_that_begin_alike_are_told_apart():
     keys = np.array([b"8 bytes." + end for end in (b"a", b"b", b"c", b"b")] + [b"other", b""], "S16")
     wanted = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
     assert KeyIndex(keys).find(wanted).tolist() == [1, 2, -1, 4, 5, -1]
+    assert KeyIndex(keys).find(np.tile(wanted, 5)).tolist() == [1, 2, -1, 4, 5, -1] * 5
 
 
 @pytest.mark.parametrize("seed", range(20))
