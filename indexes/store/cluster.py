@@ -35,9 +35,9 @@ class ShardEntry:
     """One shard: its folder in the cluster's, its generation, the SHA-256 of that one's manifest.json, and what it
     holds."""
 
-    folder: Annotated[str, Meta(pattern=f"^{FOLDER.pattern}$")]
-    generation: Annotated[str, Meta(pattern=r"^gen-\d{6,}$")]
-    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    folder: Annotated[str, Meta(pattern=rf"^{FOLDER.pattern}\Z")]
+    generation: Annotated[str, Meta(pattern=r"^gen-\d{6,}\Z")]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
     photos: Annotated[int, Meta(ge=1)]
     objects: Annotated[int, Meta(ge=1)]
 
@@ -47,7 +47,7 @@ class ClusterManifest:
     """The file. kind, fingerprint: those of all shards; about: catalogue, checkpoint and what else was said of the
     build; calibration: the document of that name, None without one."""
 
-    generation: Annotated[str, Meta(pattern=r"^cluster-\d{6,}$")]
+    generation: Annotated[str, Meta(pattern=r"^cluster-\d{6,}\Z")]
     created: str
     software: str
     kind: str

@@ -21,8 +21,8 @@ MAX_BYTES = 4 * 2**20
 
 T = TypeVar("T")
 Count = Annotated[int, Meta(ge=0, lt=10**9)]
-Word = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]*$")]
-FileName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+\.(json|jsonl|npy|faiss)$")]
+Word = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]*\Z")]
+FileName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+\.(json|jsonl|npy|faiss)\Z")]
 
 
 @dataclass(frozen=True)

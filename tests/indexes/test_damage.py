@@ -261,6 +261,7 @@ def test_any_field_of_the_manifest_may_be_forged(kept, field, value):
         lambda content: content["arrays"].append("halves"),
         lambda content: content["documents"].append("../../secret"),
         lambda content: content["arrays"].append("../../secret"),
+        lambda content: content["files"].__setitem__("rows.jsonl\n", {"bytes": 1, "sha256": ""}),
         lambda content: content["counts"].__setitem__("records", 20),
         lambda content: content["files"]["calibration.json"].__setitem__("colour", "red"),
         lambda content: content.pop("dim"),
