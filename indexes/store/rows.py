@@ -1,7 +1,6 @@
 """Rows on the disk: text that is parsed when somebody looks, and a table of what searching needs of each.
 
-SQLite was measured in their place, at 100,000 rows: a rebuild copies a parent's rows in 70 ms of CPU time instead of 5,
-and matches files with rows in 200 ms instead of 15 (docs/formats.md). What is compared over all rows is an array.
+What is compared over all rows is an array, not a table of SQLite: docs/formats.md says what was measured.
 """
 
 import json
