@@ -4,7 +4,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
-from typing import Any, TypeVar, get_args, get_type_hints
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -82,10 +83,18 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
-    tables = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and is_dataclass(each)]
-    if not tables or not isinstance(document, Mapping):
+    kind = getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind  # of Annotated
+    parts: Any = [document]
+    kinds = get_args(kind)
+    if kinds and get_origin(kind) not in (Union, UnionType):  # a list or a table of such
+        parts = list(document.values()) if isinstance(document, Mapping) else document
+        parts = parts if isinstance(parts, list | tuple) else []
+    for part in parts:
+        for each in kinds:
+            _require_known(part, each, name, complete)
+    if not is_dataclass(kind) or not isinstance(document, Mapping):
         return
-    known = _hints(tables[0])
+    known = _hints(kind)
     if complete and (lacking := [key for key in known if key not in document]):
         raise ValueError(f"{name or 'it'} must hold {', '.join(known)}; {lacking[0]} is missing")
     for key, value in document.items():

@@ -269,7 +269,7 @@ def worker(bench, times):
         thread, known, own = threading.Thread(target=work), 0, 0
         thread.start()
         while thread.is_alive():
-            kept = sum(path.stat().st_size for path in out.glob("shard-*/unfinished/*.records"))
+            kept = sum(path.stat().st_size for path in out.glob("shard-*/unfinished.sqlite"))
             if kept > known and own < min(4, times - killed) and (workers := on_ray.called(WORKER)):
                 for process in workers:
                     os.kill(process, signal.SIGKILL)

@@ -45,6 +45,7 @@ from benchmarks.common import duration
 from indexes.errors import ParameterError
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
+from indexes.store.manifest import FileSeal
 from indexes.store.tables import Block
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
@@ -291,9 +292,9 @@ def opened(folder: Path) -> dict[str, float]:
 
 
 def on_disk(made: Generation) -> dict[str, float]:
-    structure = made.manifest.files.get("vectors.faiss", {"bytes": 0})["bytes"]
+    structure = made.manifest.files.get("vectors.faiss", FileSeal(0, "")).bytes
     return {
-        "disk_mb": sum(file["bytes"] for file in made.manifest.files.values()) / 2**20,
+        "disk_mb": sum(seal.bytes for seal in made.manifest.files.values()) / 2**20,
         "structure_mb": structure / 2**20,
     }
 

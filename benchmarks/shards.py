@@ -118,7 +118,7 @@ def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]
         cluster_name(1), "", "", "flat", fingerprint(model), about, calibration.get("calibration"), shards, entries
     )
     write_cluster(out / "cluster", manifest)
-    size = sum(file["bytes"] for file in whole.manifest.files.values())
+    size = sum(seal.bytes for seal in whole.manifest.files.values())
     return {"folder_s": folder_s, "shards_s": time.perf_counter() - start, "bytes_per_photo": size / photos}
 
 

@@ -133,20 +133,18 @@ class VectorIndex(ABC):
         vectors: Floats,
         parameters: Parameters,
         *,
-        covered: int | None = None,
         seed: int = 0,
         threads: int | None = None,
     ) -> Self:
         """The index that `save` wrote to `path`, over the same `vectors` (M, d), which may be memory-mapped.
 
-        `covered` says how many leading vectors the structure holds (None: all). A file that is unreadable or does
-        not fit raises `CorruptIndex`. The vectors are trusted.
+        A file that is unreadable or does not fit raises `CorruptIndex`. The vectors are trusted.
         """
         index = cls(vectors, parameters, seed, check_threads(threads))
         if cls.structure_file:
             if path is None:
                 raise ParameterError(f"{cls.kind} is loaded from a file; got no path")
-            index._read(Path(path), len(vectors) if covered is None else covered)
+            index._read(Path(path))
         else:
             index._build()
         return index
@@ -176,11 +174,6 @@ class VectorIndex(ABC):
     def vectors(self) -> Floats:
         """The vectors (M, d); not to be written to."""
         return self._vectors
-
-    @property
-    def covered(self) -> int:
-        """How many leading vectors the structure holds; those after them are scanned."""
-        return 0
 
     def settings(self) -> dict[str, Any]:
         """The parameters as a JSON object."""
@@ -280,8 +273,8 @@ class VectorIndex(ABC):
     def _grown(self) -> None:  # noqa: B027 - nothing to do without a structure
         """Take in that `self._vectors` has more vectors than before."""
 
-    def _read(self, path: Path, covered: int) -> None:
-        """Read the structure and check that it holds the first `covered` of `self._vectors`."""
+    def _read(self, path: Path) -> None:
+        """Read the structure and check that it holds `self._vectors`."""
         raise NotImplementedError
 
     def _write(self, path: Path) -> None:

@@ -39,14 +39,11 @@ def guarded(doing: str, threads: int | None) -> Iterator[None]:
 
 
 class FaissIndex(VectorIndex):
-    """A kind whose candidates come from a FAISS structure, and from a scan of the vectors that it does not hold.
+    """A kind whose candidates FAISS names.
 
-    Rounds: structure and scan name some candidates; they are scored and ordered exactly; a query is settled when
+    Rounds: FAISS names some candidates; they are scored and ordered exactly; a query is settled when
     k live ones are there and, for an exact kind, no slot outside can reach the last of them. The unsettled
     look `GROWTH` times further, and once everything would be asked for the vectors are scanned instead.
-
-    A structure that was built or grown here holds all vectors; `flat` has none, and format 2 of the store let a tenth
-    of the vectors stand outside.
     """
 
     structure_type: ClassVar[str]
@@ -55,11 +52,6 @@ class FaissIndex(VectorIndex):
     """Threads of a build unless the caller names a number."""
 
     _structure: Any = None
-
-    @property
-    def covered(self) -> int:
-        """How many leading vectors the structure holds; those after them are scanned."""
-        return 0 if self._structure is None else int(self._structure.ntotal)
 
     def _make(self) -> Any:
         """An empty, untrained structure for the resolved parameters."""
@@ -87,13 +79,15 @@ class FaissIndex(VectorIndex):
         fetch, effort = math.ceil(self._first_fetch(k) * dilution), 1
         pending = np.arange(len(queries))
         while pending.size and fetch < self.count:
-            with guarded("searching", 1 if len(pending) == 1 else self.threads):
-                rough, found = self._named(queries[pending], fetch, effort)
+            rough, found = self._named(queries[pending], fetch, effort)
             gridded, open_still = on_grid(queries[pending]), []
             for place, query in enumerate(pending):
-                ranked = self._rescored(gridded[place], found[place], k, live)
-                if self._settled(ranked[0], rough[place], k):
-                    scores[query], slots[query] = ranked
+                kept = found[place][found[place] >= 0]
+                kept = kept if live is None else kept[live[kept]]
+                ranked, ordered = best(grid_scores(gridded[place], on_grid(self._vectors[kept])), kept, k)
+                reach = float(rough[place].min()) + slack(self.dim)
+                if len(ranked) == k and (not self.exact or float(ranked[-1]) > reach):
+                    scores[query], slots[query] = ranked, ordered
                 else:
                     open_still.append(query)
             pending = np.array(open_still, dtype=np.int64)
@@ -108,8 +102,7 @@ class FaissIndex(VectorIndex):
         dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
         fetch = math.ceil(self._first_fetch(k) * dilution)
         if fetch < self.count:
-            with guarded("searching", 1):
-                rough, found = (row[0] for row in self._named(query, fetch, 1))
+            rough, found = (row[0] for row in self._named(query, fetch, 1))
             kept = found >= 0 if live is None else (found >= 0) & live[found]
             scores: Floats = rough[kept]
             slots: Slots = found[kept]
@@ -130,30 +123,9 @@ class FaissIndex(VectorIndex):
 
     def _named(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
-        parts, first = [], self.covered
-        if first:
-            rough, found = self._candidates(queries, min(fetch, first), effort)
-            parts.append((rough, check_slots(found, first, least=-1)))
-        if first < self.count:
-            rest = self._vectors[first:]
-            rough, found = faiss.knn(queries, rest, min(fetch, len(rest)), faiss.METRIC_INNER_PRODUCT)
-            parts.append((rough, found + first))
-        if len(parts) == 1:
-            return parts[0]
-        rough, found = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
-        order = np.argsort(-rough, axis=1, kind="stable")[:, :fetch]
-        return np.take_along_axis(rough, order, axis=1), np.take_along_axis(found, order, axis=1)
-
-    def _rescored(self, query: Doubles, found: Slots, k: int, live: Mask | None) -> tuple[Floats, Slots]:
-        kept = found[found >= 0]
-        if live is not None:
-            kept = kept[live[kept]]
-        return best(grid_scores(query, on_grid(self._vectors[kept])), kept, k)
-
-    def _settled(self, scores: Floats, rough: Floats, k: int) -> bool:
-        if len(scores) < k:
-            return False
-        return not self.exact or float(scores[-1]) > float(rough.min()) + slack(self.dim)
+        with guarded("searching", 1 if len(queries) == 1 else self.threads):
+            rough, found = self._candidates(queries, fetch, effort)
+        return rough, check_slots(found, self.count, least=-1)
 
     def _building_threads(self) -> int | None:
         return self.build_threads if self.threads is None else self.threads
@@ -166,7 +138,7 @@ class FaissIndex(VectorIndex):
         self._add_missing()
 
     def _grown(self) -> None:
-        if self.covered < self.count:
+        if self._structure.ntotal < self.count:
             with guarded(f"copying {self.kind}", None):
                 self._structure = faiss.clone_index(self._structure)  # this one may be another index's too
             self._add_missing()
@@ -174,20 +146,20 @@ class FaissIndex(VectorIndex):
     def _add_missing(self) -> None:
         """Give the structure the vectors that it does not hold."""
         with guarded(f"adding to {self.kind}", self._building_threads()):
-            for start in range(self.covered, self.count, ADDED_ROWS):
+            for start in range(self._structure.ntotal, self.count, ADDED_ROWS):
                 self._structure.add(np.ascontiguousarray(self._vectors[start : start + ADDED_ROWS]))
 
     def _write(self, path: Path) -> None:
         with guarded(f"writing {path}", None):
             faiss.write_index(self._structure, str(path))
 
-    def _read(self, path: Path, covered: int) -> None:
+    def _read(self, path: Path) -> None:
         try:
             structure = faiss.read_index(str(path))
         except Exception as error:
             raise CorruptIndex(f"{path}: FAISS cannot read it; build the index again ({error})") from error
         got = (type(structure).__name__, structure.ntotal, structure.d, structure.metric_type)
-        must = (self.structure_type, covered, self.dim, faiss.METRIC_INNER_PRODUCT)
+        must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
         if got != must:
             raise CorruptIndex(
                 f"{path}: must hold (type, count, size, metric) {must}, holds {got}; build the index again"

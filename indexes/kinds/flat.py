@@ -2,7 +2,8 @@
 
 from typing import ClassVar
 
-from indexes.kinds.faiss_index import FaissIndex
+from indexes.kinds.faiss_index import FaissIndex, faiss
+from indexes.kinds.scores import Floats, Slots
 
 SPARE = 16
 """Candidates beyond k in the first round, so that rounding at the last rank rarely needs a second one."""
@@ -26,3 +27,7 @@ class FlatIndex(FaissIndex):
 
     def _first_fetch(self, k: int) -> int:
         return k + SPARE
+
+    def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
+        rough, found = faiss.knn(queries, self._vectors, fetch, faiss.METRIC_INNER_PRODUCT)
+        return rough, found

@@ -43,11 +43,11 @@ class HNSWIndex(FaissIndex):
 
     def _add_missing(self) -> None:
         # A graph read from disk has lost its generator: seed it by what is there, read or not.
-        self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self.covered)
+        self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self._structure.ntotal)
         super()._add_missing()
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
         # FAISS makes room for the whole breadth at once, and no more than all can be found.
-        breadth = min(self.covered, max(fetch, self.parameters.ef_search * effort))
+        breadth = min(self.count, max(fetch, self.parameters.ef_search * effort))
         rough, found = self._structure.search(queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth))
         return rough, found

@@ -11,22 +11,22 @@ another. Opening reads this file alone; it is as long as there are shards, howev
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from _touch_retrieval.files import encoded, file_digest, naming, write_atomically
+from msgspec import Meta
+
+from _touch_retrieval.files import file_digest, naming, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex
-from indexes.store.folder import GENERATION, IndexStore
+from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import NAME as GENERATION_MANIFEST
-from indexes.store.manifest import own_digest, read_document
+from indexes.store.manifest import document_of, read_document
 from indexes.store.rows import key_of
 
 NAME, FORMAT = "CLUSTER.json", 1
-CLUSTER = re.compile(r"cluster-(\d{6,})")
 FOLDER = re.compile(r"shard-(\d{2,})-of-(\d{2,})")
-DIGEST = re.compile(r"[0-9a-f]{64}")
 MOST_SHARDS = 4096
 
 
@@ -35,11 +35,11 @@ class ShardEntry:
     """One shard: its folder in the cluster's, its generation, the SHA-256 of that one's manifest.json, and what it
     holds."""
 
-    folder: str
-    generation: str
-    sha256: str
-    photos: int
-    objects: int
+    folder: Annotated[str, Meta(pattern=rf"^{FOLDER.pattern}\Z")]
+    generation: Annotated[str, Meta(pattern=r"^gen-\d{6,}\Z")]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    photos: Annotated[int, Meta(ge=1)]
+    objects: Annotated[int, Meta(ge=1)]
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class ClusterManifest:
     """The file. kind, fingerprint: those of all shards; about: catalogue, checkpoint and what else was said of the
     build; calibration: the document of that name, None without one."""
 
-    generation: str
+    generation: Annotated[str, Meta(pattern=r"^cluster-\d{6,}\Z")]
     created: str
     software: str
     kind: str
     fingerprint: dict[str, str]
     about: dict[str, Any]
     calibration: Any
-    of: int
-    shards: list[ShardEntry]
+    of: Annotated[int, Meta(ge=1, le=MOST_SHARDS)]
+    shards: Annotated[list[ShardEntry], Meta(min_length=1, max_length=MOST_SHARDS)]
 
     @property
     def photos(self) -> int:
@@ -107,9 +107,7 @@ def write_cluster(folder: Path, manifest: ClusterManifest) -> None:
 
 def cluster_file(manifest: ClusterManifest) -> bytes:
     """The content of the file."""
-    content = {"format": FORMAT} | asdict(manifest)
-    content["sha256"] = own_digest(content)
-    return encoded(content, indent=2) + b"\n"
+    return document_of(manifest, FORMAT)
 
 
 def read_cluster(folder: Path) -> ClusterManifest:
@@ -117,14 +115,10 @@ def read_cluster(folder: Path) -> ClusterManifest:
     path = folder / NAME
     if not path.exists():
         raise NoIndex(f"{folder}: there is no cluster here; run `retrieve build-index --shards` first")
-    content = read_document(path, FORMAT, FORMAT)
-    del content["format"]
-    if set(content) != {field.name for field in fields(ClusterManifest)}:
-        raise CorruptIndex(f"{path}: must have exactly the fields of format {FORMAT}; {AGAIN}")
-    wrong = [name for name, is_right in _RIGHT.items() if not is_right(content[name])]
-    if wrong:
-        raise CorruptIndex(f"{path}: {wrong[0]} is not what the format says, the file was altered; {AGAIN}")
-    return ClusterManifest(**content | {"shards": [ShardEntry(**entry) for entry in content["shards"]]})
+    manifest = read_document(path, FORMAT, ClusterManifest)
+    if len({shard.folder for shard in manifest.shards}) < len(manifest.shards):
+        raise CorruptIndex(f"{path}: every shard must have a folder of its own, two share one; {AGAIN}")
+    return manifest
 
 
 def open_shard(
@@ -146,41 +140,3 @@ def open_shard(
     if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256 or generation.count != entry.photos:
         raise CorruptIndex(f"{generation.folder} is not the generation that {cluster / NAME} was written for; {AGAIN}")
     return generation
-
-
-def _is_entry(value: object) -> bool:
-    if not isinstance(value, dict) or set(value) != {field.name for field in fields(ShardEntry)}:
-        return False
-    texts = isinstance(value["folder"], str) and isinstance(value["generation"], str)
-    counts = all(type(value[name]) is int and value[name] > 0 for name in ("photos", "objects"))
-    return bool(
-        texts
-        and counts
-        and FOLDER.fullmatch(value["folder"])
-        and GENERATION.fullmatch(value["generation"])
-        and isinstance(value["sha256"], str)
-        and DIGEST.fullmatch(value["sha256"])
-    )
-
-
-def _is_texts(value: object) -> bool:
-    return isinstance(value, dict) and all(isinstance(each, str) for each in value.values())
-
-
-def _is_shards(value: object) -> bool:
-    if not isinstance(value, list) or not 1 <= len(value) <= MOST_SHARDS or not all(map(_is_entry, value)):
-        return False
-    return len({entry["folder"] for entry in value}) == len(value)
-
-
-_RIGHT = {
-    "generation": lambda value: isinstance(value, str) and bool(CLUSTER.fullmatch(value)),
-    "created": lambda value: isinstance(value, str),
-    "software": lambda value: isinstance(value, str),
-    "kind": lambda value: isinstance(value, str),
-    "fingerprint": _is_texts,
-    "about": lambda value: isinstance(value, dict),
-    "of": lambda value: type(value) is int and 1 <= value <= MOST_SHARDS,
-    "shards": _is_shards,
-}
-"""What each field must be: whoever alters the file can write the digest that fits."""

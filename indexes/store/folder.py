@@ -10,13 +10,12 @@
       vectors.faiss       the structure of the index, for kinds that have one
       NAME.json           documents; NAME.npy those that are arrays, of no row
     LOCK                  held by the writer
-    seen.records          how the files behind the rows looked, of no generation (`indexes.store.seen`)
-    seen.folders          and what folders held that looked so (`indexes.store.seen_folders`)
-    unfinished/           what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
+    files.stat            the stat cache of the files behind the rows, of no generation (`indexes.store.stat_cache`)
+    folders.stat          and of their folders
+    unfinished.sqlite     what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
 
 A generation is written whole and stands alone: its folder and a CURRENT are an index, wherever they are copied to. One
-made from a parent copies what it keeps of the parent's rows: a million photos (1 GB) in 2 to 7 seconds. This is format
-3; format 2 is read as well (`indexes.store.older`).
+made from a parent copies what it keeps of the parent's rows: a million photos (1 GB) in 2 to 7 seconds.
 
 One writer, many readers. A writer killed at any moment leaves the old or the new generation current, whole;
 the next writer sweeps up what the killed one left.
@@ -78,18 +77,13 @@ class IndexStore:
 
         Raises `NoIndex`, `CorruptIndex`, `UnsupportedFormat`, or `MismatchedIndex` (see `indexes.errors`).
         """
-        if name is not None:
-            generation = self._read(name, verify, threads)
-            generation.require(expect or {})
-            return generation
-        name = self.current()
+        wanted = name or self.current()
         try:
-            generation = self._read(name, verify, threads)
+            generation = self._read(wanted, verify, threads)
         except CorruptIndex:
-            newer = self.current()
-            if newer == name:
+            if name is not None or self.current() == wanted:
                 raise
-            generation = self._read(newer, verify, threads)  # a writer replaced it while it was being read
+            generation = self._read(self.current(), verify, threads)  # a writer replaced it while it was being read
         generation.require(expect or {})
         return generation
 
@@ -177,7 +171,9 @@ class IndexStore:
             settle=settle,
             queries=queries,
         )
-        check_about(fingerprint, about or {})
+        json_of(job.about, "about")
+        if odd := [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]:
+            raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
         for what, number in (("self_check", self_check), ("keep", keep)):
             if not is_whole(number, 0, MOST):
                 raise ParameterError(f"{what} must be a whole number of at least 0; got {number!r}")
@@ -252,14 +248,6 @@ class IndexStore:
 def generation_name(number: int) -> str:
     """The name of a generation, such as gen-000007."""
     return f"gen-{number:06d}"
-
-
-def check_about(fingerprint: Mapping[str, str], about: Mapping[str, Any]) -> None:
-    """The fingerprint is text, and `about` JSON; or `RowError`."""
-    odd = [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]
-    if odd:
-        raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
-    json_of(dict(about), "about")
 
 
 def _discard(folder: Path) -> None:

@@ -1,7 +1,7 @@
 """One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,10 @@ from indexes.errors import (
     UnsupportedFormat,
 )
 from indexes.kinds.base import VectorIndex
-from indexes.kinds.checks import BLOCK_ROWS, NORM_TOLERANCE, check_k, row_norms
+from indexes.kinds.checks import NORM_TOLERANCE, check_k, row_norms
 from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
 from indexes.store.arrays import mapped
 from indexes.store.manifest import Manifest, check_files, read_manifest
-from indexes.store.older import joined, table_files
 from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
@@ -128,19 +127,16 @@ class Generation:
         that tie for the last place, and of an approximate kind perhaps more."""
         return [self._rows_of(slots)[1] for slots in self.index.candidates(queries, k, self._live)]
 
-    def matching(self, ids: Sequence[str], digests: Iterable[object]) -> Slots:
-        """For each id and digest the row (n,) that has both; -1 where there is none, or no digest."""
-        return self.matching_keys(keys_of(ids), keys_of(digests))
-
-    def matching_keys(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
-        """As `matching`, for the keys (n,) of ids and digests."""
-        numbers = self.rows.find_keys(ids)
-        same = (digests != b"") & (digests == self._digests[numbers])
+    def matching(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
+        """For the keys of each id and digest (`indexes.store.rows.keys_of`) the row (n,) that has both; -1 where there
+        is none, or no digest."""
+        numbers = self.rows.by_id.find(ids)
+        same = (digests != b"") & (digests == self.rows.by_digest.keys[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
     def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
         """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
-        numbers = self.matching(list(wanted), wanted.values()).tolist()
+        numbers = self.matching(keys_of(wanted), keys_of(wanted.values())).tolist()
         return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
 
     def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
@@ -175,10 +171,6 @@ class Generation:
         top = self.index.search(own, k, self._live)[0][:, 0]
         must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
         return numbers[top < must]
-
-    @cached_property
-    def _digests(self) -> NDArray[np.bytes_]:
-        return self.rows.keys("digest")
 
     def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
         """The rows of the best k of k + 1 slots; where slots tie for the last place, their ids say which stays."""
@@ -231,17 +223,28 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     check_files(folder, manifest, verify=verify)
     try:
         rows, arrays, embeddings = _tables(folder, manifest)
-        documents = _documents(folder, manifest)
-        _check_counts(manifest, rows.table, embeddings)
+        files, names = manifest.files, manifest.documents
+        documents: dict[str, Any] = {name: mapped(folder / f"{name}.npy") for name in names if f"{name}.npy" in files}
+        most = max_document_bytes(manifest.counts.rows, documents.values())
+        documents |= {name: read_json(folder / f"{name}.json", most) for name in names if name not in documents}
+        counts, slots = manifest.counts, rows.table["slot"]
+        if slots.min() < 0 or slots.max() >= counts.slots:
+            raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, are not; {AGAIN}")
+        tombstones = counts.slots - int(np.count_nonzero(np.bincount(slots)))
+        got = {"rows": len(slots), "slots": len(embeddings), "tombstones": tombstones, "dim": embeddings.shape[1]}
+        must = {**asdict(counts), "dim": manifest.dim}
+        if any(must[name] != number for name, number in got.items()):
+            raise CorruptIndex(f"{folder}: the manifest says {must}, the files hold {got}; {AGAIN}")
         if verify:
-            _check_vectors(folder, embeddings)
-            _check_rows(folder, rows.table)
+            if not (np.abs(row_norms(embeddings) - 1.0) <= NORM_TOLERANCE).all():
+                raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
+            if not are_distinct(rows.keys("id")):
+                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
         kind = load_kind(manifest.kind)
         index = kind.load(
             folder / STRUCTURE if kind.structure_file else None,
             embeddings,
             kind.parameters_from(manifest.parameters),
-            covered=manifest.counts.structure_slots,
             seed=manifest.seed,
             threads=threads,
         )
@@ -254,60 +257,24 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
-def _documents(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """The documents by name, arrays first: their rows say how long the others may be."""
-    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.documents if f"{name}.npy" in manifest.files}
-    most = max_document_bytes(manifest.counts.rows, arrays.values())
-    texts = [name for name in manifest.documents if name not in arrays]
-    return arrays | {name: read_json(folder / f"{name}.json", most) for name in texts}
-
-
 def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
     """How many bytes of JSON a document may have, in an index of so many rows with these documents that are arrays."""
     return min(MAX_JSON_BYTES, DOCUMENT_BYTES + DOCUMENT_BYTES_PER_ROW * (rows + sum(map(len, arrays))))
 
 
 def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:
-    """The rows, per-row arrays and embeddings; memory-mapped, but those of a grown generation of format 2."""
-    tables = {name: [folder / file for file in files] for name, files in table_files(manifest).items()}
-    if lacking := sorted({path.name for paths in tables.values() for path in paths} - set(manifest.files)):
+    """The rows, per-row arrays and embeddings, memory-mapped."""
+    files = {ROWS, TABLE, EMBEDDINGS, *(f"{name}.npy" for name in manifest.arrays)}
+    if lacking := sorted(files - set(manifest.files)):
         raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
     # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
-    texts = [np.asarray(np.memmap(path, np.uint8, "r")) for path in tables.pop("rows")]
-    parts = {name: [mapped(path) for path in paths] for name, paths in tables.items()}
-    text, whole = joined(folder, manifest, texts, parts)
-    table, embeddings = np.asarray(whole.pop("table")), whole.pop("embeddings")
-    must = {"fields": RECORD} | dict.fromkeys(whole, len(table))
-    got = {"fields": table.dtype} | {name: len(array) for name, array in whole.items()}
+    text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(mapped(folder / TABLE))
+    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.arrays}
+    must = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
+    got = {"fields": table.dtype} | {name: len(array) for name, array in arrays.items()}
     if got != must:
         raise CorruptIndex(f"{folder}: the tables must hold {must}, hold {got}; {AGAIN}")
-    starts, stops = table["start"], table["stop"]
-    if starts.min() < 0 or stops.max() > len(text) or not (starts < stops).all():
-        raise CorruptIndex(f"{folder}: the lines of {ROWS} must lie in its text, and do not; {AGAIN}")
-    return Rows(text, table), whole, embeddings
-
-
-def _check_vectors(folder: Path, embeddings: Floats) -> None:
-    for start in range(0, len(embeddings), BLOCK_ROWS):
-        if not (np.abs(row_norms(embeddings[start : start + BLOCK_ROWS]) - 1.0) <= NORM_TOLERANCE).all():
-            raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
-
-
-def _check_rows(folder: Path, table: NDArray[Any]) -> None:
-    """No row comes twice: neither two with one id, nor two with the same bytes of the text."""
-    if not are_distinct(np.ascontiguousarray(table["id"])):
-        raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
-    starts, stops = np.sort(table["start"]), np.sort(table["stop"])
-    if (starts[1:] < stops[:-1]).any():
-        raise CorruptIndex(f"{folder}: the lines of the rows must not overlap, two do; {AGAIN}")
-
-
-def _check_counts(manifest: Manifest, table: NDArray[Any], embeddings: Floats) -> None:
-    counts, slots = manifest.counts, table["slot"]
-    if slots.min() < 0 or slots.max() >= counts.slots:
-        raise CorruptIndex(f"{manifest.generation}: slots must be below {counts.slots}, are not; {AGAIN}")
-    rows, slot_count, tombstones = len(slots), len(embeddings), counts.slots - int(np.count_nonzero(np.bincount(slots)))
-    got = {"rows": rows, "slots": slot_count, "tombstones": tombstones, "components": embeddings.shape[1]}
-    must = {name: getattr(counts, name) for name in ("rows", "slots", "tombstones")} | {"components": manifest.dim}
-    if got != must:
-        raise CorruptIndex(f"{manifest.generation}: the manifest says {must}, the files hold {got}; {AGAIN}")
+    stops = table["stop"]
+    if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
+        raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
+    return Rows(text, table), arrays, mapped(folder / EMBEDDINGS)

@@ -42,20 +42,23 @@ class WriterLock:
             descriptor = _opened(self.path)
         except OSError as error:
             raise WriteFailed(f"{self.path}: the lock file cannot be opened; {error.strerror}") from error
-        if not _is_lock(descriptor):
-            os.close(descriptor)
-            raise WriteFailed(f"{self.path} is not the lock file of an index, and stays as it is; give another folder")
         try:
+            is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
+            holder = os.pread(descriptor, 33, 0).decode("ascii", "replace").strip() if is_file else "no file"
+            if holder and not (holder.isdigit() and len(holder) <= 32):  # of the user
+                raise WriteFailed(
+                    f"{self.path} is not the lock file of an index, and stays as it is; give another folder"
+                )
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            holder = _holder(descriptor)
             os.close(descriptor)
-            who = "an unknown process" if holder is None else f"process {holder}"
-            raise LockedIndex(
-                f"{self.path.parent}: one writer at a time; {who} is writing. Wait for it to end", holder
-            ) from error
-        except OSError as error:
+            who = f"process {holder}" if holder else "an unknown process"
+            message = f"{self.path.parent}: one writer at a time; {who} is writing. Wait for it to end"
+            raise LockedIndex(message, int(holder) if holder else None) from error
+        except (OSError, WriteFailed) as error:
             os.close(descriptor)
+            if isinstance(error, WriteFailed):
+                raise
             raise WriteFailed(
                 f"{self.path}: this disk keeps no locks ({error.strerror}); build the index on another one"
             ) from error
@@ -69,19 +72,6 @@ def _opened(path: Path) -> int:
     """A lock file, made where there is none; a link is refused, and a pipe blocks nobody. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-
-
-def _is_lock(descriptor: int) -> bool:
-    """Whether a file holds nothing but a process id: any other one is of the user."""
-    status = os.fstat(descriptor)
-    if not stat.S_ISREG(status.st_mode):
-        return False
-    return status.st_size == 0 or (status.st_size <= 32 and _holder(descriptor) is not None)
-
-
-def _holder(descriptor: int) -> int | None:
-    text = os.pread(descriptor, 32, 0).strip()
-    return int(text) if text.isdigit() else None
 
 
 @contextmanager

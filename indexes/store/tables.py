@@ -23,7 +23,7 @@ from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_
 MOST_TOMBSTONES = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
 
-RESERVED = {"rows", "table", "order", "embeddings", "vectors", "manifest"}
+RESERVED = {"rows", "table", "embeddings", "vectors", "manifest"}
 
 Layouts: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
 """Name of a per-row array -> its dtype, and the shape of one row of it."""
@@ -88,9 +88,15 @@ class TableWriter:
         """Take the next rows. Raises `RowError`, `VectorError` or `MismatchedIndex`, naming the row."""
         if not block.rows:
             raise RowError("a block must hold at least one row; got none")
-        ids = _checked_ids(block.rows)
-        numbers = self._known(block.rows, ids)
+        ids: list[Any] = [row.get("id") for row in block.rows]
+        if odd := [name for name in ids if not isinstance(name, str) or not name]:
+            raise RowError(f"every row needs a text id; row {ids.index(odd[0])} has {odd[0]!r}")
+        numbers = np.full(len(ids), -1)  # of the parent's rows, to take vectors and arrays from
+        if self.parent is not None:
+            numbers = self.parent.matching(keys_of(ids), keys_of(row.get("digest") for row in block.rows))
         known = numbers >= 0
+        if self.parent is not None and known.any():
+            self._require_fit(self.parent)
         fresh_ids = [ids[number] for number in np.flatnonzero(~known)]
         count = 0 if block.embeddings is None else len(block.embeddings)
         if count != len(fresh_ids):
@@ -117,19 +123,11 @@ class TableWriter:
         span = slice(numbers.start, numbers.stop)
         self._open_arrays(parent.arrays)
         for name, file in (self._arrays or {}).items():
-            for start in range(span.start, span.stop, BLOCK_ROWS):
-                file.append(parent.arrays[name][start : min(start + BLOCK_ROWS, span.stop)])
-        records = parent.rows.table[span].copy()
-        first, last = int(records["start"][0]), int(records["stop"][-1])
-        if (records["start"][1:] == records["stop"][:-1]).all():
-            shift = self._text.tell() - first
-            self._text.write(parent.rows.text[first:last].data)
-            records["start"] += shift
-            records["stop"] += shift
-        else:  # of a grown generation of format 2
-            lines = [parent.rows.line(number) + b"\n" for number in numbers]
-            self._place(records, lines)
-            self._text.writelines(lines)
+            file.append(parent.arrays[name][span])
+        records, first = parent.rows.table[span].copy(), parent.rows.start(numbers.start)
+        text = parent.rows.text[first : int(records["stop"][-1])]
+        records["stop"] += self._text.tell() - first
+        self._text.write(text.data)
         self._records.append(records)
 
     def close(self) -> Tables:
@@ -151,15 +149,6 @@ class TableWriter:
     def _array_files(self) -> list[ArrayFile]:
         return [*([self._vectors] if self._vectors else ()), *(self._arrays or {}).values()]
 
-    def _known(self, rows: Sequence[Mapping[str, Any]], ids: Sequence[str]) -> Slots:
-        """The parent's row (n,) to take each row's vector and arrays from, or -1."""
-        if self.parent is None:
-            return np.full(len(rows), -1)
-        numbers = self.parent.matching(ids, [row.get("digest") for row in rows])
-        if (numbers >= 0).any():
-            self._require_fit(self.parent)
-        return numbers
-
     def _require_fit(self, parent: Generation) -> None:
         """Rows are to be taken over from the parent: they must have been made alike."""
         if not self._fits:
@@ -172,8 +161,7 @@ class TableWriter:
     def _add_vectors(self, vectors: Floats) -> None:
         if self._vectors is None:
             self._vectors = ArrayFile(self.folder / EMBEDDINGS, np.float32, vectors.shape[1:])
-        for start in range(0, len(vectors), BLOCK_ROWS):
-            self._vectors.append(vectors[start : start + BLOCK_ROWS])
+        self._vectors.append(vectors)
 
     def _add_arrays(self, given: Mapping[str, NDArray[Any]], numbers: Slots, fresh_ids: Sequence[str]) -> None:
         """Write the arrays of a block: those given of its new rows, the parent's of the others."""
@@ -222,23 +210,18 @@ class TableWriter:
             if self.parent is not None and same.any():
                 records[name][same] = self.parent.rows.table[name][numbers[same]]
             records[name][~same] = keys_of(rows[place].get(name) for place in np.flatnonzero(~same).tolist())
-        self._place(records, lines)
+        records["stop"] = self._text.tell() + np.cumsum([len(line) for line in lines])
         self._text.writelines(lines)
         self._records.append(records)
-
-    def _place(self, records: NDArray[Any], lines: Sequence[bytes]) -> None:
-        """Say where lines will stand that are written next."""
-        records["stop"] = self._text.tell() + np.cumsum([len(line) for line in lines])
-        records["start"] = np.concatenate([[self._text.tell()], records["stop"][:-1]])
 
     def _check_distinct(self, table: NDArray[Any]) -> None:
         keys = np.ascontiguousarray(table["id"])
         if are_distinct(keys):
             return
         order = np.argsort(keys, kind="stable")
-        record = table[order[int(np.argmax(keys[order][1:] == keys[order][:-1]))]]
+        number = int(order[int(np.argmax(keys[order][1:] == keys[order][:-1]))])
         with (self.folder / ROWS).open("rb") as text:
-            text.seek(int(record["start"]))
+            text.seek(int(table["stop"][number - 1]) if number else 0)
             name = json.loads(text.readline())["id"]
         raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
 
@@ -296,13 +279,6 @@ def check_name(name: str) -> None:
         )
 
 
-def _checked_ids(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    for number, row in enumerate(rows):
-        if not isinstance(row.get("id"), str) or not row["id"]:
-            raise RowError(f"every row needs a text id; row {number} has {row.get('id')!r}")
-    return [row["id"] for row in rows]
-
-
 def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
     if not isinstance(array, np.ndarray) or array.ndim < 1 or array.dtype.kind not in "biuf":
         raise RowError(f"array {name!r} must be a numpy array of numbers; got {type(array).__name__}")
@@ -310,9 +286,7 @@ def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
         raise RowError(f"array {name!r} must hold at least one number for each row; got {array.shape[1:]}")
     if len(array) != len(ids):
         raise RowError(f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}")
-    for start in range(0, len(array), BLOCK_ROWS):
-        block = array[start : start + BLOCK_ROWS]
-        good = np.isfinite(block).reshape(len(block), -1).all(axis=1)
-        if not good.all():
-            row = ids[start + int(np.argmin(good))]
-            raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)
+    finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    if not finite.all():
+        row = ids[int(np.argmin(finite))]
+        raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)

@@ -1,18 +1,18 @@
-"""What a build has made until it was cut off, kept beside the generations for the next one to take up.
+"""What a build has embedded until it was cut off, kept for the next one to take up: `unfinished.sqlite`.
 
-    unfinished/<key>.records    records of one size, one after another: digest of the content, arrays, checksum
-
-The key stands for the fingerprint of what makes the arrays and for their layout, so that nothing is ever taken from
-another model's build. A record is written whole by one call; one that a kill or a full disk cut short, or that was
-altered, fails its checksum and counts as not there. Nothing here belongs to an index: the folder may be deleted at any
-time, and is when a generation has been written.
+A record stands under the digest of the content and under a key of what makes the arrays and of their layout, so that
+nothing is ever taken from another model's build. It is committed at once, with a checksum: whatever a kill or a full
+disk leaves, a record is whole or counts as absent. The file belongs to no generation and no query opens it. It may be
+deleted at any time, and is when a generation has been written.
 """
 
 import hashlib
 import json
+import sqlite3
 import threading
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,30 +20,34 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from _touch_retrieval import files
 from indexes.errors import WriteFailed
-from indexes.store.rows import key_of, keys_of
 from indexes.store.tables import Layouts
 
-FOLDER = "unfinished"
+NAME = "unfinished.sqlite"
+_TABLE = """CREATE TABLE IF NOT EXISTS records (
+    maker TEXT, digest TEXT, arrays BLOB, checksum INTEGER, PRIMARY KEY (maker, digest)) WITHOUT ROWID"""
 
 
 class Unfinished:
-    """Records by digest, in the folder `index`/unfinished; use it under the index's lock. Threads may share it.
+    """Records by digest, in the folder `index`; use it under the index's lock. Threads may share it.
 
     layouts: name of an array -> dtype and shape of one record's, as in `indexes.store.tables`.
     """
 
     def __init__(self, index: Path, fingerprint: Mapping[str, str], layouts: Layouts) -> None:
-        self.folder, self._layouts = index / FOLDER, layouts
-        of = {"fingerprint": dict(fingerprint), "layouts": {name: str(how) for name, how in layouts.items()}}
-        key = hashlib.sha256(json.dumps(of, sort_keys=True).encode()).hexdigest()[:32]
-        self._path = self.folder / f"{key}.records"
-        self._record = np.dtype([("key", "S16"), *((name, *how) for name, how in layouts.items()), ("check", "<u4")])
+        self.path = index / NAME
+        self._record = np.dtype([(name, *how) for name, how in layouts.items()])
+        maker = {"fingerprint": dict(fingerprint), "record": str(self._record)}
+        self._maker = hashlib.sha256(json.dumps(maker, sort_keys=True).encode()).hexdigest()
         self._lock = threading.Lock()
-        self._handle: Any = None
-        self._known = self._read()
-        self._places = {bytes(key): place for place, key in enumerate(self._known["key"])}
+        self._connection: sqlite3.Connection | None = None
+        if self.path.exists():
+            try:
+                whole = self._open().execute("PRAGMA quick_check").fetchall() == [("ok",)]
+            except sqlite3.Error:
+                whole = False
+            if not whole:
+                self.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -51,17 +55,22 @@ class Unfinished:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._handle is not None:
-            self._handle.close()
+        if self._connection is not None:
+            self._connection.close()
 
     def find(self, digests: Iterable[str]) -> dict[str, Any]:
         """Of these digests, those of which an earlier build left a whole record: {digest: record}, which gives its
         arrays by their names."""
+        if self._connection is None:
+            return {}
         found = {}
         for digest in digests:
-            place = self._places.get(key_of(digest).rstrip(b"\0"))  # numpy drops zeros at the end of bytes
-            if place is not None and _checksum(record := self._known[place : place + 1])[0] == record["check"][0]:
-                found[digest] = record[0].copy()
+            with self._lock:
+                row = self._connection.execute(
+                    "SELECT arrays, checksum FROM records WHERE maker = ? AND digest = ?", (self._maker, digest)
+                ).fetchone()
+            if row is not None and _checksum(digest, row[0]) == row[1]:
+                found[digest] = np.frombuffer(row[0], self._record)[0]
         return found
 
     def keep(self, digests: Sequence[str], arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -69,52 +78,38 @@ class Unfinished:
 
         Raises `WriteFailed` where the disk refuses.
         """
-        records = np.zeros(len(digests), self._record)
-        records["key"] = keys_of(digests)
-        good = np.ones(len(digests), bool)
-        for name in self._layouts:
+        records, finite = np.zeros(len(digests), self._record), np.ones(len(digests), bool)
+        for name in self._record.names or ():
             records[name] = arrays[name]
-            good &= np.isfinite(arrays[name]).reshape(len(digests), -1).all(axis=1)
-        records["check"] = _checksum(records)
+            finite &= np.isfinite(arrays[name]).reshape(len(digests), -1).all(axis=1)
+        rows = [
+            (self._maker, digest, record.tobytes(), _checksum(digest, record.tobytes()))
+            for digest, record, good in zip(digests, records, finite, strict=True)
+            if good
+        ]
         try:
-            with self._lock:
-                content = records[good].tobytes()
-                if self._open().write(content) < len(content):
-                    raise OSError("the disk is full")
-        except OSError as error:
-            raise WriteFailed(f"{self._path}: the disk refused ({error.strerror or error}); build again") from error
+            with self._lock, self._connection or self._open() as connection:
+                connection.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", rows)
+        except (OSError, sqlite3.Error) as error:
+            raise WriteFailed(f"{self.path}: the disk refused ({error}); build again") from error
 
     def clear(self) -> None:
         """Delete what all unfinished builds left: a generation holds it now. What cannot be deleted stays."""
-        if self._handle is not None:
-            self._handle.close()
-            self._handle = None
-        if self.folder.is_dir():
-            try:
-                files.remove_folder(self.folder)
-            except OSError:
-                return
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        for path in (self.path, self.path.with_name(f"{NAME}-journal")):
+            with suppress(OSError):
+                path.unlink()
 
-    def _open(self) -> Any:
-        """The file to append to, cut to whole records; unbuffered, so that what is written outlives the process."""
-        if self._handle is None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._handle = self._path.open("ab", buffering=0)
-            self._handle.truncate(self._handle.tell() // self._record.itemsize * self._record.itemsize)
-        return self._handle
-
-    def _read(self) -> NDArray[Any]:
-        try:
-            count = self._path.stat().st_size // self._record.itemsize
-            if count and self._path.is_file():
-                return np.memmap(self._path, self._record, "r", shape=(count,))
-        except OSError:
-            pass
-        return np.empty(0, self._record)
+    def _open(self) -> sqlite3.Connection:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._connection = sqlite3.connect(self.path, check_same_thread=False)
+        self._connection.execute("PRAGMA synchronous = OFF")  # a commit outlives the process, though not the power
+        self._connection.execute(_TABLE)
+        self._connection.execute("PRAGMA user_version = 1")  # fails where it cannot be written to
+        return self._connection
 
 
-def _checksum(records: NDArray[Any]) -> NDArray[np.uint32]:
-    """Of each record (n,), over all before its last field."""
-    size = records.dtype.itemsize
-    rows = np.ascontiguousarray(records).view(np.uint8).reshape(len(records), size)
-    return np.array([zlib.crc32(row[: size - 4].tobytes()) for row in rows], np.uint32)
+def _checksum(digest: str, arrays: bytes) -> int:
+    return zlib.crc32(digest.encode() + arrays)

@@ -79,7 +79,10 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         with files.durable(folder / f"{document}.json") as handle:
             handle.write(text)
     if job.settle is not None:
-        job = _settled(job, job.settle(tables))
+        chosen = job.settle(tables)
+        kind = load_kind(chosen.kind)
+        json_of(dict(chosen.about), "about")
+        job = replace(job, kind=kind, asked=kind.asked(chosen.parameters), about={**job.about, **chosen.about})
     index, built_slots, kept = _index(tables, job)
     if index.save(folder / STRUCTURE):
         files.sync(folder / STRUCTURE)
@@ -99,7 +102,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         asked=asdict(job.asked),
         seed=job.seed,
         recall=_recall(index, job),
-        counts=Counts(len(tables.slots), slots, tombstones, built_slots, index.covered),
+        counts=Counts(len(tables.slots), slots, tombstones, built_slots),
         arrays=sorted(tables.arrays),
         documents=sorted(job.documents),
         files=sealed(folder),
@@ -127,12 +130,6 @@ def _serves(parent: Generation, slots: int, job: Job) -> bool:
     if manifest.kind != kind.kind or kind.parameters_from(manifest.asked) != job.asked or manifest.seed != job.seed:
         return False
     return kind.retrain_growth is None or slots <= kind.retrain_growth * manifest.counts.built_slots
-
-
-def _settled(job: Job, chosen: Chosen) -> Job:
-    kind = load_kind(chosen.kind)
-    json_of(dict(chosen.about), "about")
-    return replace(job, kind=kind, asked=kind.asked(chosen.parameters), about={**job.about, **chosen.about})
 
 
 def _recall(index: VectorIndex, job: Job) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
 
 from _touch_retrieval.files import parse_json, read_regular
-from indexes.store.seen_folders import SeenFolders
+from indexes.store.stat_cache import FolderCache
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
@@ -128,7 +128,7 @@ class PhotoBytes:
     digest: str
 
 
-def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: SeenFolders | None = None) -> Catalogue:
+def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: FolderCache | None = None) -> Catalogue:
     """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None. seen:
     what earlier builds saw there, which takes down what this one sees.
 

@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
 from _touch_retrieval.files import parse_json
-from indexes.store.seen_folders import SeenFolders
+from indexes.store.stat_cache import FolderCache
 from retrieval.data.catalogue import (
     METADATA_FILE,
     Catalogue,
@@ -84,7 +84,7 @@ def is_elsewhere(where: str | Path) -> bool:
     return is_url(where) or str(where).endswith((".parquet", ".tar"))
 
 
-def list_photos(where: str | Path, naming: Naming | None = None, seen: SeenFolders | None = None) -> Catalogue:
+def list_photos(where: str | Path, naming: Naming | None = None, seen: FolderCache | None = None) -> Catalogue:
     """The photos of a folder, or of a URL as the text above says. Raises DatasetError as `list_catalogue` does."""
     if not is_elsewhere(where):
         return list_catalogue(Path(where), naming, seen)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
-from indexes.store.seen_folders import SeenFolders
+from indexes.store.stat_cache import FolderCache
 from retrieval.data.text import is_utf8
 from retrieval.errors import DatasetError
 
@@ -24,7 +24,7 @@ class Walk:
     its folders; followed: where links led."""
 
     root: Path
-    seen: SeenFolders | None = None
+    seen: FolderCache | None = None
     names: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     followed: set[Path] = field(default_factory=set)
@@ -34,8 +34,8 @@ class Walk:
 
         A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
         """
-        look = b"" if self.seen is None else self.seen.look(folder)  # before what is in it
-        if self.seen is not None and (known := self.seen.names(prefix, look)) is not None:
+        status = None if self.seen is None else self.seen.status(folder)  # before what is in it
+        if self.seen is not None and (known := self.seen.names(prefix, status)) is not None:
             self.names += [prefix + name for name in known]
             return
         try:
@@ -64,7 +64,7 @@ class Walk:
             else:
                 self.walk(entry.path, path + "/")
         if self.seen is not None and plain:
-            self.seen.note(prefix, look, [path[len(prefix) :] for path in self.names[first:]])
+            self.seen.note(prefix, status, [path[len(prefix) :] for path in self.names[first:]])
 
     def _follow(self, link: str, path: str) -> None:
         target = Path(os.path.realpath(link))

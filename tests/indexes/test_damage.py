@@ -1,21 +1,42 @@
-"""Every way an index on disk can be unusable has its own error, and none is taken for a good one."""
+"""Every way an index on disk can be unusable has its own error, and none is taken for a good one, whether its digests
+fit or not. Nothing outside the folder is read, waited for or written over."""
 
 import json
+import os
+import resource
 import shutil
+import socket
+import time
 
 import faiss
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from _touch_retrieval.files import file_digest
+import indexes.errors
+from _touch_retrieval.files import DEEPEST, file_digest, read_regular
 from indexes import KINDS, load_kind
-from indexes.errors import CorruptIndex, IndexesError, MismatchedIndex, NoIndex, UnsupportedFormat
+from indexes.errors import (
+    CorruptIndex,
+    IndexesError,
+    MismatchedIndex,
+    NoIndex,
+    RowError,
+    UnsupportedFormat,
+    WriteFailed,
+)
 from indexes.store.folder import IndexStore
 from indexes.store.manifest import own_digest
-from tests.indexes.test_store import FINGERPRINT, filled, unit
+from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit
 
 TABLES = ["rows.jsonl", "table.npy", "embeddings.npy", "halves.npy"]
 FILES = ["manifest.json", "vectors.faiss", "calibration.json", *TABLES]
+
+
+def make(path, count=20, kind="hnsw"):
+    arrays, documents = {"halves": np.ones((count, 3), np.float16)}, {"calibration": {"a": 1}}
+    return filled(path, count, kind, arrays=arrays, documents=documents).folder
 
 
 @pytest.fixture
@@ -24,24 +45,29 @@ def folder(tmp_path):
     return make(tmp_path / "index")
 
 
-def make(path):
-    return filled(
-        path,
-        kind="hnsw",
-        arrays={"halves": np.ones((20, 3), np.float16)},
-        documents={"calibration": {"a": 1}},
-    ).folder
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """As `folder`, for examples that put back what they change."""
+    return make(tmp_path_factory.mktemp("kept") / "index")
 
 
-def reopened(folder, **options):
-    return IndexStore(folder.parent).open(**options)
+def opened(folder, **options):
+    """The index, each row read and searched once."""
+    generation = IndexStore(folder.parent).open(**options)
+    list(generation.rows)
+    generation.search(unit(1), 3)
+    return generation
 
 
-def rewrite_manifest(folder, **changes) -> None:
-    """Change fields of the manifest and give it the digest that fits, as other software would."""
+def forge(folder, change=lambda content: None, **fields):
+    """Change the manifest, with every size and digest made to fit, as other software would."""
     path = folder / "manifest.json"
-    content = json.loads(path.read_text()) | changes
-    content.pop("sha256")
+    content = json.loads(path.read_text()) | fields
+    content.pop("sha256", None)
+    for name, must in content["files"].items() if isinstance(content["files"], dict) else ():
+        if (folder / name).is_file():
+            must |= {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)}
+    change(content)
     path.write_text(json.dumps(content | {"sha256": own_digest(content)}))
 
 
@@ -63,87 +89,50 @@ def test_a_file_in_the_place_of_the_folder_is_no_index(tmp_path):
         IndexStore(tmp_path / "index").open()
 
 
-@pytest.mark.parametrize("text", ["", "\n", "gen-1", "gen-000001x", "../gen-000001", "\xff\x00", "gen-000001 gen"])
-def test_a_current_file_of_garbage_is_corrupt(folder, text):
-    (folder.parent / "CURRENT").write_text(text)
-    with pytest.raises(CorruptIndex, match="CURRENT: must name a generation"):
-        reopened(folder)
-
-
-def test_a_current_file_that_names_a_missing_generation_is_corrupt(folder):
-    (folder.parent / "CURRENT").write_text("gen-000009\n")
-    with pytest.raises(CorruptIndex, match="the generation gen-000009 is missing"):
-        reopened(folder)
-
-
-def test_a_generation_under_the_name_of_another_is_corrupt(folder):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *(
+            (text, "CURRENT: must name a generation")
+            for text in ("", "gen-1", "gen-000001x", "../gen-000001", "\xff\x00")
+        ),
+        ("gen-000009\n", "the generation gen-000009 is missing"),
+        ("gen-000002\n", "the manifest is that of gen-000001"),
+    ],
+)
+def test_a_current_file_that_names_no_generation_or_another_one_is_corrupt(folder, text, words):
     shutil.copytree(folder, folder.parent / "gen-000002")
-    (folder.parent / "CURRENT").write_text("gen-000002\n")
-    with pytest.raises(CorruptIndex, match="the manifest is that of gen-000001"):
-        reopened(folder)
+    (folder.parent / "CURRENT").write_text(text)
+    with pytest.raises(CorruptIndex, match=words):
+        opened(folder)
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_missing_file_is_named(folder, name):
-    (folder / name).unlink()
-    with pytest.raises(CorruptIndex, match=rf"{name}: cannot be read .*retrieve build-index"):
-        reopened(folder, verify=False)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_file_cut_at_any_of_many_lengths_is_named_even_without_verifying(folder, name):
-    whole = (folder / name).read_bytes()
-    cuts = sorted({0, 1, 10, len(whole) // 3, len(whole) // 2, len(whole) - 2} & set(range(len(whole))))
-    for length in cuts:
-        (folder / name).write_bytes(whole[:length])
-        with pytest.raises(CorruptIndex, match=name):
-            reopened(folder, verify=False)
-    (folder / name).write_bytes(whole + b"\n")
-    if name != "manifest.json":
-        with pytest.raises(CorruptIndex, match=name):
-            reopened(folder, verify=False)
-
-
-def test_the_manifest_cut_at_any_length_is_corrupt(folder):
-    path = folder / "manifest.json"
-    whole = path.read_bytes()
-    for length in [*range(0, len(whole) - 1, 13), len(whole) - 2]:  # the last byte is the final line break
-        path.write_bytes(whole[:length])
-        with pytest.raises(CorruptIndex, match=r"manifest\.json"):
-            reopened(folder, verify=False)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_one_flipped_bit_anywhere_is_found_and_named(folder, name):
+def test_a_file_that_is_missing_cut_or_longer_is_named_even_without_verifying(folder, name):
     path = folder / name
     whole = path.read_bytes()
-    rng = np.random.default_rng(0)
-    places = [0, len(whole) // 2, len(whole) - 2, *rng.integers(len(whole) - 1, size=20)]
-    for place in places:
-        flip(path, int(place), int(rng.integers(8)))
-        with pytest.raises((CorruptIndex, UnsupportedFormat), match=name):
-            reopened(folder)
-        path.write_bytes(whole)
-    assert reopened(folder).count == 20
+    path.unlink()
+    with pytest.raises(CorruptIndex, match=rf"{name}: cannot be read .*retrieve build-index"):
+        opened(folder, verify=False)
+    lengths = range(0, len(whole) - 1, 13) if name == "manifest.json" else {0, 1, 10, len(whole) // 2, len(whole) - 2}
+    for content in (*(whole[:length] for length in lengths), *([] if name == "manifest.json" else [whole + b"\n"])):
+        path.write_bytes(content)
+        with pytest.raises(CorruptIndex, match=name):
+            opened(folder, verify=False)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_whatever_is_flipped_or_cut_in_an_index_of_any_kind_is_found_by_its_digest(tmp_path, kind):
-    count = 650  # what the codes of the largest kinds need
-    arrays, documents = {"halves": np.ones((count, 3), np.float16)}, {"calibration": {"a": 1}}
-    folder = filled(tmp_path, count, kind, arrays=arrays, documents=documents).folder
+def test_one_flipped_bit_anywhere_in_an_index_of_any_kind_is_found_by_its_digest(tmp_path, kind):
+    folder = make(tmp_path, 650, kind)  # what the codes of the largest kinds need
     rng = np.random.default_rng(0)
     for path in sorted(folder.iterdir()):
         whole = path.read_bytes()
-        for place in rng.integers(len(whole) - 1, size=6).tolist():  # the last byte is a line break in some
-            flip(path, place, int(rng.integers(8)))
+        for place in [0, len(whole) // 2, len(whole) - 2, *rng.integers(len(whole) - 1, size=6).tolist()]:
+            flip(path, place, int(rng.integers(8)))  # the last byte is a line break in some
             with pytest.raises((CorruptIndex, UnsupportedFormat), match=path.name):
-                reopened(folder)
-            path.write_bytes(whole[:place])
-            with pytest.raises(CorruptIndex, match=path.name):
-                reopened(folder, verify=False)
+                IndexStore(tmp_path).open()
             path.write_bytes(whole)
-    assert reopened(folder).count == count
+    assert IndexStore(tmp_path).open().count == 650
 
 
 @pytest.mark.parametrize("kind", ["ivf_flat", "ivf_sq8", "ivf_pq"])
@@ -157,10 +146,8 @@ def test_an_id_out_of_range_in_a_structure_is_an_error_of_the_search(tmp_path, k
         ids = np.full(lists.list_size(number), wrong, np.int64)
         lists.update_entries(number, 0, len(ids), faiss.swig_ptr(ids), lists.get_codes(number))
     faiss.write_index(structure, str(folder / "vectors.faiss"))
-    files = json.loads((folder / "manifest.json").read_text())["files"]
-    files["vectors.faiss"]["sha256"] = file_digest(folder / "vectors.faiss")
-    rewrite_manifest(folder, files=files)
-    generation = reopened(folder)
+    forge(folder)
+    generation = IndexStore(tmp_path).open()
     for search in (generation.search, generation.candidates):
         with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, the index has 650.*build-index"):
             search(unit(3), 4)
@@ -196,9 +183,9 @@ def test_naive_faiss_loads_a_flipped_bit_in_silence_and_answers_wrongly(tmp_path
 def test_without_verifying_the_content_is_trusted(folder):
     path = folder / "calibration.json"
     path.write_text(path.read_text().replace("1", "2"))
-    assert reopened(folder, verify=False).documents == {"calibration": {"a": 2}}
+    assert opened(folder, verify=False).documents == {"calibration": {"a": 2}}
     with pytest.raises(CorruptIndex, match=r"calibration\.json: the SHA-256 differs"):
-        reopened(folder)
+        opened(folder)
 
 
 @pytest.mark.parametrize("name", ["vectors.faiss", *TABLES])
@@ -206,67 +193,213 @@ def test_garbage_of_the_right_size_never_escapes_as_a_raw_exception(folder, name
     path = folder / name
     path.write_bytes(b"\x93" * path.stat().st_size)
     with pytest.raises(CorruptIndex):
-        reopened(folder, verify=False).rows[3]  # rows are read when somebody looks
+        opened(folder, verify=False)
 
 
 def test_a_pickled_array_is_not_loaded(folder):
-    path = folder / "halves.npy"
-    np.save(path, np.array([{"a": 1}] * 20, dtype=object), allow_pickle=True)
-    files = json.loads((folder / "manifest.json").read_text())["files"]
-    files["halves.npy"]["bytes"] = path.stat().st_size
-    rewrite_manifest(folder, files=files)
+    np.save(folder / "halves.npy", np.array([{"a": 1}] * 20, dtype=object), allow_pickle=True)
+    forge(folder)
     with pytest.raises(CorruptIndex, match="cannot be read"):
-        reopened(folder, verify=False)
+        opened(folder)
 
 
 @pytest.mark.parametrize(
-    ("version", "words"),
-    [(4, "newer format 4.*update"), (1, "older format 1.*build-index"), (0, "older format 0"), (-1, "older")],
+    ("fields", "error", "words"),
+    [
+        ({"format": 5}, UnsupportedFormat, "newer format 5, this software reads 4; update"),
+        *(({"format": old}, UnsupportedFormat, f"older format {old}.*build-index") for old in (3, 2, 0, -1)),
+        *(({"format": odd}, CorruptIndex, "must say its format version") for odd in (None, "1", True, 1.5, [1])),
+        ({"kind": "quantum"}, UnsupportedFormat, r"quantum.*Update the software"),
+        ({"kind": "ivf_flat", "parameters": {}, "asked": {}}, CorruptIndex, "IndexHNSWFlat"),
+        ({"colour": "red"}, CorruptIndex, "has no setting 'colour'"),
+    ],
 )
-def test_other_formats_say_whether_they_are_newer_or_older(folder, version, words):
-    rewrite_manifest(folder, format=version)
-    with pytest.raises(UnsupportedFormat, match=words):
-        reopened(folder)
-
-
-@pytest.mark.parametrize("version", [None, "1", True, 1.5, [1]])
-def test_a_format_that_is_no_number_is_corrupt(folder, version):
-    rewrite_manifest(folder, format=version)
-    with pytest.raises(CorruptIndex, match="must say its format version"):
-        reopened(folder)
-
-
-def test_a_kind_that_this_software_does_not_know_is_unsupported(folder):
-    rewrite_manifest(folder, kind="quantum")
-    with pytest.raises(UnsupportedFormat, match=r"quantum.*Update the software"):
-        reopened(folder)
+def test_manifests_of_other_software_say_what_is_wrong(folder, fields, error, words):
+    forge(folder, **fields)
+    with pytest.raises(error, match=words):
+        opened(folder)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", '"x"', "null", "[" * 100_000])
 def test_a_manifest_that_is_no_object_is_corrupt(folder, text):
     (folder / "manifest.json").write_text(text)
     with pytest.raises(CorruptIndex, match=r"manifest\.json: must be"):
-        reopened(folder)
+        opened(folder)
 
 
-@pytest.mark.parametrize("field", ["rows", "slots", "tombstones"])
-def test_counts_that_the_files_do_not_bear_out_are_corrupt(folder, field):
-    counts = json.loads((folder / "manifest.json").read_text())["counts"]
-    rewrite_manifest(folder, counts=counts | {field: counts[field] + 1})
-    with pytest.raises(CorruptIndex, match=r"the manifest says .* the files hold"):
-        reopened(folder)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+FIELDS = ["about", "arrays", "asked", "counts", "dim", "documents", "files", "fingerprint", "format", "generation"]
+FIELDS += ["kind", "parameters", "parent", "recall", "seed", "metric", "created", "software"]
 
 
-def test_missing_and_unknown_fields_are_named(folder):
-    rewrite_manifest(folder, colour="red")
-    with pytest.raises(CorruptIndex, match="differs in colour"):
-        reopened(folder)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(field=st.sampled_from(FIELDS), value=JSON)
+def test_any_field_of_the_manifest_may_be_forged(kept, field, value):
+    before = (kept / "manifest.json").read_bytes()
+    forge(kept, lambda content: content.__setitem__(field, value))
+    try:
+        opened(kept)
+    except IndexesError:
+        pass
+    finally:
+        (kept / "manifest.json").write_bytes(before)
 
 
-def test_a_structure_of_other_vectors_is_corrupt(folder):
-    rewrite_manifest(folder, kind="ivf_flat", parameters={}, asked={})
-    with pytest.raises(CorruptIndex, match="IndexHNSWFlat"):
-        reopened(folder)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["files"].__setitem__("../../../etc/passwd", {"bytes": 1, "sha256": ""}),
+        lambda content: content["files"].__setitem__("a\0b", {"bytes": 1, "sha256": ""}),
+        lambda content: content["files"]["calibration.json"].pop("bytes"),
+        lambda content: content["files"].pop("rows.jsonl"),
+        lambda content: content["documents"].append("calibration"),
+        lambda content: content["documents"].append("halves"),
+        lambda content: content["arrays"].append("halves"),
+        lambda content: content["documents"].append("../../secret"),
+        lambda content: content["arrays"].append("../../secret"),
+        lambda content: content["files"].__setitem__("rows.jsonl\n", {"bytes": 1, "sha256": ""}),
+        lambda content: content["counts"].__setitem__("records", 20),
+        lambda content: content["files"]["calibration.json"].__setitem__("colour", "red"),
+        lambda content: content.pop("dim"),
+        *(
+            lambda content, name=name: content["counts"].__setitem__(name, content["counts"][name] + 1)
+            for name in ("rows", "slots", "tombstones")
+        ),
+        lambda content: content["counts"].__setitem__("rows", 2**70),
+        lambda content: content["counts"].__setitem__("rows", True),
+        lambda content: content.__setitem__("dim", 10**9),
+        lambda content: content.__setitem__("about", json.loads("[" * 900 + "]" * 900)),
+    ],
+)
+def test_a_forged_manifest_is_refused(folder, change):
+    forge(folder, change)
+    with pytest.raises(CorruptIndex):
+        opened(folder)
+
+
+def out_of(field, value):
+    def change(table):
+        table[field][3] = value
+        return table
+
+    return change
+
+
+def same(field):
+    def change(table):
+        table[field][4] = table[field][3] if field != "object_id" else b"other"
+        return table
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("table.npy", out_of("stop", -1)),
+        ("table.npy", out_of("stop", 2**40)),
+        ("table.npy", lambda table: table[:-1]),  # lines that no row has
+        ("table.npy", lambda table: table[[0, *range(20 - 1)]]),  # two rows of one id
+        ("table.npy", same("id")),
+        ("table.npy", same("stop")),  # a row without a line
+        ("table.npy", same("object_id")),  # of one row, to rank its object twice
+        ("table.npy", out_of("slot", -1)),
+        ("table.npy", out_of("slot", 10**6)),
+        ("table.npy", lambda table: table[:0]),
+        ("table.npy", lambda table: table["stop"]),
+        ("halves.npy", lambda halves: halves[:7]),
+        ("embeddings.npy", lambda vectors: vectors * np.float32("nan")),
+        ("embeddings.npy", lambda vectors: vectors * 1000),
+        ("embeddings.npy", lambda vectors: vectors[:, :5]),
+        ("embeddings.npy", lambda vectors: vectors.astype(complex)),
+        ("embeddings.npy", lambda vectors: vectors[0, 0]),
+    ],
+)
+def test_a_forged_array_is_refused(folder, name, change):
+    np.save(folder / name, change(np.load(folder / name)))
+    forge(folder)
+    with pytest.raises(CorruptIndex):
+        opened(folder)
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(line=st.binary(max_size=30) | JSON.map(lambda row: json.dumps(row).encode()))
+def test_any_row_may_be_forged(kept, line):
+    path = kept / "rows.jsonl"
+    before, manifest = path.read_bytes(), (kept / "manifest.json").read_bytes()
+    length = before.index(b"\n")
+    path.write_bytes(line[:length].ljust(length) + before[length:])
+    forge(kept)
+    try:
+        opened(kept)
+    except IndexesError:
+        pass
+    finally:
+        path.write_bytes(before)
+        (kept / "manifest.json").write_bytes(manifest)
+
+
+def test_a_row_nested_deeper_than_anyone_reads_is_refused_as_it_is_written(tmp_path):
+    deep = json.loads("[" * DEEPEST + "]" * DEEPEST)
+    rows = rows_of(names(2))
+    with pytest.raises(RowError, match="must not be nested deeper than 64 levels"):
+        IndexStore(tmp_path).write([rows[0], rows[1] | {"metadata": deep}], unit(2), fingerprint=FINGERPRINT)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "rows.jsonl", "calibration.json", "../CURRENT"])
+@pytest.mark.parametrize("verify", [True, False])
+def test_what_is_no_file_is_refused_without_being_read(folder, name, verify):
+    path = folder / name
+    path.unlink()
+    server = socket.socket(socket.AF_UNIX)
+    for make_it in (os.mkfifo, server.bind, lambda there: os.symlink("/dev/zero", there), os.mkdir):
+        make_it(str(path))
+        with pytest.raises(IndexesError, match=r"is a (pipe|socket|device|folder), not a"):
+            IndexStore(folder.parent).open(verify=verify)
+        path.rmdir() if path.is_dir() else path.unlink()
+    server.close()
+
+
+def test_a_file_larger_than_what_is_read_whole_is_refused_unread(tmp_path):
+    (tmp_path / "large").touch()
+    os.truncate(tmp_path / "large", 2**40)
+    with pytest.raises(OSError, match="has 1099511627776 bytes; at most 536870912 are read"):
+        read_regular(tmp_path / "large")
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "calibration.json"])
+def test_a_json_file_larger_than_its_index_needs_is_refused_at_once_and_unread(folder, name):
+    with (folder / name).open("ab") as file:
+        file.truncate(300 * 10**6)
+    if name != "manifest.json":
+        forge(folder, lambda content: content["files"][name].__setitem__("sha256", ""))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    with pytest.raises(CorruptIndex, match=r"has 300000000 bytes; at most \d+ are read"):
+        opened(folder, verify=False)  # the digest of 300 MB would be taken first
+    assert time.perf_counter() - start < 1
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_a_manifest_that_has_a_key_twice_is_refused(folder):
+    path = folder / "manifest.json"
+    path.write_text(path.read_text().replace('"documents": [', '"documents": [], "documents": [', 1))
+    with pytest.raises(CorruptIndex, match="it has the key 'documents' twice"):
+        opened(folder)
+
+
+@pytest.mark.parametrize("field", ["about", "documents", "rows"])
+def test_json_larger_than_a_reader_takes_is_refused_as_it_is_written(tmp_path, field):
+    long = {"note": "x" * 5 * 10**6}
+    more = {"rows": {}, "about": {"about": long}, "documents": {"documents": {"calibration": long}}}[field]
+    rows = [row | (long if field == "rows" else {}) for row in rows_of(names(2))]
+    with pytest.raises(RowError, match=r"must have (at most|less than) \d+ bytes"):
+        IndexStore(tmp_path).write(rows, unit(2), fingerprint=FINGERPRINT, **more)
+    assert not (tmp_path / "CURRENT").exists()
 
 
 @pytest.mark.parametrize(
@@ -279,13 +412,11 @@ def test_a_structure_of_other_vectors_is_corrupt(folder):
 )
 def test_another_model_or_preprocessing_is_a_mismatch_naming_both(folder, expect, words):
     with pytest.raises(MismatchedIndex, match=words):
-        reopened(folder, expect=expect)
-    assert reopened(folder, expect={"checkpoint": "abc"}).count == 20
+        opened(folder, expect=expect)
+    assert opened(folder, expect={"checkpoint": "abc"}).count == 20
 
 
 def test_every_error_leaves_with_the_promised_exit_code():
-    import indexes.errors
-
     found = [thing for thing in vars(indexes.errors).values() if hasattr(thing, "exit_code")]
     assert {thing.__name__ for thing in found if thing.exit_code == 1} == {
         "JobFailed",
@@ -296,8 +427,31 @@ def test_every_error_leaves_with_the_promised_exit_code():
     assert all(issubclass(thing, IndexesError) and thing.exit_code in (1, 2) for thing in found)
 
 
+def test_files_of_the_user_in_the_folder_of_an_index_stay(tmp_path):
+    (tmp_path / "CURRENT").write_text("my notes on electricity")
+    with pytest.raises(NoIndex, match="is not of an index, and is left as it is"):
+        filled(tmp_path)
+    assert (tmp_path / "CURRENT").read_text() == "my notes on electricity"
+    (tmp_path / "CURRENT").unlink()
+    (tmp_path / "LOCK").write_text("the combination is 1234")
+    with pytest.raises(WriteFailed, match="is not the lock file of an index"):
+        filled(tmp_path)
+    assert (tmp_path / "LOCK").read_text() == "the combination is 1234"
+    (tmp_path / "LOCK").unlink()
+    (tmp_path / "photo.jpg").write_text("a photo")
+    (tmp_path / "LOCK").symlink_to("photo.jpg")
+    with pytest.raises(WriteFailed, match="cannot be opened"):
+        filled(tmp_path)
+    assert (tmp_path / "photo.jpg").read_text() == "a photo"
+    (tmp_path / "LOCK").unlink()
+    (tmp_path / "notes.tmp-1").write_text("not yours")
+    filled(tmp_path)
+    filled(tmp_path)
+    assert (tmp_path / "notes.tmp-1").read_text() == "not yours"
+
+
 def test_a_damaged_index_is_not_in_the_way_of_a_new_one(folder):
     (folder.parent / "CURRENT").write_text("garbage")
     (folder / "manifest.json").unlink()
     make(folder.parent)
-    assert reopened(folder).name == "gen-000002"
+    assert opened(folder).name == "gen-000002"

@@ -18,8 +18,10 @@ from indexes.store.generation import Generation
 
 DIM = 8
 FINGERPRINT = {"checkpoint": "abc", "preprocessing": "def"}
+MORE = {"fingerprint": FINGERPRINT, "threads": 1}
 EVERY_KIND = list(KINDS)
 APPROXIMATE = [name for name in KINDS if not load_kind(name).exact]
+EXACT = [name for name in KINDS if load_kind(name).exact]
 
 
 def unit(count: int, dim: int = DIM, seed: int = 0) -> np.ndarray:
@@ -37,8 +39,7 @@ def names(count: int, start: int = 0) -> list[str]:
 
 def filled(path, count: int = 20, kind: str = "flat", **more) -> Generation:
     """A small index of `count` random vectors."""
-    values = {"fingerprint": FINGERPRINT, "kind": kind, "threads": 1} | more
-    return IndexStore(path).write(rows_of(names(count)), unit(count), **values)
+    return IndexStore(path).write(rows_of(names(count)), unit(count), **MORE | {"kind": kind} | more)
 
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
@@ -104,16 +105,10 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     tables = ["embeddings.npy", "rows.jsonl", "table.npy"]
     assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert manifest["format"] == 3
-    assert manifest["generation"] == "gen-000001"
-    assert manifest["parent"] is None
-    assert manifest["fingerprint"] == FINGERPRINT
-    assert manifest["about"] == {"catalogue": "mugs/"}
-    assert manifest["software"] == "1.2"
-    assert manifest["kind"] == "hnsw"
-    assert manifest["metric"] == "inner_product"
-    assert manifest["dim"] == DIM
-    assert manifest["counts"] == {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20, "structure_slots": 20}
+    counts = {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20}
+    must = {"format": 4, "generation": "gen-000001", "parent": None, "fingerprint": FINGERPRINT, "software": "1.2"}
+    must |= {"about": {"catalogue": "mugs/"}, "kind": "hnsw", "metric": "inner_product", "dim": DIM, "counts": counts}
+    assert {key: manifest[key] for key in must} == must
     assert manifest["recall"]["value"] == 1.0
     assert sorted(manifest["files"]) == [name for name in found if name != "manifest.json"]
     first = json.loads((folder / "rows.jsonl").read_text().splitlines()[0])
@@ -159,9 +154,7 @@ def test_ties_between_slots_go_by_row_id_whatever_the_order_of_writing(tmp_path)
 def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path, kind):
     store, count = IndexStore(tmp_path), 700
     halves = np.arange(count, dtype=np.float32)[:, None]
-    first = store.write(
-        rows_of(names(count)), unit(count), {"halves": halves}, fingerprint=FINGERPRINT, kind=kind, threads=1
-    )
+    first = store.write(rows_of(names(count)), unit(count), {"halves": halves}, kind=kind, **MORE)
     # p00000 goes, p00001 changes, "new" comes; the rest stays, in another order and with other metadata.
     kept = [row | {"price": 3} for row in rows_of(names(count - 2, start=2))][::-1]
     wanted = [{"id": "new", "digest": "1"}, *kept, {"id": "p00001", "digest": "2"}]
@@ -169,7 +162,7 @@ def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path,
     assert sorted(reuse) == names(count - 2, start=2)
     assert reuse["p00005"] == 5
     fresh, extra = unit(2, seed=9), np.array([[-1.0], [-2.0]], np.float32)
-    second = store.write(wanted, fresh, {"halves": extra}, fingerprint=FINGERPRINT, kind=kind, parent=first, threads=1)
+    second = store.write(wanted, fresh, {"halves": extra}, kind=kind, parent=first, **MORE)
     assert second.manifest.parent == "gen-000001"
     assert second.rows == wanted
     expected = np.concatenate([fresh[:1], unit(count)[2:][::-1], fresh[1:]])
@@ -189,14 +182,8 @@ def test_removed_rows_leave_tombstones_until_a_tenth_is_gone(tmp_path, kind):
     store, count = IndexStore(tmp_path), 1000
     generation = filled(tmp_path, count, kind)
     for removed, slots, tombstones in [(50, 1000, 50), (100, 1000, 100), (101, 899, 0), (150, 899, 49)]:
-        generation = store.write(
-            rows_of(names(count - removed, start=removed)),
-            None,
-            fingerprint=FINGERPRINT,
-            kind=kind,
-            parent=generation,
-            threads=1,
-        )
+        rows = rows_of(names(count - removed, start=removed))
+        generation = store.write(rows, None, kind=kind, parent=generation, **MORE)
         counts = generation.manifest.counts
         assert (counts.rows, counts.slots, counts.tombstones) == (count - removed, slots, tombstones)
         # The removed vectors themselves are asked for: their neighbours fill all the places.
@@ -208,9 +195,8 @@ def test_removed_rows_leave_tombstones_until_a_tenth_is_gone(tmp_path, kind):
 def test_a_removed_row_that_comes_back_takes_up_its_old_slot(tmp_path):
     store, all_rows = IndexStore(tmp_path), rows_of(names(100))
     first = filled(tmp_path, 100, "hnsw")
-    more = {"fingerprint": FINGERPRINT, "kind": "hnsw", "threads": 1}
-    second = store.write(all_rows[1:], None, parent=first, **more)
-    third = store.write(all_rows, unit(100)[:1], parent=second, **more)
+    second = store.write(all_rows[1:], None, parent=first, kind="hnsw", **MORE)
+    third = store.write(all_rows, unit(100)[:1], parent=second, kind="hnsw", **MORE)
     assert third.manifest.counts.tombstones == 0
     assert third.manifest.counts.slots == 100
 
@@ -219,14 +205,7 @@ def test_inverted_lists_are_trained_again_when_the_index_has_more_than_doubled(t
     store, generation = IndexStore(tmp_path), filled(tmp_path, 400, "ivf_flat")
     for count, built in [(600, 400), (800, 400), (801, 801)]:
         fresh = unit(count)[generation.count :] if count < 801 else unit(1, seed=5)
-        generation = store.write(
-            rows_of(names(count)),
-            fresh,
-            fingerprint=FINGERPRINT,
-            kind="ivf_flat",
-            parent=generation,
-            threads=1,
-        )
+        generation = store.write(rows_of(names(count)), fresh, kind="ivf_flat", parent=generation, **MORE)
         assert generation.manifest.counts.built_slots == built
     assert generation.manifest.parameters["lists"] == 801 // 39
 
@@ -234,23 +213,9 @@ def test_inverted_lists_are_trained_again_when_the_index_has_more_than_doubled(t
 def test_other_parameters_or_another_kind_build_the_structure_anew_from_the_kept_vectors(tmp_path):
     store, generation = IndexStore(tmp_path), filled(tmp_path, 700, "hnsw")
     rows = rows_of(names(699, start=1))
-    for kind, parameters in [
-        ("hnsw", HNSWParameters(neighbours=8)),
-        ("ivf_flat", None),
-        ("ivf_pq", None),
-        ("flat", None),
-        ("exact", None),
-        ("hnsw", None),
-    ]:
-        generation = store.write(
-            rows,
-            None,
-            fingerprint=FINGERPRINT,
-            kind=kind,
-            parameters=parameters,
-            parent=generation,
-            threads=1,
-        )
+    turns = [("hnsw", HNSWParameters(neighbours=8)), *((kind, None) for kind in APPROXIMATE + EXACT), ("hnsw", None)]
+    for kind, parameters in turns:
+        generation = store.write(rows, None, kind=kind, parameters=parameters, parent=generation, **MORE)
         assert generation.manifest.kind == kind
         counts = generation.manifest.counts
         assert (counts.rows, counts.built_slots, counts.tombstones) == (699, 700, 1)
@@ -308,23 +273,15 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
         ({"embeddings": None}, VectorError, "each of the 3 new rows; got 0"),
         ({"embeddings": unit(3) * np.float32(2)}, VectorError, "row 'a': the norm must be 1"),
         ({"arrays": {"halves": np.zeros((2, 4))}}, RowError, "each of 3 new rows; got 2"),
-        (
-            {"arrays": {"halves": np.array([[1], [np.inf], [2]], np.float16)}},
-            RowError,
-            "row 'b' holds NaN or inf",
-        ),
+        ({"arrays": {"halves": np.float16([[1], [np.inf], [2]])}}, RowError, "row 'b' holds NaN or inf"),
         ({"arrays": {"halves": np.array([{}, 1, 2])}}, RowError, "array of numbers"),
         ({"arrays": {"halves": np.zeros((3, 0))}}, RowError, "at least one number"),
         ({"arrays": {"rows": np.zeros(3)}}, RowError, "lower-case words"),
         ({"arrays": {"../x": np.zeros(3)}}, RowError, "lower-case words"),
         ({"documents": {"manifest": {}}}, RowError, "lower-case words"),
         ({"documents": {"calibration": {"a": float("nan")}}}, RowError, "document 'calibration'"),
-        (
-            {"documents": {"touches": np.float16([1, np.nan])}},
-            RowError,
-            "document 'touches': an array must hold finite",
-        ),
-        ({"documents": {"touches": np.array([{}])}}, RowError, "document 'touches': an array must hold finite"),
+        ({"documents": {"touches": np.float16([1, np.nan])}}, RowError, "'touches': an array must hold finite"),
+        ({"documents": {"touches": np.array([{}])}}, RowError, "'touches': an array must hold finite"),
         ({"documents": {"x": 1}, "arrays": {"x": np.zeros(3)}}, RowError, "cannot share a name"),
         ({"fingerprint": {"checkpoint": 3}}, RowError, "fingerprint must map text to text"),
         ({"about": {"a": float("inf")}}, RowError, "about must be JSON"),
@@ -445,9 +402,7 @@ def test_a_reader_keeps_its_generation_while_a_writer_makes_four_more(tmp_path):
         assert np.array_equal(a[0], b[0])
     assert IndexStore(tmp_path).open().count == 2
     # Even a deleted generation can be the parent of the next.
-    again = IndexStore(tmp_path).write(
-        reader.rows, None, fingerprint=FINGERPRINT, parent=reader, kind="hnsw", threads=1
-    )
+    again = IndexStore(tmp_path).write(reader.rows, None, parent=reader, kind="hnsw", **MORE)
     assert np.array_equal(again.arrays["halves"], halves)
 
 

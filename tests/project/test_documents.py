@@ -1,7 +1,7 @@
 """Plain documents as typed values, and what is said of those that do not fit."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -24,6 +24,8 @@ class Sensor:
     name: str | None = None
     frozen: bool = False
     lights: dict[str, float] | None = None
+    spares: tuple[Gel, ...] = ()
+    by_name: dict[str, Gel] = field(default_factory=dict)
 
 
 def test_tables_become_dataclasses_lists_tuples_and_whole_numbers_floats():
@@ -41,6 +43,8 @@ def test_tables_become_dataclasses_lists_tuples_and_whole_numbers_floats():
         ({"gel": {}}, "[sensor].gel: object missing required field `pitch_mm`"),
         ({"gel": [2]}, "[sensor].gel must be a table, got [2]"),
         ({"gel": {"pitch_mm": 2, "lamp": 1}}, "[sensor].gel has no setting 'lamp'; it knows markers, pitch_mm"),
+        ({"spares": [{"pitch_mm": 2, "lamp": 1}]}, "[sensor].spares has no setting 'lamp'; it knows markers, pitch_mm"),
+        ({"by_name": {"a": {"pitch_mm": 2, "lamp": 1}}}, "[sensor].by_name has no setting 'lamp'; it knows markers"),
         ({"sides": [1]}, "[sensor].sides must be a list of length 2, got [1]"),
         ({"sides": [1, "x"]}, "[sensor].sides[1] must be a number, got 'x'"),
         ({"name": 3}, "[sensor].name must be a text in quotes or nothing, got 3"),

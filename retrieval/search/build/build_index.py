@@ -14,7 +14,7 @@ from indexes.kinds.base import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
-from indexes.store.seen_folders import SeenFolders
+from indexes.store.stat_cache import FolderCache
 from indexes.store.tables import Tables
 from indexes.store.writing import RECALL_QUERIES, Chosen
 from retrieval.data.catalogue import Catalogue
@@ -96,7 +96,7 @@ def build_index(
     except IndexesError:
         before = {}
     naming, note = naming_by(objects_from, before)
-    seen = SeenFolders(out, known=not verify)
+    seen = FolderCache(out, known=not verify)
     catalogue = list_photos(folder, naming, seen)
     report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, asked, quiet, verify, note))
     seen.write()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
+from indexes.store.rows import keys_of
 from indexes.store.tables import Block, Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
@@ -211,7 +212,7 @@ class Embedder:
         for holder in self._holders:
             if not (wanted := [digest for digest in digests if digest not in found]):
                 break
-            numbers = holder.rows.holding(wanted)
+            numbers = holder.rows.by_digest.find(keys_of(wanted))
             having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
             halves, is_remade = holder.arrays["halves"][rows], holder is self._halves

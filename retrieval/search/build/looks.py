@@ -5,7 +5,6 @@ so a file that had changed just before a build looked at it is not noted, and th
 does with its "racily clean" files.
 """
 
-import json
 import os
 import struct
 import time
@@ -17,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.files import encoded
 from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
-from indexes.store.rows import keys_of
-from indexes.store.seen import LOOKS, SETTLED_NS, Looks, Seen
+from indexes.store.rows import key_of, keys_of
+from indexes.store.stat_cache import SETTLED_NS, STATUS, Statuses, StatRecords
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.sources import Fetched
 
@@ -28,8 +28,7 @@ LEAST_RUN = 256
 """Photos in a row that are worth being taken over as they lie; each such run ends a batch of photos to encode."""
 
 _MASK = 2**64 - 1
-_LOOK = struct.Struct(f"={len(LOOKS)}Q")
-_UNSEEN = bytes(_LOOK.size)
+_LOOK = struct.Struct(f"={len(STATUS)}Q")
 _BARE = b'"metadata": {}}'
 """How the line of a row without metadata ends, as `row_of` has it last."""
 
@@ -44,23 +43,21 @@ class Looked:
     def __init__(self, catalogue: Catalogue, index: Path, verify: bool = False) -> None:
         self.photos = catalogue.photos
         self.ids = keys_of(self.photos.paths)
-        self._seen = Seen(index)
-        self._local, self._verify = not isinstance(catalogue, Fetched), verify
-        self._looks, self._settled = _looks(catalogue) if self._local else _unknown(len(self.photos))
-        self.unnoted = self._local and not verify and not len(self._seen.records)
+        self._seen = StatRecords(index)
+        self._verify = verify
+        self._looks, self._settled = _looks(catalogue)
+        self.unnoted = not isinstance(catalogue, Fetched) and not verify and not len(self._seen.records)
 
     def known(self, parent: Generation | None) -> Slots:
         """For each photo the parent's row (N,) of its id and content, where its file need not be read; else -1."""
-        if parent is None or self._verify or not self._local:
+        if parent is None or self._verify:
             return np.full(len(self.photos), -1)
         digests = self._seen.digests(self.ids, self._looks)
-        return parent.matching_keys(self.ids, digests)
+        return parent.matching(self.ids, digests)
 
     def note(self, made: Generation) -> None:
         """Write down how files look whose content is that of the generation's rows, for the next build."""
-        if not self._local:
-            return
-        numbers = made.rows.find_keys(self.ids)
+        numbers = made.rows.by_id.find(self.ids)
         good = (numbers >= 0) & self._settled
         self._seen.write(self.ids[good], made.rows.table["digest"][numbers[good]], self._looks[good])
 
@@ -82,25 +79,16 @@ def _as_they_are(photos: Photos, known: Slots, parent: Generation) -> NDArray[np
 
     Rows without metadata are compared by the keys of their objects, and not parsed.
     """
-    names = list(dict.fromkeys(photos.objects))
-    number_of = {name: number for number, name in enumerate(names)}
-    objects = keys_of(names)[[number_of[name] for name in photos.objects]]
+    key_of_name = {name: key_of(name) for name in photos.objects}
+    objects = np.array([key_of_name[name] for name in photos.objects], "S16")
     same: NDArray[np.bool_] = (known >= 0) & (parent.rows.table["object_id"][known] == objects)
     telling = ~parent.rows.ending(_BARE)[known]
     if photos.metadata:
         telling |= [path in photos.metadata for path in photos.paths]
     for place in np.flatnonzero(same & telling).tolist():
-        same[place] = _is_row(photos[place], parent, int(known[place]))
+        number = int(known[place])
+        same[place] = parent.rows.line(number) == encoded(row_of(photos[place], parent.rows[number]["digest"]))
     return same
-
-
-def _is_row(photo: CataloguePhoto, parent: Generation, number: int) -> bool:
-    try:
-        row = json.loads(parent.rows.line(number))
-        said = {**row, "metadata": repr(row["metadata"])}  # 1, 1.0 and true are equal, and not the same
-    except (ValueError, TypeError, KeyError):
-        return False
-    return bool(said == row_of(photo, row.get("digest")) | {"metadata": repr(photo.metadata)})
 
 
 def row_of(photo: CataloguePhoto, digest: str) -> dict[str, Any]:
@@ -114,28 +102,27 @@ def row_of(photo: CataloguePhoto, digest: str) -> dict[str, Any]:
     }
 
 
-def _looks(catalogue: Catalogue) -> tuple[Looks, NDArray[np.bool_]]:
-    """Of each file (N, 4), and whether it had been left alone for `SETTLED_NS`."""
+def _looks(catalogue: Catalogue) -> tuple[Statuses, NDArray[np.bool_]]:
+    """Of each file (N, 4), and whether it had been left alone for `SETTLED_NS`; zeros where the disk does not tell."""
     now, paths, looks = time.time_ns(), catalogue.photos.paths, list[bytes]()
+    unknown = np.zeros((len(paths), len(STATUS)), np.uint64), np.zeros(len(paths), bool)
+    if isinstance(catalogue, Fetched):
+        return unknown
     try:
         folder = os.open(catalogue.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError:  # gone since it was listed
-        return _unknown(len(paths))
+        return unknown
     try:
         for path in paths:  # below an open folder they are found sooner
             try:
                 found = os.stat(path, dir_fd=folder)
             except (OSError, ValueError):  # reading it will say why
-                looks.append(_UNSEEN)
+                looks.append(bytes(_LOOK.size))
                 continue
             modified, changed = found.st_mtime_ns & _MASK, found.st_ctime_ns & _MASK
             looks.append(_LOOK.pack(found.st_size & _MASK, modified, changed, found.st_ino & _MASK))
     finally:
         os.close(folder)
-    table = np.frombuffer(b"".join(looks), np.uint64).reshape(-1, len(LOOKS))
+    table = np.frombuffer(b"".join(looks), np.uint64).reshape(-1, len(STATUS))
     times = table[:, 1:3].view(np.int64)
     return table, (times.max(axis=1) + SETTLED_NS < now) & table.any(axis=1)
-
-
-def _unknown(count: int) -> tuple[Looks, NDArray[np.bool_]]:
-    return np.zeros((count, len(LOOKS)), np.uint64), np.zeros(count, bool)

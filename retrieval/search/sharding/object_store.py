@@ -152,7 +152,7 @@ class StoredCluster:
         the same digest. Raises StorageError."""
         place, own = f"{entry.folder}/{_name(entry)}", self.work / entry.folder / entry.generation
         there = self._sizes(place)
-        must = {name: file["sha256"] for name, file in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
+        must = {name: seal.sha256 for name, seal in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
         for name, sha256 in must.items():
             size = (own / name).stat().st_size
             if there.get(name) != size or (verify and self._try(f"{place}/{name}", self._digest) != sha256):
@@ -276,7 +276,7 @@ class StoredCluster:
         part.mkdir(parents=True, exist_ok=True)
         self._fetch_file(f"{name}/{MANIFEST}", part / MANIFEST, None, sha256)
         for file, must in read_manifest(part).files.items():
-            self._fetch_file(f"{name}/{file}", part / file, must["bytes"], must["sha256"])
+            self._fetch_file(f"{name}/{file}", part / file, must.bytes, must.sha256)
         part.rename(place)
 
     def _fetch_file(self, name: str, file: Path, must: int | None, sha256: str) -> None:

@@ -414,7 +414,7 @@ def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, m
     thread.start()
     until, killed = time.monotonic() + 240, 0
     while thread.is_alive() and killed < 2 and time.monotonic() < until:
-        records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished/*.records"))
+        records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished.sqlite"))
         if records and (workers := on_ray.called(WORKER)):
             os.kill(workers[0], signal.SIGKILL)
             killed += 1

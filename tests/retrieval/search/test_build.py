@@ -73,7 +73,7 @@ def test_a_rebuild_with_nothing_changed_writes_nothing_and_says_so(own, checkpoi
     embedded.clear()
     (own / "note.txt").write_text("no photo")
     (own / "broken.png").write_bytes(b"no photo either")
-    left = {"LOCK", "seen.records", "seen.folders"}  # how files and folders look is noted when they have settled
+    left = {"LOCK", "files.stat", "folders.stat"}  # how files and folders look is noted when they have settled
     before = {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in left}
     report = build_index(own, checkpoint, index, quiet=True)
     assert (embedded, report.embedded, report.reused, report.generation) == ([], 0, 24, "gen-000001")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from indexes.store.folder import IndexStore
-from indexes.store.seen import NAME, Seen
+from indexes.store.stat_cache import FILES, StatRecords
 from retrieval.data.catalogue import list_catalogue, read_photo
 from retrieval.search.build import embed, looks
 from retrieval.search.build.build_index import UNNOTED, build_index
@@ -156,7 +156,7 @@ def test_times_before_1970_and_after_now_are_times_too(own, checkpoint, index, r
 @pytest.mark.usefixtures("an_hour_later")
 def test_an_index_of_an_older_version_is_read_whole_once_and_that_is_said(own, checkpoint, index, read):
     build_index(own, checkpoint, index, quiet=True)
-    (index / NAME).unlink()
+    (index / FILES).unlink()
     read.clear()
     report = build_index(own, checkpoint, index, quiet=True)
     assert (len(read), report.embedded, report.written) == (24, 0, False)
@@ -164,32 +164,11 @@ def test_an_index_of_an_older_version_is_read_whole_once_and_that_is_said(own, c
     assert build_index(own, checkpoint, index, quiet=True).unread == 24
 
 
-@pytest.mark.usefixtures("an_hour_later")
-@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "longer", "folder"])
-def test_notes_that_are_damaged_are_none(harm, own, checkpoint, index, read):
-    build_index(own, checkpoint, index, quiet=True)
-    path = index / NAME
-    content = path.read_bytes()
-    middle = len(content) // 2
-    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    harmed = {"cut": content[:-7], "flipped": flipped, "empty": b"", "longer": content + b"x"}
-    if harm == "folder":
-        path.unlink()
-        path.mkdir()
-        assert len(Seen(index).records) == 0
-        return
-    path.write_bytes(harmed[harm])
-    read.clear()
-    assert not build_index(own, checkpoint, index, quiet=True).written
-    assert len(read) == 24
-    assert path.read_bytes() == content
-
-
 def test_only_files_that_have_settled_are_noted(own, checkpoint, index):
     for path in own.rglob("*.jpg"):
         path.touch()
     build_index(own, checkpoint, index, quiet=True)
-    assert len(Seen(index).records) == 0
+    assert len(StatRecords(index).records) == 0
 
 
 # Rows that are taken over as they lie --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from indexes.store.folder import IndexStore
-from indexes.store.unfinished import FOLDER
+from indexes.store.unfinished import NAME
 from retrieval.commands.main import main
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import embed
@@ -64,7 +64,7 @@ def test_a_first_build_that_was_killed_goes_on_where_it_was(call, own, model, tm
     report = build_index(own, checkpoint, index, quiet=True)
     assert sum(embedded) == PHOTOS - left
     assert (report.embedded, report.resumed, report.reused) == (PHOTOS - left, left, left)
-    assert not (index / FOLDER).exists()
+    assert not (index / NAME).exists()
     assert list(index.glob("*.tmp-*")) == []
     whole = build_index(own, checkpoint, tmp_path / "whole", quiet=True)
     same(IndexStore(index).open(), IndexStore(tmp_path / "whole").open())
@@ -104,7 +104,7 @@ def test_what_another_model_left_is_not_taken(own, model, tmp_path, embedded):
 
     report = build_index(own, changed_model(load_checkpoint(model), other), index, quiet=True)
     assert (sum(embedded), report.resumed) == (PHOTOS, 0)
-    assert not (index / FOLDER).exists()
+    assert not (index / NAME).exists()
 
 
 def test_ctrl_c_keeps_what_was_embedded_and_says_so(own, model, tmp_path, embedded, monkeypatch, capsys):

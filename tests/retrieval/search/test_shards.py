@@ -405,7 +405,7 @@ def test_a_forged_manifest_is_refused(field, value, own):
     for one in dataclasses.fields(manifest):
         object.__setattr__(made_up, one.name, value if one.name == field else getattr(manifest, one.name))
     write_cluster(cluster, made_up)
-    with pytest.raises(CorruptIndex, match=f"{field} is not what the format says"):
+    with pytest.raises(CorruptIndex, match=rf"CLUSTER\.{field}.* must be"):
         Searcher.open(cluster)
 
 

@@ -1,5 +1,7 @@
 """What builds note of files, rows that are taken over unparsed, and checks in time of what changed."""
 
+import hashlib
+import os
 import random
 
 import numpy as np
@@ -7,9 +9,10 @@ import pytest
 
 from indexes.errors import MismatchedIndex, RowError
 from indexes.kinds.base import VectorIndex
+from indexes.store import stat_cache
 from indexes.store.folder import IndexStore
-from indexes.store.rows import are_distinct, first_equal, keys_of
-from indexes.store.seen import Seen
+from indexes.store.rows import KeyIndex, are_distinct, keys_of
+from indexes.store.stat_cache import FILES, FOLDERS, FolderCache, StatRecords
 from indexes.store.tables import Block
 from tests.indexes.test_store import unit
 
@@ -30,21 +33,42 @@ def store(tmp_path):
 
 def test_a_file_is_known_by_all_that_it_looks_like(tmp_path):
     ids, digests = keys_of(["a", "b", "c"]), keys_of(["1", "2", "3"])
-    looks = np.arange(12, dtype=np.uint64).reshape(3, 4) + np.uint64(2**64 - 20)
-    Seen(tmp_path).write(ids, digests, looks)
-    seen = Seen(tmp_path)
-    np.testing.assert_array_equal(seen.digests(ids, looks), digests)
+    statuses = np.arange(12, dtype=np.uint64).reshape(3, 4) + np.uint64(2**64 - 20)
+    StatRecords(tmp_path).write(ids, digests, statuses)
+    cache = StatRecords(tmp_path)
+    np.testing.assert_array_equal(cache.digests(ids, statuses), digests)
     for column in range(4):
-        other = looks.copy()
+        other = statuses.copy()
         other[1, column] += np.uint64(1)
-        assert (seen.digests(ids, other) == b"").tolist() == [False, True, False]
-    assert seen.digests(keys_of(["d"]), looks[:1]).tolist() == [b""]
+        assert (cache.digests(ids, other) == b"").tolist() == [False, True, False]
+    assert cache.digests(keys_of(["d"]), statuses[:1]).tolist() == [b""]
+
+
+@pytest.mark.parametrize("name", [FILES, FOLDERS])
+@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "longer", "forged", "folder"])
+def test_a_damaged_stat_cache_is_an_empty_one(tmp_path, name, harm, monkeypatch):
+    monkeypatch.setattr(stat_cache.sys, "platform", "linux")
+    StatRecords(tmp_path).write(keys_of(["a"]), keys_of(["1"]), np.ones((1, 4), np.uint64))
+    folders, status = FolderCache(tmp_path), (1, 1, 1, os.makedev(8, 1))
+    folders.note("cup/", status, ["1.jpg", "2.jpg"])
+    folders.write()
+    assert FolderCache(tmp_path).names("cup/", status) == ["1.jpg", "2.jpg"]
+    path = tmp_path / name
+    content = path.read_bytes()
+    flipped = content[:9] + bytes([content[9] ^ 1]) + content[10:]
+    forged = b"\xc1" + hashlib.sha256(b"\xc1").digest()
+    harmed = {"cut": content[:-7], "flipped": flipped, "empty": b"", "longer": content + b"x", "forged": forged}
+    path.unlink()
+    path.mkdir() if harm == "folder" else path.write_bytes(harmed[harm])
+    assert len(StatRecords(tmp_path).records) == (name != FILES)
+    assert (FolderCache(tmp_path).names("cup/", status) is None) == (name == FOLDERS)
 
 
 def test_keys_that_begin_alike_are_told_apart():
     keys = np.array([b"8 bytes." + end for end in (b"a", b"b", b"c", b"b")] + [b"other", b""], "S16")
     wanted = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
-    assert first_equal(keys, wanted).tolist() == [1, 2, -1, 4, 5, -1]
+    assert KeyIndex(keys).find(wanted).tolist() == [1, 2, -1, 4, 5, -1]
+    assert KeyIndex(keys).find(np.tile(wanted, 5)).tolist() == [1, 2, -1, 4, 5, -1] * 5
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -56,7 +80,7 @@ def test_keys_are_found_wherever_a_list_was_changed(seed):
         place = draw.randrange(len(other) + 1)
         other[place : place + draw.randrange(3)] = draw.sample(["new", "0001", "0299"], draw.randrange(2))
     place_of = {name: place for place, name in enumerate(names)}
-    found = first_equal(keys_of(names), keys_of(other))
+    found = KeyIndex(keys_of(names)).find(keys_of(other))
     assert found.tolist() == [place_of.get(name, -1) for name in other]
 
 
