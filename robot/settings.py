@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, TypeVar
 
-from robot.errors import RobotConfigError
+from _touch_retrieval.registry import Registry
+from robot.errors import RobotConfigError, UnknownName
 
 _T = TypeVar("_T")
 _MOST = 2**63
@@ -69,6 +70,36 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
         return cls(**settings, **{name: value for name, value in given.items() if name in taken})
     except RobotConfigError as error:
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
+
+
+def build_named(
+    registry: Registry[type[_T]],
+    table: Mapping[str, Any],
+    key: str,
+    *,
+    where: str,
+    default: str | None = None,
+    **given: Any,
+) -> _T:
+    """Return an object of the class that `key` of a table names in a registry, built from the table's other keys.
+
+    Args:
+        registry: Classes by name.
+        table: A table of a rig's file.
+        key: The key that holds the name.
+        where: What messages call the table.
+        default: The name where the table has none; None: it must have one.
+        given: As `build` takes it.
+
+    Raises:
+        UnknownName: Nothing has this name; lists the known ones.
+        RobotConfigError: As `build`.
+    """
+    settings = dict(table)
+    name = settings.pop(key, default)
+    if not isinstance(name, str):
+        raise UnknownName(f"{where}: {key} must be one of {', '.join(registry.names())}; got {name!r}")
+    return build(registry.resolve(name), settings, where=where, **given)
 
 
 @functools.cache
