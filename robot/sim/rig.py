@@ -90,7 +90,7 @@ class SimSettings(TypedSettings):
     (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one. focal_px: of the
     camera, whose pictures have 256 px a side; at 860 they show some 190 mm, and larger objects in part.
     localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt, planner and gel are
-    the tables [grasp], [attempt], [planner] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts
+    the tables [grasp], [attempt], [planner], [gel.a] and [gel.b] of a real rig's file: how grasps are drawn and attempts
     are made (robot.grasping.settings), where the jaws close (robot.grasping.planner; "mesh" by default for meshes), and
     what the gels are made of (robot.gel_settings); what is not known of one is drawn.
     """
