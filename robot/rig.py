@@ -185,7 +185,7 @@ def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]
     """Name of the rig and its settings."""
     try:
         document = tomllib.loads(content_of(path, RobotConfigError).decode())
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)
     if not isinstance(name, str):

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from _touch_retrieval.files import write_atomically
 from robot.errors import RobotConfigError
-from robot.storage import content_of, object_of, storage_errors, sync_folder, write_file
+from robot.storage import content_of, object_of, storage_errors
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
@@ -99,8 +100,7 @@ class HandEye:
     def save(self, path: Path) -> None:
         """Write the file whole or not at all. Raises StorageError."""
         with storage_errors(path.parent):
-            write_file(path, (json.dumps(_document(self), indent=1) + "\n").encode())
-            sync_folder(path.parent)
+            write_atomically(path, (json.dumps(_document(self), indent=1) + "\n").encode())
 
 
 def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: datetime | None = None) -> HandEye:

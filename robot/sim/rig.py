@@ -86,20 +86,20 @@ class SimSettings(TypedSettings):
     fingers: those with a gel. optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses
     (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
     markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
-    instead (needs the extra `mesh`). contact_grid
-    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one. focal_px: of the
-    camera, whose pictures have 256 px a side; at 860 they show some 190 mm, and larger objects in part.
-    localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt, planner and gel are
-    the tables [grasp], [attempt], [planner], [gel.a] and [gel.b] of a real rig's file: how grasps are drawn and attempts
-    are made (robot.grasping.settings), where the jaws close (robot.grasping.planner; "mesh" by default for meshes), and
-    what the gels are made of (robot.gel_settings); what is not known of one is drawn.
+    instead (needs the extra `mesh`). contact_grid (rows, columns) and contact_tolerance of the contact solver. shadow:
+    whether the lamp casts one. focal_px: of the camera, whose pictures have 256 px a side; at 860 they show some 190
+    mm, and larger objects in part. localisation_mm: how far off the camera's calibration is, drawn from this range.
+    grasp, attempt, planner and gel are the tables [grasp], [attempt], [planner], [gel.a] and [gel.b] of a real rig's
+    file: how grasps are drawn and attempts are made (robot.grasping.settings), where the jaws close
+    (robot.grasping.planner; "mesh" by default for meshes), and what the gels are made of (robot.gel_settings); what is
+    not known of one is drawn.
     """
 
-    fingers: Sequence[str] = ("a", "b")
+    fingers: tuple[str, ...] = ("a", "b")
     optics: str = "led"
     gels: int = limited(1, 1000, 1, unit="pairs")
     markers: bool = False
-    families: Sequence[str] = ()
+    families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: float = limited(1e-12, 0.999, 1e-2)

@@ -38,9 +38,9 @@ class CutSettings(TypedSettings):
     """How a sensor's pictures are cut to the gel: `crop`, shares at left, top, right and bottom, or a calibration file;
     output_px: width and height of the result, counts before the file's."""
 
-    crop: Sequence[float] = ()
+    crop: tuple[float, ...] = ()
     calibration: str = ""
-    output_px: Sequence[int] = ()
+    output_px: tuple[int, ...] = ()
 
 
 _MOST_PX = 20_000
