@@ -35,7 +35,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write each file so that it holds all of its bytes or is untouched; sync their folder then for their names to last.
+    """Write each file so that it holds all of its bytes or is untouched; sync their folder then, and their names last.
 
     The disk is asked to keep them when all are written: it takes fewer turns for it than file by file.
     """
