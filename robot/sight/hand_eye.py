@@ -143,7 +143,7 @@ def fit_rigid(camera_mm: Points, rig_mm: Points) -> Points:
 def fit_affine(camera_mm: Points, rig_mm: Points) -> Points:
     """The linear map and translation (4, 4) of least squares; about the means, so that a far origin costs no digits."""
     camera_mean, rig_mean = camera_mm.mean(0), rig_mm.mean(0)
-    linear = np.linalg.lstsq(camera_mm - camera_mean, rig_mm - rig_mean)[0].T
+    linear = np.linalg.lstsq(camera_mm - camera_mean, rig_mm - rig_mean, rcond=None)[0].T
     return _matrix(linear, rig_mean - linear @ camera_mean)
 
 
