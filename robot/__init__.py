@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from robot.devices import Gripper as Gripper
     from robot.devices import TactileSensor as TactileSensor
     from robot.errors import RobotError as RobotError
-    from robot.grasping.plan import GraspPlan as GraspPlan
+    from robot.grasping.planner import GraspPlan as GraspPlan
     from robot.grasping.planner import GraspPlanner as GraspPlanner
     from robot.importers import load_importer as load_importer
     from robot.readings import Frame as Frame
@@ -34,7 +34,7 @@ _PLACES = {
     "Arm": "devices",
     "Camera": "devices",
     "Frame": "readings",
-    "GraspPlan": "grasping.plan",
+    "GraspPlan": "grasping.planner",
     "GraspPlanner": "grasping.planner",
     "Gripper": "devices",
     "Pose": "readings",

@@ -125,6 +125,15 @@ def object_of(text: bytes, refusal: type[RobotError]) -> dict[str, Any]:
         raise refusal(f"must be JSON in UTF-8, without NaN and Infinity: {error}") from error
 
 
+def document_of(path: str | Path, refusal: type[RobotError]) -> dict[str, Any]:
+    """The JSON object that a file holds. Raises `refusal`, which names the file."""
+    data = content_of(path, refusal)
+    try:
+        return object_of(data, refusal)
+    except RobotError as error:
+        raise refusal(f"{path}: {error}") from error
+
+
 def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:
     import cv2
 

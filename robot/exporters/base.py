@@ -76,17 +76,13 @@ def whole_folder(out: Path) -> Iterator[Path]:
                 if path.name != _MARK:
                     shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
             yield part
-            _sync_all(part)
+            for path in (*part.rglob("*"), part):
+                sync(path)
             (part / _MARK).unlink()
             if out.exists():
                 out.rmdir()
             os.rename(part, out)
             sync(out.parent)
-
-
-def _sync_all(folder: Path) -> None:
-    for path in (*folder.rglob("*"), folder):
-        sync(path)
 
 
 # Grasps ----------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ recorded is left out. The folder opens as it is with Hugging Face datasets ("ima
 A line is written when its images are on the disk: a crash leaves whole grasps; half a last line is dropped.
 """
 
+import contextlib
 import fcntl
 import io
 import json
@@ -25,7 +26,7 @@ import re
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from _touch_retrieval.files import open_regular, sync, write_atomically
 from robot.errors import RecordingError
@@ -36,6 +37,7 @@ from robot.storage import (
     ImageSource,
     append_line,
     content_of,
+    document_of,
     file_content,
     object_of,
     storage_errors,
@@ -144,21 +146,18 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_FILE
     if not os.path.exists(path):  # False, and no error, for a name that no disk takes
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
-    try:
-        info = object_of(content_of(path, RecordingError), RecordingError)
-        _check_info(info)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    info = document_of(path, RecordingError)
+    _check_info(info, path)
     return info
 
 
-def _check_info(info: Mapping[str, Any]) -> None:
+def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
     version = info.get("schema_version")
     if type(version) is not int or version not in KNOWN_VERSIONS:
         known = ", ".join(map(str, KNOWN_VERSIONS))
-        raise RecordingError(f"schema_version must be one this software knows ({known}), got {version!r}")
+        raise RecordingError(f"{path}: schema_version must be one this software knows ({known}), got {version!r}")
     for key in ("source", "sensor"):
-        check_name(key, info.get(key))
+        check_name(f"{path}: {key}", info.get(key))
 
 
 def _torn(data: bytes) -> bytes:
@@ -178,7 +177,7 @@ def _after_last_newline(data: bytes) -> bytes:
 # Writing ---------------------------------------------------------------------------------------------------
 
 
-class RecordingWriter:
+class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     """Appends grasps to a recording that it creates or continues; one writer at a time.
 
         with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
@@ -302,9 +301,6 @@ class RecordingWriter:
     def close(self) -> None:
         """Let go of the folder; a second call does nothing."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

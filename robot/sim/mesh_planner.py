@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from robot.errors import PlanError, RobotConfigError, UngraspableError
-from robot.grasping.plan import GraspPlan
-from robot.grasping.planner import GraspPlanner
+from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
 from robot.rig import Rig

@@ -25,7 +25,7 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, content_of, file_content, object_of, storage_errors, write_files
+from robot.storage import append_line, content_of, document_of, file_content, storage_errors, write_files
 from robot.workers import Jobs, Work
 
 INFO_FILE = "pictures.json"
@@ -107,7 +107,7 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
     plain = json.loads(json.dumps(info))
     with storage_errors(folder):
         if (folder / INFO_FILE).exists():
-            held = object_of(content_of(folder / INFO_FILE, RecordingError), RecordingError)
+            held = document_of(folder / INFO_FILE, RecordingError)
             if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
                 raise RecordingError(
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"

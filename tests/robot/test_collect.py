@@ -13,8 +13,7 @@ from robot.collect import CollectSettings, Progress, RecordedTouches, collect, n
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import Attempter, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
-from robot.grasping.plan import GraspPlan
-from robot.grasping.planner import CylinderPlanner
+from robot.grasping.planner import CylinderPlanner, GraspPlan
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD, Pose
 from robot.recording.attempt_log import read_attempts

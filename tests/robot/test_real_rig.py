@@ -11,8 +11,7 @@ from robot.drivers.manual_arm import ManualArm
 from robot.drivers.replay import ImagesSensor
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
-from robot.grasping.plan import GraspPlan
-from robot.grasping.planner import CylinderPlanner, GraspPlanner
+from robot.grasping.planner import CylinderPlanner, GraspPlan, GraspPlanner
 from robot.readings import Pose
 from robot.real_rig import DRIVERS, load_driver
 from robot.rig import load_rig
