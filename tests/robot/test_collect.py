@@ -528,7 +528,7 @@ OTHERWISE = {
     "another limit": ({"most": 5}, "was collected with most attempts 18, not 5"),
     "other forces": (
         {"attempt": AttemptSettings(grasp=GraspSettings(force_n=(5, 30)))},
-        r"with attempt\.grasp\.force n \[5\.0, 25\.0\], not \[5, 30\]",
+        r"with attempt\.grasp\.force n \[5\.0, 25\.0\], not \[5\.0, 30\.0\]",
     ),
     "another gate": ({"gate": ContactAreaGate(20.0)}, "was collected with gate 'ContactAreaGate"),
     "other objects": ({"names": ["round-9"]}, "was collected with other objects"),
