@@ -16,9 +16,9 @@ from robot.readings import Pose
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
-from robot.sim.objects.mesh import Mesh, load_mesh_object, mesh_object, read_mesh
+from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
 from robot.sim.objects.resting import UP, resting_ups, tipping_angle, turn_up
-from tests.meshes import BOTTLE, box, revolved, sphere, stl
+from tests.meshes import BOTTLE, box, load_mesh_object, revolved, sphere, stl
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
 pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
