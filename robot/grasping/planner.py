@@ -44,6 +44,10 @@ class GraspPlan:
 
     approach: poses to pass on the way there, the last one clear of the object; `above` where none are given. fit: what
     the attempt's log says of the object as it was seen.
+
+    >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
+    >>> robot.GraspPlan(pose, above, opening_mm=110.0, force_n=10.0).approach
+    ()
     """
 
     pose: Pose
@@ -63,8 +67,8 @@ class GraspPlanner(ABC):
     ...     needs_depth = False
     ...
     ...     def plan(self, rig, image, settings, rng):
-    ...         pose = robot.Pose(0.0, 0.0, 60.0, rng.uniform(0.0, 3.14))
-    ...         above = robot.Pose(0.0, 0.0, 240.0, pose.yaw_rad)
+    ...         yaw_rad = rng.uniform(0.0, 3.14)
+    ...         pose, above = (robot.Pose(0.0, 0.0, z_mm, yaw_rad) for z_mm in (60.0, 240.0))
     ...         return robot.GraspPlan(pose, above, opening_mm=rig.gripper.stroke_mm, force_n=10.0)
     """
 
