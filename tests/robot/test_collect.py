@@ -564,12 +564,6 @@ def test_a_recording_that_no_rig_collected_is_refused(tmp_path):
         run(tmp_path / "r")
 
 
-def test_a_folder_of_other_files_is_refused(tmp_path):
-    (tmp_path / "letter.txt").write_text("dear")
-    with pytest.raises(RecordingError, match=r"holds other files, such as letter\.txt"):
-        run(tmp_path)
-
-
 def test_a_lost_log_is_refused(tmp_path):
     run(tmp_path / "r")
     (tmp_path / "r" / "attempts.jsonl").unlink()

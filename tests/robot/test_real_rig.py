@@ -186,7 +186,6 @@ BAD = {
     "a grasp through the back door": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
     "a force that is no range": ({"grasp": "force_n = 10"}, r"\[grasp\]: force_n must be a list"),
     "a force of three": ({"grasp": "force_n = [1, 2, 3]"}, r"force_n must be a list of length 2, got \[1, 2, 3\]"),
-    "a jitter that is no number": ({"grasp": "jitter_mm = true"}, r"\[grasp\]: jitter_mm must be a number, got True"),
     "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of manual, sawyer; got \['man"),
     "a speed without end": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
     "a place that is none": ({"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"}, "x_mm must be a finite"),
