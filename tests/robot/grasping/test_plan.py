@@ -147,7 +147,7 @@ def test_settings_come_from_plain_values():
         build(GraspSettings, {"jitter": 3})
     for wrong, said in (
         ({"force_n": [1, 2, 3]}, "force_n must be a list of length 2"),
-        ({"force_n": ["a", "b"]}, "force_n must be a list of length 2, each of them a number"),
+        ({"force_n": ["a", "b"]}, r"force_n\[0\] must be a number, got 'a'"),
         ({"lift_mm": "high"}, "lift_mm must be a number"),
     ):
         with pytest.raises(RobotConfigError, match=said):
