@@ -48,5 +48,5 @@ $(VENV)/installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv --clear $(VENV)
 # PyTorch first and pinned: an unpinned one may bring gigabytes of CUDA libraries that the tests do not use.
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
-	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,mesh,heif,calibration,evaluation,onnx,sawyer,realsense,importers,serve,cluster,transformers]'
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,sim,mesh,heif,calibration,evaluation,onnx,gripper,sawyer,realsense,importers,serve,cluster,transformers]'
 	@touch $@

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from robot.devices import Gripper as Gripper
     from robot.devices import TactileSensor as TactileSensor
     from robot.errors import RobotError as RobotError
+    from robot.grasping.planner import GraspPlan as GraspPlan
+    from robot.grasping.planner import GraspPlanner as GraspPlanner
     from robot.importers import load_importer as load_importer
     from robot.readings import Frame as Frame
     from robot.readings import Pose as Pose
@@ -36,6 +38,8 @@ _PLACES = {
     "Arm": "devices",
     "Camera": "devices",
     "Frame": "readings",
+    "GraspPlan": "grasping.planner",
+    "GraspPlanner": "grasping.planner",
     "Grip": "sim.pinch",
     "Gripper": "devices",
     "Pose": "readings",

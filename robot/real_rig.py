@@ -36,6 +36,8 @@
     [object]                                  # instead of depth: every object stands here and is so large
     x_mm = 0
     ...
+    [planner]                                 # where the jaws close (robot.grasping.planner)
+    name = "cylinder"                         # its other keys are the planner's settings
 
 Homing jaws keep their own speed, and Sawyer's slow /robot/state may be 2 s old whatever `state_age_s`.
 Paths are those of the process that reads the file. Unknown keys are refused everywhere.
@@ -53,10 +55,11 @@ from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import gels_of
+from robot.grasping.planner import load_planner
 from robot.grasping.settings import AttemptSettings, GraspSettings, attempt_of
 from robot.readings import Region
 from robot.rig import Rig, ask_on_terminal
-from robot.settings import TypedSettings, build, check_type, limited
+from robot.settings import TypedSettings, build, build_named, checked, limited
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
@@ -145,6 +148,7 @@ class RealRig(Rig):
         grasp: Mapping[str, Any] = {},
         object: Mapping[str, Any] = {},
         gel: Mapping[str, Any] = {},
+        planner: Mapping[str, Any] = {},
         source: str = "real rig",
         sensor: str = "gelsight",
     ) -> None:
@@ -170,25 +174,22 @@ class RealRig(Rig):
             },
             attempt=_attempt(attempt, grasp, ceilings),
             given=build(GivenObject, object, where="[object]").fit() if object else None,
+            planner=load_planner(planner),
         )
 
     def connect(self) -> None:
         """As any rig; a camera may turn out to have no depth only now. Raises RobotConfigError then."""
         super().connect()
-        if not self.camera.has_depth and self.given is None:
+        try:
+            self.planner.check(self)
+        except RobotConfigError:
             self.close()
-            raise RobotConfigError(
-                f"{self.camera.name} has no depth: say where every object stands and how large it is, in [object]"
-            )
+            raise
 
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -> Any:
     """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
-    settings = dict(table)
-    name = settings.pop("driver", None)
-    if not isinstance(name, str):
-        raise UnknownName(f"{where}: driver must be one of {', '.join(DRIVERS[role].names())}; got {name!r}")
-    return build(DRIVERS[role].resolve(name), settings, where=where, clock=time.monotonic, **given)
+    return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **given)
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
@@ -205,8 +206,8 @@ def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
     file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", HAND_EYE_DAYS)
-    check_type("[camera]: hand_eye", str | None, file)
-    check_type("[camera]: hand_eye_days", float, days)
+    checked("[camera]: hand_eye", str | None, file)
+    checked("[camera]: hand_eye_days", float, days)
     extrinsics = np.eye(4) if file is None else hand_eye.load(Path(file), max_age_days=days).rigid
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:

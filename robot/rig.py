@@ -66,14 +66,13 @@ class Rig:
         given: CylinderFit | None = None,
         planner: GraspPlanner | None = None,
     ) -> None:
-        self.planner = planner or CylinderPlanner()
-        if given is None and self.planner.needs_depth and not camera.has_depth:
-            raise RobotConfigError(f"{camera.name} has no depth: where the object stands and its size must be given")
         self.arm, self.gripper, self.camera = arm, gripper, camera
         self.sensors = dict(sorted(sensors.items()))
         self.info = dict(info)
         self.clock, self.sleep, self.ask = clock, sleep, ask
         self.attempt, self.given = attempt or AttemptSettings(), given
+        self.planner = planner or CylinderPlanner()
+        self.planner.check(self)
         self._on_table: str | None = None
 
     @property
@@ -186,7 +185,7 @@ def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]
     """Name of the rig and its settings."""
     try:
         document = tomllib.loads(content_of(path, RobotConfigError).decode())
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)
     if not isinstance(name, str):

@@ -1,18 +1,17 @@
-"""Files that survive a crash: written beside, synced, renamed; and pictures as PNG or JPEG content."""
+"""Pictures as PNG or JPEG content, appended lines, and refusals of the disk as errors of `robot`."""
 
 import contextlib
-import errno
-import json
 import os
-import stat
 from collections.abc import Iterator, Mapping
 from io import FileIO
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from _touch_retrieval.files import open_regular
 from robot.errors import RecordingError, RobotError, StorageError
 
 PART = ".part"
@@ -30,18 +29,13 @@ def storage_errors(folder: Path) -> Iterator[None]:
     except BlockingIOError as error:
         raise StorageError(f"{folder} is being written by another process; wait for it or stop it") from error
     except OSError as error:
-        reason = error.strerror or str(error)
+        reason = (error.strerror or str(error)).removeprefix("cannot be written: ")
         where = error.filename or folder
         raise StorageError(f"{where} could not be written: {reason}; what was appended before is whole") from error
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write `path` so that it holds all of `data` or is untouched; `sync_folder` then makes its name last."""
-    write_files({path: data})
-
-
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write each file so that it holds all of its bytes or is untouched; `sync_folder` then makes their names last.
+    """Write each file so that it holds all of its bytes or is untouched; sync their folder then, and their names last.
 
     The disk is asked to keep them when all are written: it takes fewer turns for it than file by file.
     """
@@ -82,15 +76,6 @@ def append_line(file: FileIO, end: int, line: bytes) -> int:
     return end + len(line)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` last."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     """Return (file content, suffix): pixels as PNG, a file's own bytes as they are. Raises RecordingError."""
     if isinstance(source, np.ndarray):
@@ -121,20 +106,11 @@ def decoded(data: bytes, way: int | None = None) -> npt.NDArray[Any] | None:
     return pixels
 
 
-def read_regular(path: str | Path) -> bytes:
-    """The bytes of a regular file. Raises OSError, whose `strerror` says what stands there instead: a pipe would block,
-    a device may be read for ever."""
-    require_regular(os.stat(path).st_mode, path)
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what was swapped since does not block
-    with os.fdopen(descriptor, "rb") as file:
-        require_regular(os.fstat(descriptor).st_mode, path)
-        return file.read()
-
-
 def content_of(path: str | Path, refusal: type[RobotError]) -> bytes:
     """The bytes of a regular file. Raises `refusal`, which names it and what keeps it from being read."""
     try:
-        return read_regular(path)
+        with open_regular(path) as file:
+            return file.read()
     except (OSError, ValueError) as error:  # ValueError of a name that holds a zero
         raise refusal(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
 
@@ -142,24 +118,20 @@ def content_of(path: str | Path, refusal: type[RobotError]) -> bytes:
 def object_of(text: bytes, refusal: type[RobotError]) -> dict[str, Any]:
     """The JSON object of a line or file. Raises `refusal` for anything else, NaN and infinity too."""
     try:
-        value = json.loads(text.decode(), parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
-        raise refusal(f"must be JSON in UTF-8: {error}") from error
-    if not isinstance(value, dict):
-        raise refusal("must be one JSON object in braces")
-    return value
+        return msgspec.json.decode(text, type=dict[str, Any])
+    except msgspec.ValidationError as error:
+        raise refusal(f"must be one JSON object in braces, of finite numbers: {error}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise refusal(f"must be JSON in UTF-8, without NaN and Infinity: {error}") from error
 
 
-def _refuse_constant(text: str) -> NoReturn:
-    raise ValueError(f"numbers must be finite, got {text}")
-
-
-def require_regular(mode: int, path: str | Path) -> None:
-    """Raise OSError, whose `strerror` says what stands there, unless `mode` is that of a regular file."""
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
-    if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, not a regular file", str(path))
+def document_of(path: str | Path, refusal: type[RobotError]) -> dict[str, Any]:
+    """The JSON object that a file holds. Raises `refusal`, which names the file."""
+    data = content_of(path, refusal)
+    try:
+        return object_of(data, refusal)
+    except RobotError as error:
+        raise refusal(f"{path}: {error}") from error
 
 
 def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:

@@ -4,6 +4,8 @@ import struct
 
 import numpy as np
 
+from robot.sim.objects.mesh import mesh_object, read_mesh
+
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 CUBE = np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))])
@@ -68,3 +70,8 @@ def ply(path, vertices, faces):
     rows = [" ".join(map(str, row)) for row in vertices] + ["3 " + " ".join(map(str, row)) for row in faces]
     path.write_text(head + "\n".join(rows) + "\n")
     return path
+
+
+def load_mesh_object(path, seed, **drawn):
+    """The object of a mesh file, which stands as it does in the file."""
+    return mesh_object(path, read_mesh(path), seed, **drawn)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Lock
+from typing import TYPE_CHECKING, cast
 
 import cv2
 import numpy as np
@@ -22,8 +23,11 @@ from retrieval.errors import BadInput
 from retrieval.search.query.objects import listed_photo
 from retrieval.serve.service import Grasped, LiveRig
 from robot.devices import TactileSensor
+from robot.errors import RobotConfigError
 from robot.rig import load_rig
-from robot.sim.rig import SimRig
+
+if TYPE_CHECKING:
+    from robot.sim.rig import SimRig  # needs an extra
 
 _SIMULATED = re.compile(r".+-(\d{4,})-\d{5,}")
 """How the simulated rig calls its objects: their seed, and their number."""
@@ -35,17 +39,22 @@ _TRIES = 20
 def of_rig(spec: str, index: str | Path) -> LiveRig:
     """The sensors of a rig, which are connected at once. Raises RobotError."""
     rig = load_rig(spec, seed=_seed(index) or 0)
-    if isinstance(rig, SimRig):
-        return _simulated(rig)
+    if rig.info["rig"] == "sim":
+        return _simulated(cast("SimRig", rig))
     for sensor in rig.sensors.values():
         sensor.connect()
     return LiveRig({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
 
 
 def of_index(index: str | Path) -> LiveRig | None:
-    """The simulated rig, where the index shows its objects."""
+    """The simulated rig, where the index shows its objects and the extra `sim` is installed."""
     seed = _seed(index)
-    return None if seed is None else _simulated(SimRig(seed))
+    if seed is None:
+        return None
+    try:
+        return _simulated(cast("SimRig", load_rig("sim", seed=seed)))
+    except RobotConfigError:
+        return None
 
 
 def _seed(index: str | Path) -> int | None:
@@ -66,7 +75,7 @@ def _seed(index: str | Path) -> int | None:
 class _Jaws:
     """The simulated rig from several threads, one after the other; its gels show what they closed on last."""
 
-    def __init__(self, rig: SimRig) -> None:
+    def __init__(self, rig: "SimRig") -> None:
         self._rig, self._lock = rig, Lock()
         self._gels: dict[str, npt.NDArray[np.uint8]] = {}
 
@@ -93,7 +102,7 @@ class _Jaws:
             return _encoded(".jpg", self._gels[finger])
 
 
-def _simulated(rig: SimRig) -> LiveRig:
+def _simulated(rig: "SimRig") -> LiveRig:
     jaws = _Jaws(rig)
     sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
     return LiveRig(sensors, jaws.grasp)

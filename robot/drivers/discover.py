@@ -7,8 +7,9 @@ through their packages where these are installed.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -112,41 +113,37 @@ def _listed_ports() -> list[tuple[str, str]]:
 
 def find_realsenses() -> list[Found]:
     """RealSense cameras, where pyrealsense2 is installed."""
-    try:
-        import pyrealsense2 as rs
 
-        devices: Iterable[Any] = rs.context().query_devices()
+    def listed(rs: Any) -> list[Found]:
+        known = rs.camera_info
         return [
-            _by_serial("realsense", each.get_info(rs.camera_info.serial_number), each.get_info(rs.camera_info.name))
-            for each in devices
+            _by_serial("realsense", each.get_info(known.serial_number), each.get_info(known.name))
+            for each in rs.context().query_devices()
         ]
-    except ImportError as error:
-        return _not_loaded("RealSense", "pyrealsense2", error)
-    except Exception as error:  # a vendor's package that fails must not hide the other devices
-        log.warning("RealSense cameras could not be listed: %s", error)
-        return []
+
+    return _through("RealSense", "pyrealsense2", listed)
 
 
 def find_kinects() -> list[Found]:
     """Kinect 2 cameras, where pylibfreenect2 is installed."""
+
+    def listed(package: Any) -> list[Found]:
+        freenect = package.Freenect2()
+        serials = map(freenect.getDeviceSerialNumber, range(freenect.enumerateDevices()))
+        return [_by_serial("kinect2", as_text(serial), "Kinect 2") for serial in serials]
+
+    return _through("Kinect 2", "pylibfreenect2", listed)
+
+
+def _through(camera: str, package: str, listed: Callable[[Any], list[Found]]) -> list[Found]:
+    """List cameras through their maker's package; nothing where it is not installed, and a warning where it fails."""
     try:
-        from pylibfreenect2 import Freenect2
-
-        freenect = Freenect2()
-        count = freenect.enumerateDevices()
-        serials = [as_text(freenect.getDeviceSerialNumber(number)) for number in range(count)]
-        return [_by_serial("kinect2", serial, "Kinect 2") for serial in serials]
+        return listed(import_module(package))
     except ImportError as error:
-        return _not_loaded("Kinect 2", "pylibfreenect2", error)
-    except Exception as error:  # as above
-        log.warning("Kinect 2 cameras could not be listed: %s", error)
-        return []
-
-
-def _not_loaded(camera: str, package: str, error: ImportError) -> list[Found]:
-    """Nothing; said aloud where the package is installed and the system lacks what it needs."""
-    if need := missing_library(package, error):
-        log.warning("%s cameras could not be listed: that needs %s", camera, need)
+        if need := missing_library(package, error):
+            log.warning("%s cameras could not be listed: that needs %s", camera, need)
+    except Exception as error:  # a maker's package that fails must not hide the other devices
+        log.warning("%s cameras could not be listed: %s", camera, error)
     return []
 
 

@@ -1,13 +1,14 @@
-"""What drivers over a maker's package share: loading it, its exceptions, its numbers, waiting, and starting again."""
+"""What drivers over a maker's package share: loading it, its exceptions, its numbers, and starting again."""
 
 import contextlib
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from robot.devices import Camera
 from robot.drivers.video.frames import MOST_S
 from robot.errors import DeviceError
 from robot.settings import TypedSettings, limited
@@ -70,13 +71,30 @@ def vendor_errors(failure: str) -> Iterator[None]:
         raise DeviceError(f"{failure}: {error or type(error).__name__}") from error
 
 
-def start_again(close: Callable[[], None], connect: Callable[[], None]) -> None:
-    """Close whatever can be closed, then connect whole or not at all. Raises what `connect` raises."""
-    with contextlib.suppress(DeviceError, OSError):
-        close()
-    try:
-        connect()
-    except BaseException:
+class MakerCamera(Camera):
+    """A camera behind its maker's package. `_has`: what it says of its settings."""
+
+    _has: Mapping[str, Any] = {}
+
+    def _settings(self) -> dict[str, Any]:
+        return dict(self._has)
+
+    def _recover(self) -> None:
+        """Close whatever can be closed, then connect whole or not at all."""
         with contextlib.suppress(DeviceError, OSError):
-            close()
-        raise
+            self._close()
+        try:
+            self._connect()
+        except BaseException:
+            with contextlib.suppress(DeviceError, OSError):
+                self._close()
+            raise
+
+    def _chosen(self, asked: str, connected: Sequence[str]) -> int:
+        """Return the place of the camera to open among the serial numbers of those connected. Raises DeviceError."""
+        if asked in connected or (not asked and len(connected) == 1):
+            return connected.index(asked) if asked else 0
+        known = ", ".join(connected) or "none"
+        if asked:
+            raise DeviceError(f"{self.name} {asked} must be connected; connected: {known}")
+        raise DeviceError(f"one {self.name} must be connected, or its serial number given; connected: {known}")

@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.files import sync
 from robot.errors import ImporterError, RecordingError
 from robot.importers.base import Progress, whole_picture
 from robot.recording.folder import RecordedGrasp, Recording
-from robot.storage import PART, decoded, storage_errors, sync_folder
+from robot.storage import PART, decoded, storage_errors
 
 Picture = NDArray[np.uint8]
 """(H, W, 3), red first."""
@@ -75,20 +76,13 @@ def whole_folder(out: Path) -> Iterator[Path]:
                 if path.name != _MARK:
                     shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
             yield part
-            _sync_all(part)
+            for path in (*part.rglob("*"), part):
+                sync(path)
             (part / _MARK).unlink()
             if out.exists():
                 out.rmdir()
             os.rename(part, out)
-            sync_folder(out.parent)
-
-
-def _sync_all(folder: Path) -> None:
-    for here, _, files in os.walk(folder):
-        for name in files:
-            with open(os.path.join(here, name), "rb") as file:
-                os.fsync(file.fileno())
-        sync_folder(Path(here))
+            sync(out.parent)
 
 
 # Grasps ----------------------------------------------------------------------------------------------------

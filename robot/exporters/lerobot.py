@@ -14,8 +14,9 @@ with every frame whole and colours at full resolution, but not lossless: measure
 grey levels in root mean square, at most 1.2.
 """
 
+import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -125,8 +126,11 @@ class _File:
         for film in self._films.values():
             film.close()
         if kind is None:
-            _write_table(self._folder / _DATA.format(**self._place), self._rows, _step_types())
-            _write_table(self._folder / _EPISODES.format(**self._place), self._episodes, _plain_types())
+            pa = library("pyarrow", _WHAT)
+            kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
+            plain = {key: kinds[kind] for key, kind in _PLAIN.items()}
+            _write_table(self._folder / _DATA.format(**self._place), self._rows, {"timestamp": pa.float32()})
+            _write_table(self._folder / _EPISODES.format(**self._place), self._episodes, plain)
 
 
 class _Film:
@@ -193,16 +197,6 @@ _PLAIN = {
 }
 
 
-def _plain_types() -> dict[str, Any]:
-    pa = library("pyarrow", _WHAT)
-    types = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
-    return {key: types[kind] for key, kind in _PLAIN.items()}
-
-
-def _step_types() -> dict[str, Any]:
-    return {"timestamp": library("pyarrow", _WHAT).float32()}
-
-
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
     """A Parquet file of rows that have the same keys; types: of those that values do not tell."""
     pa = library("pyarrow", _WHAT)
@@ -237,7 +231,8 @@ def _write_json(path: Path, value: Any) -> None:
 def _info(
     recording: Recording, steps: Steps, tasks: int, found: Mapping[str, Sequence[RecordedGrasp]]
 ) -> dict[str, Any]:
-    episodes = sum(map(len, found.values()))
+    ends = list(itertools.accumulate(map(len, found.values())))
+    episodes = ends[-1]
     said = ("source", "sensor", "rig", "licence", "citation", "background")
     return {
         "codebase_version": "v3.0",
@@ -249,20 +244,16 @@ def _info(
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": FPS,
-        "splits": dict(_ranges(found)),
+        "splits": {part: f"{end - len(found[part])}:{end}" for part, end in zip(found, ends, strict=True)},
         "data_path": _DATA,
         "video_path": _VIDEO,
         "features": {_key(camera): _video_feature(size) for camera, size in steps.sizes.items()}
-        | {name: _step_feature(name) for name in _STEP_COLUMNS},
+        | {
+            name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
+            for name in _STEP_COLUMNS
+        },
         "recording": {key: recording.info.get(key) for key in said},
     }
-
-
-def _ranges(found: Mapping[str, Sequence[RecordedGrasp]]) -> Iterator[tuple[str, str]]:
-    start = 0
-    for part, grasps in found.items():
-        yield part, f"{start}:{start + len(grasps)}"
-        start += len(grasps)
 
 
 def _video_feature(size: tuple[int, int]) -> dict[str, Any]:
@@ -278,7 +269,3 @@ def _video_feature(size: tuple[int, int]) -> dict[str, Any]:
         "has_audio": False,
     }
     return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": about}
-
-
-def _step_feature(name: str) -> dict[str, Any]:
-    return {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}

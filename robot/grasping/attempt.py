@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from robot.devices import MAX_AGE_S, read_together
 from robot.errors import DeviceError, PlanError, UngraspableError
-from robot.grasping.plan import GraspPlan
+from robot.grasping.planner import GraspPlan
 from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Pose
 from robot.rig import Rig, check_seed

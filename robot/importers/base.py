@@ -20,9 +20,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from _touch_retrieval.files import write_atomically
 from robot.errors import ImporterError, RecordingError
 from robot.recording.folder import GRASP_ID, Recording, RecordingWriter, Shared, read_recording
-from robot.storage import ImageSource, file_content, storage_errors, sync_folder, write_file
+from robot.storage import ImageSource, file_content, storage_errors
 
 Progress = Callable[[int, int], None]
 """Called with (done, total) after each grasp, whether it was read, held already or skipped."""
@@ -232,8 +233,7 @@ def _write_splits(out: Path, splits: _Splits) -> None:
         folder.mkdir(exist_ok=True)
         for name, parts in splits.items():
             split = {"seed": 0, **{part: sorted(parts.get(part, ())) for part in ("train", "validation", "test")}}
-            write_file(folder / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
-        sync_folder(folder)
+            write_atomically(folder / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
 
 
 # What importers need of their source -----------------------------------------------------------------------

@@ -29,7 +29,7 @@ from robot.errors import ImporterError
 from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of
 from robot.importers.episodes import ENDINGS, Episode, Picture, Step
 from robot.recording.folder import Recording
-from robot.storage import content_of, decoded, object_of
+from robot.storage import decoded, document_of
 
 DATA_SET = DataSet(
     source="LeRobot data set",
@@ -85,7 +85,7 @@ class _Source:
 
     def __init__(self, src: Path, touch: str, photo: str) -> None:
         self.src = src
-        self.info = object_of(content_of(src / "meta" / "info.json", ImporterError), ImporterError)
+        self.info = document_of(src / "meta" / "info.json", ImporterError)
         version = str(self.info.get("codebase_version"))
         if not re.fullmatch(r"v3(\.\d+)*", version):
             raise ImporterError(f"{src} must be of LeRobot's version 3, and is of {version}; convert it with lerobot")

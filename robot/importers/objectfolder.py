@@ -23,7 +23,7 @@ from typing import Any
 from robot.errors import ImporterError
 from robot.importers.base import DataSet, Item, Progress, Published, Skip, folders, import_items, name_of, numbered
 from robot.recording.folder import Recording, Shared
-from robot.storage import content_of, object_of
+from robot.storage import content_of, document_of
 
 DATA_SET = DataSet(
     source="ObjectFolder",
@@ -111,10 +111,7 @@ def _split(path: Path) -> Mapping[str, Mapping[str, Sequence[str]]]:
     """The objects of each part: of {"<object>": [instances]}, or of [["<object>", instance], ...]."""
     if not path.is_file():
         return {}
-    try:
-        document = object_of(content_of(path, ImporterError), ImporterError)
-    except ImporterError as error:
-        raise ImporterError(f"{path}: {error}") from error
+    document = document_of(path, ImporterError)
     parts: dict[str, list[str]] = {}
     for theirs, ours in _PARTS.items():
         listed = document.get(theirs, {})

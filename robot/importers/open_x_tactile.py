@@ -55,7 +55,11 @@ def import_open_x_tactile(
 ) -> Recording:
     """Import the stores below `src`. Raises ImporterError without zarr, and where no store is one."""
     src = Path(src)
-    paths = sorted(path for path in (src, *(src.glob("*") if src.is_dir() else ())) if _is_store(path))
+    paths = sorted(
+        path
+        for path in (src, *(src.glob("*") if src.is_dir() else ()))
+        if path.name.endswith(".zarr" if path.is_dir() else ".zarr.zip")
+    )
     if not paths:
         packed = sorted(src.glob("*.tar*")) if src.is_dir() else []
         lacking = f"unpack {packed[0].name} first" if packed else "there is no such file or folder"
@@ -78,10 +82,6 @@ def import_open_x_tactile(
         progress=progress,
         published=Published({}, splits),
     )
-
-
-def _is_store(path: Path) -> bool:
-    return path.name.endswith(".zarr") if path.is_dir() else path.name.endswith(".zarr.zip")
 
 
 def _said(tasks: list["_Task"]) -> DataSet:

@@ -119,7 +119,7 @@ def _listed(path: Path) -> dict[str, set[str]] | None:
     try:
         with open(path, "rb") as file:
             found = json.loads(file.read(_MOST_JSON))
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise ImporterError(f"{path} cannot be read: {error}") from error
     tactile = found.get("tactile") if isinstance(found, dict) else None
     if not isinstance(tactile, list) or not all(isinstance(each, str) for each in tactile):

@@ -109,11 +109,7 @@ class Store:
             raise ImporterError(f"{self.path.name}/{name} cannot be opened: {error}") from error
 
     def _has(self, name: str) -> bool:
-        return self._top + name in self._members if self._zip else (self.path / name).is_file()
-
-    @cached_property
-    def _members(self) -> frozenset[str]:
-        return frozenset(self._zip.namelist()) if self._zip else frozenset()
+        return self._top + name in self._zip.NameToInfo if self._zip else (self.path / name).is_file()
 
     def _json(self, name: str) -> dict[str, Any]:
         try:

@@ -7,6 +7,7 @@ before its grasp is appended to the recording: after a crash at most the last li
 does not count.
 """
 
+import contextlib
 import json
 import os
 from collections import Counter
@@ -92,7 +93,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
     return found
 
 
-class AttemptLog:
+class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
     """Appends to attempts.jsonl, of which only what counts is kept. The recording's writer holds the folder's lock."""
 
     def __init__(self, folder: Path, grasp_ids: Set[str]) -> None:
@@ -115,9 +116,6 @@ class AttemptLog:
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -17,6 +17,7 @@ recorded is left out. The folder opens as it is with Hugging Face datasets ("ima
 A line is written when its images are on the disk: a crash leaves whole grasps; half a last line is dropped.
 """
 
+import contextlib
 import fcntl
 import io
 import json
@@ -25,23 +26,21 @@ import re
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
+from _touch_retrieval.files import open_regular, sync, write_atomically
 from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
 from robot.recording.grasp import RecordedGrasp as RecordedGrasp
 from robot.recording.grasp import check_name, unknown_keys
 from robot.storage import (
-    PART,
     ImageSource,
     append_line,
     content_of,
+    document_of,
     file_content,
     object_of,
-    require_regular,
     storage_errors,
-    sync_folder,
-    write_file,
     write_files,
 )
 
@@ -147,21 +146,18 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_FILE
     if not os.path.exists(path):  # False, and no error, for a name that no disk takes
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
-    try:
-        info = object_of(content_of(path, RecordingError), RecordingError)
-        _check_info(info)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    info = document_of(path, RecordingError)
+    _check_info(info, path)
     return info
 
 
-def _check_info(info: Mapping[str, Any]) -> None:
+def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
     version = info.get("schema_version")
     if type(version) is not int or version not in KNOWN_VERSIONS:
         known = ", ".join(map(str, KNOWN_VERSIONS))
-        raise RecordingError(f"schema_version must be one this software knows ({known}), got {version!r}")
+        raise RecordingError(f"{path}: schema_version must be one this software knows ({known}), got {version!r}")
     for key in ("source", "sensor"):
-        check_name(key, info.get(key))
+        check_name(f"{path}: {key}", info.get(key))
 
 
 def _torn(data: bytes) -> bytes:
@@ -169,7 +165,7 @@ def _torn(data: bytes) -> bytes:
     last = _after_last_newline(data)
     try:
         json.loads(last)
-    except (ValueError, RecursionError):
+    except ValueError:
         return last
     return b""
 
@@ -181,7 +177,7 @@ def _after_last_newline(data: bytes) -> bytes:
 # Writing ---------------------------------------------------------------------------------------------------
 
 
-class RecordingWriter:
+class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     """Appends grasps to a recording that it creates or continues; one writer at a time.
 
         with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
@@ -209,7 +205,7 @@ class RecordingWriter:
             descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
             self._file = os.fdopen(descriptor, "r+b", buffering=0)
             try:
-                require_regular(os.fstat(descriptor).st_mode, self.folder / METADATA_FILE)
+                open_regular(self.folder / METADATA_FILE).close()
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 self._start(wanted)
             except BaseException:
@@ -219,8 +215,7 @@ class RecordingWriter:
     def _start(self, wanted: dict[str, Any]) -> None:
         """Create recording.json unless it is there, and cut metadata.jsonl after its last whole line."""
         if not (self.folder / INFO_FILE).exists():
-            write_file(self.folder / INFO_FILE, _text_of(wanted))
-            sync_folder(self.folder)
+            write_atomically(self.folder / INFO_FILE, _text_of(wanted))
         self.info = read_info(self.folder)
         for key in _MUST_AGREE:
             if (old := self.info.get(key)) != (new := wanted.get(key)):
@@ -270,7 +265,7 @@ class RecordingWriter:
         grasp = RecordedGrasp.from_row(row)
         with storage_errors(self.folder):
             write_files({self.folder / path: data for path, data in contents.items()})
-            sync_folder(self.folder / IMAGES_FOLDER)
+            sync(self.folder / IMAGES_FOLDER)
             self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
         self._grasp_ids[grasp_id] = None
         return grasp
@@ -296,8 +291,7 @@ class RecordingWriter:
         told = _full_info({**self.info, **info})
         if told != self.info:
             with storage_errors(self.folder):
-                write_file(self.folder / INFO_FILE, _text_of(told))
-                sync_folder(self.folder)
+                write_atomically(self.folder / INFO_FILE, _text_of(told))
             self.info = told
 
     def _write_line(self, line: bytes) -> None:
@@ -307,9 +301,6 @@ class RecordingWriter:
     def close(self) -> None:
         """Let go of the folder; a second call does nothing."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -357,9 +348,9 @@ def _check_holds_nothing_else(folder: Path) -> None:
     if not folder.is_dir():
         raise RecordingError(f"a recording must be a folder, and {folder} is a file")
     with storage_errors(folder):
-        names = sorted(path.name for path in folder.iterdir())
+        names = sorted(path.name for path in folder.iterdir() if not path.name.startswith(f".{INFO_FILE}."))
         grasps = METADATA_FILE in names and (folder / METADATA_FILE).stat().st_size > 0
-    if others := [name for name in names if name not in (METADATA_FILE, IMAGES_FOLDER, INFO_FILE + PART)]:
+    if others := [name for name in names if name not in (METADATA_FILE, IMAGES_FOLDER)]:
         raise RecordingError(f"{folder} holds other files, such as {others[0]}; give a new or an empty folder")
     if grasps:
         raise RecordingError(f"{folder} has a {METADATA_FILE} but no {INFO_FILE}; restore it or give a new folder")

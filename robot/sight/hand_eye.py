@@ -14,13 +14,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
+from _touch_retrieval.documents import typed
+from _touch_retrieval.files import write_atomically
 from robot.errors import RobotConfigError
-from robot.storage import content_of, object_of, storage_errors, sync_folder, write_file
+from robot.storage import content_of, document_of, storage_errors
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
@@ -99,8 +102,19 @@ class HandEye:
     def save(self, path: Path) -> None:
         """Write the file whole or not at all. Raises StorageError."""
         with storage_errors(path.parent):
-            write_file(path, (json.dumps(_document(self), indent=1) + "\n").encode())
-            sync_folder(path.parent)
+            write_atomically(path, (json.dumps(self._document(), indent=1) + "\n").encode())
+
+    def _document(self) -> dict[str, Any]:
+        pairs = zip(self.camera_mm.tolist(), self.rig_mm.tolist(), strict=True)
+        return {
+            "version": VERSION,
+            "written": self.written.isoformat(),
+            "rigid": self.rigid.tolist(),
+            "rigid_errors": asdict(self.rigid_errors),
+            "affine": None if self.affine is None else self.affine.tolist(),
+            "affine_errors": None if self.affine_errors is None else asdict(self.affine_errors),
+            "points": [{"camera_mm": camera, "rig_mm": rig} for camera, rig in pairs],
+        }
 
 
 def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: datetime | None = None) -> HandEye:
@@ -143,7 +157,7 @@ def fit_rigid(camera_mm: Points, rig_mm: Points) -> Points:
 def fit_affine(camera_mm: Points, rig_mm: Points) -> Points:
     """The linear map and translation (4, 4) of least squares; about the means, so that a far origin costs no digits."""
     camera_mean, rig_mean = camera_mm.mean(0), rig_mm.mean(0)
-    linear = np.linalg.lstsq(camera_mm - camera_mean, rig_mm - rig_mean)[0].T
+    linear = np.linalg.lstsq(camera_mm - camera_mean, rig_mm - rig_mean, rcond=None)[0].T
     return _matrix(linear, rig_mean - linear @ camera_mean)
 
 
@@ -180,16 +194,16 @@ def read_pairs(path: Path) -> tuple[Points, Points]:
 def load(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
     """A saved calibration, fitted again from its points. Raises RobotConfigError, also for one older than asked, and
     for a file whose map is not that of its points."""
-    document = _read(path)
+    plain = document_of(path, RobotConfigError)
+    if plain.get("version") != VERSION:
+        raise RobotConfigError(f"{path} must be a hand-eye calibration of version {VERSION}; make it again")
     try:
-        camera = [point["camera_mm"] for point in document["points"]]
-        rig = [point["rig_mm"] for point in document["points"]]
-        stored = np.array(document["rigid"], dtype=np.float64)
-        written = datetime.fromisoformat(document["written"]).astimezone(UTC)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RobotConfigError(f"{path} is not a hand-eye calibration: {error!r}; make it again") from error
-    found = fit_hand_eye(camera, rig, written=written)
-    if stored.shape != (4, 4) or not np.allclose(stored, found.rigid, rtol=0, atol=1e-6):  # 1 nm: same sums elsewhere
+        document = typed(plain, _Document)
+    except ValueError as error:
+        raise RobotConfigError(f"{path} is not a hand-eye calibration: {error}; make it again") from error
+    camera, rig = [point.camera_mm for point in document.points], [point.rig_mm for point in document.points]
+    found = fit_hand_eye(camera, rig, written=document.written.astimezone(UTC))
+    if not np.allclose(document.rigid, found.rigid, rtol=0, atol=1e-6):  # 1 nm: same sums elsewhere
         raise RobotConfigError(f"{path}: the rigid map must be that of its points; the file was changed, make it again")
     _check_age(path, found, max_age_days, now)
     return found
@@ -205,34 +219,27 @@ def _check_age(path: Path, found: HandEye, max_age_days: float | None, now: date
         )
 
 
-def _read(path: Path) -> dict[str, Any]:
-    data = content_of(path, RobotConfigError)
-    try:
-        document = object_of(data, RobotConfigError)
-    except RobotConfigError as error:
-        raise RobotConfigError(f"{path}: {error}") from error
-    if document.get("version") != VERSION:
-        raise RobotConfigError(f"{path} must be a hand-eye calibration of version {VERSION}; make it again")
-    if unknown := sorted(set(document) - set(_KEYS)):
-        raise RobotConfigError(f"{path}: unknown key {unknown[0]!r}; known: {', '.join(_KEYS)}")
-    return document
+_Place = tuple[float, float, float]
+_Matrix = tuple[tuple[float, float, float, float], ...]
 
 
-_KEYS = ("version", "written", "rigid", "rigid_errors", "affine", "affine_errors", "points")
+@dataclass(frozen=True)
+class _Pair:
+    camera_mm: _Place
+    rig_mm: _Place
 
 
-def _document(found: HandEye) -> Mapping[str, Any]:
-    pairs = zip(found.camera_mm.tolist(), found.rig_mm.tolist(), strict=True)
-    values = (
-        VERSION,
-        found.written.isoformat(),
-        found.rigid.tolist(),
-        asdict(found.rigid_errors),
-        None if found.affine is None else found.affine.tolist(),
-        None if found.affine_errors is None else asdict(found.affine_errors),
-        [{"camera_mm": camera, "rig_mm": rig} for camera, rig in pairs],
-    )
-    return dict(zip(_KEYS, values, strict=True))
+@dataclass(frozen=True)
+class _Document:
+    """The saved file."""
+
+    version: int
+    written: datetime
+    rigid: Annotated[_Matrix, Meta(min_length=4, max_length=4)]
+    rigid_errors: Errors
+    affine: _Matrix | None
+    affine_errors: Errors | None
+    points: tuple[_Pair, ...]
 
 
 def _off(errors: Errors) -> str:

@@ -210,12 +210,16 @@ def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = 
 def lit(view: CameraView, lighting: Lighting, shadow: bool = True) -> tuple[Surfaces, Lamps]:
     """What light meets at each pixel, and where it comes from."""
     px = view.camera.px
-    light, own = np.asarray(lighting.direction), _object_normals(view)
+    light = np.asarray(lighting.direction)
+    # Across about one pixel, so that finer relief does not flicker.
+    own = view.obj.body.normals(view.on_object, 0.4 * view.detail_mm) @ view.placement.rotation().T
     normals = np.zeros((px * px, 3), np.float32)
     normals[:, 2], normals[view.pixels] = 1, own
     seen = _lamp_seen(view, own, light) if shadow else np.ones(px * px, np.float32)
     hidden = hidden_sky(view.is_object.reshape(px, px))
-    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), _reflectance(view, lighting))
+    colour = _table(lighting.table_seed, view.camera)
+    colour[view.pixels] = view.obj.looks.albedo(view.on_object)
+    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), colour)
     return surfaces, _lamps(lighting, view.obj.material)
 
 
@@ -226,11 +230,6 @@ def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
     lamp, sky = (lighting.exposure * np.array(colour) for colour in (lighting.lamp, lighting.sky))
     gloss = strength * material.gloss, strength * _TABLE_GLOSS
     return Lamps(np.array(lighting.direction), lamp, sky, gloss, sharpness)
-
-
-def _object_normals(view: CameraView) -> Array:
-    """Normals of the object's pixels, taken across about one pixel so that finer relief does not flicker."""
-    return view.obj.body.normals(view.on_object, 0.4 * view.detail_mm) @ view.placement.rotation().T
 
 
 def _lamp_seen(view: CameraView, own: Array, light: Array) -> Floats:
@@ -270,13 +269,6 @@ def hidden_sky(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floa
     shares = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(shares, (0, 0), width * coarse / px)
     return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))
-
-
-def _reflectance(view: CameraView, lighting: Lighting) -> Floats:
-    """(px * px, 3) linear, 0..1."""
-    colour = _table(lighting.table_seed, view.camera)
-    colour[view.pixels] = view.obj.looks.albedo(view.on_object)
-    return colour
 
 
 def _table(seed: int, camera: PinholeCamera) -> Floats:

@@ -1,9 +1,19 @@
-"""Functions in machine code, for loops over rays and pixels that numpy cannot say in few passes over memory."""
+"""Functions in machine code, for loops over rays and pixels that numpy cannot say in few passes over memory.
+
+They need numba, an extra: without it the import of this module raises RobotConfigError, which says what to install.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
-import numba
+from robot.errors import RobotConfigError
+
+try:
+    import numba
+except ImportError as error:
+    raise RobotConfigError(
+        "the simulated rig needs numba, which is missing; run pip install 'touch-retrieval[sim]'"
+    ) from error
 
 
 def compiled(function: Callable[..., Any], **settings: Any) -> Callable[..., Any]:

@@ -1,46 +1,46 @@
 """Grasps of meshes on the simulated rig: it knows the mesh, and how it lies, but for the camera's calibration."""
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from robot.errors import PlanError, UngraspableError
-from robot.grasping.plan import GraspPlan
-from robot.grasping.planner import GraspPlanner
+from robot.errors import PlanError, RobotConfigError, UngraspableError
+from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
+from robot.rig import Rig
 from robot.sim.antipodal import Array, Grasps
 from robot.sim.camera import Placement
 from robot.sim.meshes import grasps_of
 from robot.sim.objects.mesh import MeshBody
 from robot.sim.pinch import GRAVITY_M_S2
+from robot.sim.rig import SimRig
 from robot.sim.scene import Scene
-
-if TYPE_CHECKING:
-    from robot.rig import Rig
 
 
 class MeshPlanner(GraspPlanner):
-    """Draws among the grasps of a mesh: first from above or from a side, then uniformly.
-
-    scene: says what stands on the table now. error_mm (3,): the object is believed so far from where it is.
-    """
+    """Draws among the grasps of a mesh on the simulated rig: first from above or from a side, then uniformly."""
 
     needs_depth: ClassVar[bool] = False
 
-    def __init__(self, scene: Callable[[], Scene], error_mm: Array) -> None:
-        self._scene, self._error_mm = scene, error_mm
+    def check(self, rig: Rig) -> None:
+        """Raise RobotConfigError unless `rig` is simulated and holds meshes."""
+        if not isinstance(rig, SimRig) or rig.meshes is None:
+            raise RobotConfigError(
+                '[planner]: name = "mesh" plans for meshes of the simulated rig only: give meshes = FOLDER, or '
+                'name = "cylinder"'
+            )
 
-    def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        scene = self._scene()
+    def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
+        assert isinstance(rig, SimRig), "check refuses others"
+        scene = rig.world.now()
         assert isinstance(scene.obj.body, MeshBody)
         grasps = grasps_of(scene.obj.body, settings)
         _check_graspable(scene, grasps, settings, rig.gripper.stroke_mm)
         jitter = rng.uniform(-settings.jitter_mm, settings.jitter_mm, 2)
         force = round(float(rng.uniform(*settings.force_n)), 3)
-        shift = self._error_mm + np.array([*jitter, 0.0])
+        shift = rig.error_mm + np.array([*jitter, 0.0])
         poses = _Poses(grasps, scene.placement, shift, rig.arm.workspace, settings)
         tilted = grasps.tilt_rad != 0
         approaches = [kind for kind in (~tilted, tilted) if (poses.possible & kind).any()]

@@ -20,21 +20,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import (
-    PART,
-    append_line,
-    content_of,
-    file_content,
-    object_of,
-    storage_errors,
-    sync_folder,
-    write_file,
-    write_files,
-)
+from robot.storage import append_line, content_of, document_of, file_content, storage_errors, write_files
 from robot.workers import Jobs, Work
 
 INFO_FILE = "pictures.json"
@@ -116,19 +107,18 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
     plain = json.loads(json.dumps(info))
     with storage_errors(folder):
         if (folder / INFO_FILE).exists():
-            held = object_of(content_of(folder / INFO_FILE, RecordingError), RecordingError)
+            held = document_of(folder / INFO_FILE, RecordingError)
             if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
                 raise RecordingError(
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
                 )
             return _done(folder / METADATA_FILE)
-        ours = {IMAGES_FOLDER, METADATA_FILE, METADATA_FILE + PART, INFO_FILE + PART}
-        if folder.exists() and {path.name for path in folder.iterdir()} - ours:
+        ours = (IMAGES_FOLDER, METADATA_FILE, f".{METADATA_FILE}.", f".{INFO_FILE}.")
+        if folder.exists() and any(not path.name.startswith(ours) for path in folder.iterdir()):
             raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
         (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
-        write_file(folder / METADATA_FILE, b"")
-        write_file(folder / INFO_FILE, (json.dumps(plain, indent=1) + "\n").encode())
-        sync_folder(folder)
+        write_atomically(folder / METADATA_FILE, b"")
+        write_atomically(folder / INFO_FILE, (json.dumps(plain, indent=1) + "\n").encode())
     return {}
 
 

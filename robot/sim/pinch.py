@@ -229,7 +229,7 @@ class Pinch:
         friction, weight = self.obj.material.friction, self.obj.mass_kg * GRAVITY_M_S2
         if 2 * friction * self.grip.force_n < self.hand.safety * weight:
             return "the object is too heavy for the friction"
-        a, b = self._centres["a"], self._centres["b"]
+        a, b = self._centre("a"), self._centre("b")
         if math.hypot(*(a - b)[1:]) > friction * abs(a[0] - b[0]):
             return "the fingers press past each other"
         if any(_mean_slope(self.contact(finger), self._pixel_mm) > friction for finger in self.sensors):
@@ -240,12 +240,8 @@ class Pinch:
     def _pixel_mm(self) -> float:
         return self._field_mm[1] / self.hand.grid[1]
 
-    @cached_property
-    def _centres(self) -> dict[str, Array]:
-        """(x, y, z) of each contact in the gripper frame: the centre of pressure, or a bare finger's nearest point."""
-        return {finger: self._centre(finger) for finger in SIDES}
-
     def _centre(self, finger: str) -> Array:
+        """(x, y, z) of a contact in the gripper frame: the centre of pressure, or a bare finger's nearest point."""
         wall, (height, width) = self._walls[finger], self._field_mm
         felt = finger in self.sensors
         weight = self.contact(finger).pressure_mpa if felt else (wall <= wall.min() + 0.1).astype(np.float64)

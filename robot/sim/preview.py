@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError
 from robot.recording.folder import RecordedGrasp, read_recording
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import file_content, storage_errors, write_file
+from robot.storage import file_content, storage_errors
 
 Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
@@ -38,7 +39,7 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_file(Path(out), _signed(data))
+        write_atomically(Path(out), _signed(data))
     return Path(out)
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
 from robot.gel_settings import gels_of
-from robot.grasping.planner import GraspPlanner
+from robot.grasping.planner import load_planner
 from robot.grasping.settings import GraspSettings, attempt_of
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
@@ -86,19 +86,20 @@ class SimSettings(TypedSettings):
     fingers: those with a gel. optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses
     (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
     markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
-    instead (needs the extra `mesh`). contact_grid
-    (rows, columns) and contact_tolerance of the contact solver. shadow: whether the lamp casts one. focal_px: of the
-    camera, whose pictures have 256 px a side; at 860 they show some 190 mm, and larger objects in part.
-    localisation_mm: how far off the camera's calibration is, drawn from this range. grasp, attempt and gel are the
-    tables [grasp], [attempt] and [gel.a], [gel.b] of a real rig's file: how grasps are drawn and attempts are made
-    (robot.grasping.settings), and what the gels are made of (robot.gel_settings); what is not known of one is drawn.
+    instead (needs the extra `mesh`). contact_grid (rows, columns) and contact_tolerance of the contact solver. shadow:
+    whether the lamp casts one. focal_px: of the camera, whose pictures have 256 px a side; at 860 they show some 190
+    mm, and larger objects in part. localisation_mm: how far off the camera's calibration is, drawn from this range.
+    grasp, attempt, planner and gel are the tables [grasp], [attempt], [planner], [gel.a] and [gel.b] of a real rig's
+    file: how grasps are drawn and attempts are made (robot.grasping.settings), where the jaws close
+    (robot.grasping.planner; "mesh" by default for meshes), and what the gels are made of (robot.gel_settings); what is
+    not known of one is drawn.
     """
 
-    fingers: Sequence[str] = ("a", "b")
+    fingers: tuple[str, ...] = ("a", "b")
     optics: str = "led"
     gels: int = limited(1, 1000, 1, unit="pairs")
     markers: bool = False
-    families: Sequence[str] = ()
+    families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: float = limited(1e-12, 0.999, 1e-2)
@@ -107,6 +108,7 @@ class SimSettings(TypedSettings):
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
+    planner: Mapping[str, Any] = field(default_factory=dict)
     gel: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -136,10 +138,10 @@ class SimRig(Rig):
         asked = SimSettings(**settings)
         self._seed, self._families = seed, tuple(sorted(asked.families))
         attempt = attempt_of(asked.attempt, asked.grasp)
-        self._meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
+        self.meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
         self._shadow = asked.shadow
         self._hand = Hand(
-            grid=asked.contact_grid, tolerance=asked.contact_tolerance, turns_about_grip=self._meshes is not None
+            grid=asked.contact_grid, tolerance=asked.contact_tolerance, turns_about_grip=self.meshes is not None
         )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
         dots = Markers() if asked.markers else None
@@ -152,25 +154,25 @@ class SimRig(Rig):
             for pair in drawn
         ]
         self._camera = PinholeCamera(focal_px=asked.focal_px)
-        clock, error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
+        clock, self.error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
         self.world = World(clock)
         super().__init__(
             SimArm(self.world),
             SimGripper(self.world),
             {finger: SimTactileSensor(self.world, finger) for finger in fingers},
-            SimCamera(self.world, self._camera, error_mm),
+            SimCamera(self.world, self._camera, self.error_mm),
             info={
                 "source": "simulated rig",
                 "sensor": f"simulated GelSight ({asked.optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
                 "gels": [{finger: pair[finger].gel.as_recorded() for finger in sorted(pair)} for pair in self._gels],
-                **({"meshes_sha256": self._meshes.digest, "units": _MESH_UNITS} if self._meshes else {}),
+                **({"meshes_sha256": self.meshes.digest, "units": _MESH_UNITS} if self.meshes else {}),
             },
             clock=clock,
             sleep=clock.sleep,
             attempt=attempt,
-            planner=_mesh_planner(self.world, error_mm) if self._meshes else None,
+            planner=load_planner(asked.planner, "mesh" if self.meshes else "cylinder"),
         )
         self.attempt.grasp.check(self.arm, self.gripper)
 
@@ -178,8 +180,8 @@ class SimRig(Rig):
         """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
         if count > _MOST_OBJECTS:
             raise RobotConfigError(f"the simulated rig has at most {_MOST_OBJECTS} objects a seed, got {count}")
-        if self._meshes is not None:
-            return self._meshes.object_ids(count)
+        if self.meshes is not None:
+            return self.meshes.object_ids(count)
         return [_procedural(self._seed, index, self._families).object_id for index in range(count)]
 
     def prepare(self, object_id: str, number: int) -> None:
@@ -234,8 +236,8 @@ class SimRig(Rig):
 
     def _find(self, object_id: str) -> SimObject:
         """The object of this name: procedural ones end in their index, meshes begin with their file's name."""
-        if self._meshes is not None:
-            candidates = self._meshes.candidates(object_id)
+        if self.meshes is not None:
+            candidates = self.meshes.candidates(object_id)
         else:
             index = object_id.rsplit("-", 1)[-1]
             candidates = [_procedural(self._seed, int(index), self._families)] if index.isdecimal() else []
@@ -251,19 +253,10 @@ def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
     return draw_object(seed, index, family=families[index % len(families)] if families else None)
 
 
-# Meshes need packages that others need not wait for.
-
-
 def _mesh_folder(folder: str, seed: int, settings: GraspSettings) -> "MeshFolder":
-    from robot.sim.meshes import MeshFolder
+    from robot.sim.meshes import MeshFolder  # slow to import
 
     return MeshFolder(folder, seed, settings)
-
-
-def _mesh_planner(world: World, error_mm: Array) -> GraspPlanner:
-    from robot.sim.mesh_planner import MeshPlanner
-
-    return MeshPlanner(world.now, error_mm)
 
 
 def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:

@@ -45,7 +45,6 @@ from robot.readings import Frame
 from robot.sim.objects import draw, materials, relief, shapes
 from robot.sim.rig import SimRig
 from tests.documents import CONTRIBUTING, ROOT, table_rows
-from tests.fake_rig import FakeRig
 from tests.hard_case import HardCase
 from tests.retrieval.methods import hard_linear as linear
 
@@ -148,16 +147,20 @@ def add_a_setting_of_a_device(monkeypatch):
 
 
 def add_a_grasp_planner(monkeypatch):
-    class Nowhere(GraspPlanner):
-        needs_depth = False
-
-        def plan(self, rig, image, settings, rng):
-            raise PlanError("there is no such place")
-
-    rig = FakeRig(3)
-    rig.planner = Nowhere()
+    rig = robot.load_rig("sim", seed=3, planner={"name": f"{HERE}:Nowhere", "place": "the moon"})
     with rig:
-        assert Attempter(rig, 3, AttemptSettings()).run("round-0", 0).reason == "there is no such place"
+        attempt = Attempter(rig, 3, AttemptSettings()).run(rig.object_ids(1)[0], 0)
+    assert attempt.reason == "the moon is out of reach"
+
+
+class Nowhere(GraspPlanner):
+    needs_depth = False
+
+    def __init__(self, *, place: str):
+        self.place = place
+
+    def plan(self, rig, image, settings, rng):
+        raise PlanError(f"{self.place} is out of reach")
 
 
 def add_a_rig(monkeypatch):

@@ -151,7 +151,7 @@ def test_every_module_of_robot_imports_without_the_packages_of_devices():
 @pytest.mark.parametrize(
     ("role", "table", "said"),
     [
-        ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install pyserial"),
+        ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install 'touch-retrieval[gripper]'"),
         (
             "arm",
             {"driver": "sawyer", "host": "127.0.0.1", "base_xyz_mm": [0, 0, 0], "tool_mm": 150.0},
@@ -177,6 +177,29 @@ except DeviceError as error:
     done = run_blocked(code, OF_DEVICES)
     assert said in done.stdout, done.stderr
     assert "missing" in done.stdout
+
+
+def test_robot_imports_without_the_packages_of_its_extras_and_without_opencv():
+    code = "import robot; print(robot.read_recording, robot.RecordingWriter, robot.load_importer, robot.RobotError)"
+    done = run_blocked(code, ("numba", "cv2", *OF_DEVICES))
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_real_rig_is_built_and_served_without_numba():
+    names = [str(path.relative_to(ROOT).with_suffix("")).replace("/", ".") for path in modules("robot")]
+    real = [name.removesuffix(".__init__") for name in names if not name.startswith("robot.sim.")]
+    done = run_blocked(f"import retrieval.serve.rig, {', '.join(real)}", ("numba",))
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [["collect", "--rig", "sim", "--out", "grasps"], ["demo", "--out", "demo"]])
+def test_the_simulated_rig_without_numba_says_in_one_line_what_to_install(command, tmp_path):
+    code = f"import os, sys; os.chdir({str(tmp_path)!r}); sys.path.insert(0, {str(ROOT)!r})\n"
+    done = run_blocked(f"{code}from retrieval.commands.main import main; sys.exit(main({command!r}))", ("numba",))
+    assert done.returncode == 2, done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.endswith("the simulated rig needs numba, which is missing; run pip install 'touch-retrieval[sim]'")
+    assert "Traceback" not in done.stderr
 
 
 def test_the_collector_knows_the_contract_and_no_rig():

@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Camera, Clock
+from robot.devices import Clock
 from robot.drivers.discover import as_text
-from robot.drivers.vendor import MakerSettings, load, start_again, vendor_errors
+from robot.drivers.vendor import MakerCamera, MakerSettings, load, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -50,7 +50,7 @@ class Kinect2Settings(MakerSettings):
             raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {self.pipeline!r}")
 
 
-class Kinect2(Camera):
+class Kinect2(MakerCamera):
     """A Kinect 2; its keywords are those of Kinect2Settings."""
 
     Settings = Kinect2Settings
@@ -65,7 +65,6 @@ class Kinect2(Camera):
         self._listener: Any = None
         self._registration: Any = None
         self._intrinsics: Intrinsics | None = None
-        self._has: dict[str, Any] = {}
 
     def _connect(self) -> None:
         install = (
@@ -75,7 +74,9 @@ class Kinect2(Camera):
         package = self._package = load("pylibfreenect2", "a Kinect 2", install)
         with vendor_errors("kinect2 cannot be started"):
             self._freenect = package.Freenect2()
-            serial = self._choose()
+            count = self._freenect.enumerateDevices()
+            serials = list(map(self._freenect.getDeviceSerialNumber, range(count)))  # as the package gives them
+            serial = serials[self._chosen(self._asked.serial, list(map(as_text, serials)))]
             name, pipeline = self._make_pipeline()
             self._device = self._freenect.openDevice(serial, pipeline=pipeline)
             self._listener = package.SyncMultiFrameListener(package.FrameType.Color | package.FrameType.Depth)
@@ -85,17 +86,6 @@ class Kinect2(Camera):
             self._learn(as_text(serial), name)
             for _ in range(self._asked.warmup_frames):
                 self._discard()
-
-    def _choose(self) -> str | bytes:
-        """The serial number as the package gives it."""
-        count = self._freenect.enumerateDevices()
-        found = {as_text(each): each for each in map(self._freenect.getDeviceSerialNumber, range(count))}
-        asked = self._asked.serial
-        if asked in found or (not asked and len(found) == 1):
-            chosen: str | bytes = found[asked or next(iter(found))]
-            return chosen
-        wanted = f"kinect2 {asked} must be" if asked else "one kinect2, or its serial number given, must be"
-        raise DeviceError(f"{wanted} connected; connected: {', '.join(found) or 'none'}")
 
     def _make_pipeline(self) -> tuple[str, Any]:
         """The first of the wanted pipelines that this build has and this computer can run."""
@@ -127,12 +117,6 @@ class Kinect2(Camera):
                         device.close()
         finally:
             self._listener = self._registration = self._freenect = None
-
-    def _settings(self) -> dict[str, Any]:
-        return dict(self._has)
-
-    def _recover(self) -> None:
-        start_again(self._close, self._connect)
 
     @contextlib.contextmanager
     def _frames(self) -> Iterator[Any]:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Camera, Clock
-from robot.drivers.vendor import MakerSettings, finite, load, start_again, vendor_errors
+from robot.devices import Clock
+from robot.drivers.vendor import MakerCamera, MakerSettings, finite, load, vendor_errors
 from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
 from robot.settings import limited
@@ -31,7 +31,7 @@ class RealSenseSettings(MakerSettings):
     warmup_frames: int = limited(0, 1000, 30)
 
 
-class RealSense(Camera):
+class RealSense(MakerCamera):
     """A RealSense depth camera; its keywords are those of RealSenseSettings.
 
     A picture with lens distortion is undistorted by the maker's own model (depth by the nearest pixel, so that none is
@@ -49,12 +49,12 @@ class RealSense(Camera):
         self._intrinsics: Intrinsics | None = None
         self._scale_m = 0.0
         self._undistortion: npt.NDArray[np.float32] | None = None
-        self._has: dict[str, Any] = {}
 
     def _connect(self) -> None:
         rs = load("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")
         with vendor_errors("realsense cannot be started"):
-            serial = self._choose(rs)
+            found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
+            serial = found[self._chosen(self._asked.serial, found)]
             pipeline = rs.pipeline()
             profile = pipeline.start(self._config(rs, serial))
             self._pipeline = pipeline  # from here on `_close` stops it
@@ -62,15 +62,6 @@ class RealSense(Camera):
             self._learn(rs, profile, serial)
             for _ in range(self._asked.warmup_frames):
                 self._wait()
-
-    def _choose(self, rs: Any) -> str:
-        found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
-        if self._asked.serial in found or (not self._asked.serial and len(found) == 1):
-            return self._asked.serial or found[0]
-        connected = ", ".join(found) or "none"
-        if self._asked.serial:
-            raise DeviceError(f"realsense {self._asked.serial} must be connected; connected: {connected}")
-        raise DeviceError(f"one realsense must be connected, or its serial number given; connected: {connected}")
 
     def _config(self, rs: Any, serial: str) -> Any:
         config = rs.config()
@@ -103,12 +94,6 @@ class RealSense(Camera):
         if pipeline is not None:
             with vendor_errors("realsense cannot be stopped"):
                 pipeline.stop()
-
-    def _settings(self) -> dict[str, Any]:
-        return dict(self._has)
-
-    def _recover(self) -> None:
-        start_again(self._close, self._connect)
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._asked.timeout_s))

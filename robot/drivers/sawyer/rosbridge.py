@@ -77,7 +77,7 @@ def encode(operation: Message) -> str:
     """One operation as JSON. Raises DeviceError for what JSON cannot hold, NaN among it."""
     try:
         return json.dumps(operation, allow_nan=False)
-    except (TypeError, ValueError, RecursionError) as error:
+    except (TypeError, ValueError) as error:
         raise DeviceError(f"rosbridge takes plain finite values only: {error}") from error
 
 
@@ -85,7 +85,7 @@ def decode(text: str | bytes) -> Message | None:
     """The operation in one websocket message; None for what is none."""
     try:
         found = json.loads(text)
-    except (ValueError, RecursionError):
+    except ValueError:
         return None
     return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
 

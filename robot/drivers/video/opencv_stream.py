@@ -54,7 +54,7 @@ class CaptureSettings(TypedSettings):
     white_balance_k: float | None = limited(0, 1e9, None)
     gain: float | None = limited(0, 1e9, None)
     buffer: int = limited(0, 10, 0, unit="pictures")
-    led: Sequence[int] = ()
+    led: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting out of range."""

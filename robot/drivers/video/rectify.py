@@ -38,9 +38,9 @@ class CutSettings(TypedSettings):
     """How a sensor's pictures are cut to the gel: `crop`, shares at left, top, right and bottom, or a calibration file;
     output_px: width and height of the result, counts before the file's."""
 
-    crop: Sequence[float] = ()
+    crop: tuple[float, ...] = ()
     calibration: str = ""
-    output_px: Sequence[int] = ()
+    output_px: tuple[int, ...] = ()
 
 
 _MOST_PX = 20_000
@@ -78,8 +78,11 @@ class Rectifier(TypedSettings):
                 f"a picture must be {_by(self.image_px)} pixels, as in the calibration file, got {_by(size)}; "
                 "set that width and height, or calibrate again"
             )
-        kept = self._straight(picture) if self.corners_px else self._cut(picture)
-        return _resized(kept, self.output_px)
+        if not self.corners_px:
+            return _resized(self._cut(picture), self.output_px)
+        size, matrix = self._map
+        straight = np.asarray(cv2.warpPerspective(picture, matrix, size, flags=cv2.INTER_LINEAR), dtype=np.uint8)
+        return _resized(straight, self.output_px)
 
     def _cut(self, picture: Picture) -> Picture:
         if not self.crop:
@@ -88,10 +91,6 @@ class Rectifier(TypedSettings):
         left, top, right, bottom = self.crop
         x, y = round(left * width), round(top * height)
         return picture[y : max(y + 1, height - round(bottom * height)), x : max(x + 1, width - round(right * width))]
-
-    def _straight(self, picture: Picture) -> Picture:
-        size, matrix = self._map
-        return np.asarray(cv2.warpPerspective(picture, matrix, size, flags=cv2.INTER_LINEAR), dtype=np.uint8)
 
     @cached_property
     def _map(self) -> tuple[tuple[int, int], npt.NDArray[np.float64]]:

@@ -73,7 +73,9 @@ class Port:
         try:
             serial = import_module("serial")
         except ImportError as error:
-            raise DeviceError("the WSG-50 driver needs pyserial, which is missing; run pip install pyserial") from error
+            raise DeviceError(
+                "the WSG-50 driver needs pyserial, which is missing; run pip install 'touch-retrieval[gripper]'"
+            ) from error
         self.name = name
         try:
             self._serial: Any = serial.serial_for_url(

@@ -4,7 +4,7 @@ import logging
 import math
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -48,7 +48,7 @@ class WSG50Settings(TypedSettings):
     timeout_s: float = limited(1e-3, 600, 1.0)
     home_direction: str = "default"
     acceleration_mm_s2: float = limited(0, 1e5, 0.0)
-    soft_limits_mm: Sequence[float] = ()
+    soft_limits_mm: tuple[float, ...] = ()
     tare: bool = False
     acknowledge_faults: bool = False
     grasp_width_mm: float = limited(0, 1000, 0.0)

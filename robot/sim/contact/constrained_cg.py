@@ -60,14 +60,12 @@ class ContactProblem:
         if self.load is None:
             return np.maximum(self.depth - self.gap, 0.0) / self.operator.bound
         above = self.gap - self.gap.min()
-        springs = np.maximum(self._guessed_depth(above[np.isfinite(above)], self.load) - above, 0.0)
+        there = np.sort(above[np.isfinite(above)])
+        # Of a flat punch over all pixels that lie lower than it goes: the depth falls with the root of the area.
+        punch = self.operator.peak * self.load / np.sqrt(np.arange(1, there.size + 1))
+        springs = np.maximum(float(punch[np.count_nonzero(there < punch) - 1]) - above, 0.0)
         springs = springs if springs.any() else (above == 0.0).astype(np.float64)  # a surface that does not give
         return np.asarray(springs * (self.load / springs.sum()))
-
-    def _guessed_depth(self, above: Floats, load: float) -> float:
-        """Of a flat punch over all pixels that lie lower than it goes: the depth falls with the root of the area."""
-        punch = self.operator.peak * load / np.sqrt(np.arange(1, above.size + 1))
-        return float(punch[np.count_nonzero(np.sort(above) < punch) - 1])
 
 
 class _Run:
@@ -125,15 +123,12 @@ class _Run:
         pressure = np.empty_like(self.pressure)
         leaving, entering, total = _go(self.pressure, direction, self.distance, length, pressure)
         self.conjugate = not entering
-        factor = self._factor(total)
+        # Back to the load; nothing brings it back if no pressure is left, and the safe step follows.
+        factor = 1.0 if self.problem.load is None or total <= 0.0 else self.problem.load / total
         pressure *= factor
         if leaving or entering:
             return pressure, self.problem.operator(pressure)
         return pressure, (self.displacement - length * moved) * factor
-
-    def _factor(self, total: float) -> float:
-        """What brings the pressure back to the load; nothing does if none is left, and the safe step follows."""
-        return 1.0 if self.problem.load is None or total <= 0.0 else self.problem.load / total
 
     def _safe_step(self) -> Floats:
         """Down the gradient by 1/bound, to the nearest pressure that is allowed."""

@@ -204,11 +204,6 @@ def _largest(transform: npt.NDArray[np.floating]) -> float:
 
 def _mirrored(table: Floats, shape: Quadrant, size: tuple[int, ...]) -> Floats:
     """The quadrant laid out circularly over `size`; what lies beyond shape - 1 meets only zeros."""
-    rows, cols = (_folded(n, p) for n, p in zip(shape, size, strict=True))
+    rows, cols = (np.minimum(np.arange(period), period - np.arange(period)) for period in size)
     inside = (rows < shape[0])[:, None] & (cols < shape[1])
     return np.where(inside, table[np.minimum(rows, shape[0] - 1)[:, None], np.minimum(cols, shape[1] - 1)], 0.0)
-
-
-def _folded(count: int, period: int) -> npt.NDArray[np.intp]:
-    index = np.arange(period)
-    return np.minimum(index, period - index)

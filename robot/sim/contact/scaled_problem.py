@@ -103,7 +103,9 @@ class Task:
         """Solve on a window around `start`, larger each time until nothing outside it is touched."""
         wanted, iterations = start > 0.0, 0
         while True:
-            window = _whole(self.gap.shape) if self.surface.periodic else _window(wanted)
+            window = _whole(self.gap.shape)
+            if not self.surface.periodic:  # around the wanted pixels
+                window = _span(np.asarray(wanted.any(axis=1))), _span(np.asarray(wanted.any(axis=0)))
             part = self._problem(window).solve(start[window], self.tolerance, self.max_iterations - iterations)
             iterations += part.iterations
             solution, missed = self._looked_at(part, window)
@@ -130,12 +132,8 @@ def _whole(shape: tuple[int, ...]) -> Window:
     return slice(0, shape[0]), slice(0, shape[1])
 
 
-def _window(wanted: Mask) -> Window:
-    """Around the wanted pixels, with a margin and sides of one of _STEPS lengths."""
-    return _span(np.asarray(wanted.any(axis=1))), _span(np.asarray(wanted.any(axis=0)))
-
-
 def _span(wanted: Mask) -> slice:
+    """Where any is wanted, with a margin, in one of _STEPS lengths."""
     count, where = wanted.size, np.nonzero(wanted)[0]
     first, last = max(0, int(where[0]) - _MARGIN), min(count, int(where[-1]) + 1 + _MARGIN)
     step = max(1, -(-count // _STEPS))

@@ -245,17 +245,6 @@ class MeshBody(Body):
 # Reading -----------------------------------------------------------------------------------------------------
 
 
-def load_mesh_object(
-    path: str | Path,
-    seed: int,
-    *,
-    relief: str | None = None,
-    material: str | None = None,
-) -> SimObject:
-    """Read a mesh as `read_mesh` and make an object of it as `mesh_object`, that stands as it does in the file."""
-    return mesh_object(Path(path), read_mesh(path), seed, relief=relief, material=material)
-
-
 def read_mesh(path: str | Path) -> Mesh:
     """Read a closed solid and stand it on the table.
 

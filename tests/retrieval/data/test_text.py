@@ -72,7 +72,7 @@ def test_half_of_a_character_in_a_recording_is_refused_with_its_line(recording, 
     line = (recording / "metadata.jsonl").read_text().splitlines()[0]
     row = {**json.loads(line), "object_id": f"mug{HALF}"}
     (tmp_path / "metadata.jsonl").write_text(f"{line}\n{json.dumps({**row, 'grasp_id': 'other'})}\n")
-    with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: object_id must be a non-empty printable string"):
+    with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: must be JSON in UTF-8"):
         read_recording(tmp_path)
 
 

@@ -117,7 +117,7 @@ SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
         ({"image_px": [10**400, 10], "crop": [0, 0, 0, 0]}, "image_px"),
         ({"image_px": [10, 10], "corners_px": 3}, "a list"),
         ({"image_px": [10, 10], "corners_px": SQUARE[:3]}, "four points"),
-        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [9], [1, 9]]}, "a list of 2"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [9], [1, 9]]}, "a list of length 2"),
         ({"image_px": [10, 10], "corners_px": SQUARE[::-1]}, "top left, top right"),
         ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [3, 3], [1, 9]]}, "bulges"),
         ({"image_px": [10, 10], "corners_px": [[1, 1], [1, 1], [9, 9], [1, 9]]}, "bulges"),

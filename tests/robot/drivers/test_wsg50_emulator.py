@@ -5,7 +5,6 @@ import struct
 import pytest
 
 from robot.drivers.wsg50.codec import Packet, decode, encode
-from robot.errors import RobotConfigError
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.emulators.wsg50.mechanics import Mechanics
@@ -92,72 +91,6 @@ def test_it_answers_the_printed_commands_as_the_table_says():
     assert hand.tell(0x22, b"\x00") == (12, b"")
 
 
-def test_a_motion_is_pending_first_and_denied_while_another_runs():
-    hand = Hand(opening_mm=100.0)
-    move = b"\x02" + struct.pack("<ff", 50, 100)
-    assert hand.tell(MOVE, move) == (26, b"")
-    hand.wait(0.1)
-    assert hand.state() == 6
-    assert 1 in hand.flags()
-    assert hand.tell(MOVE, move) == (4, b"")
-    assert hand.tell(GRASP, bytes(8)) == (4, b"")
-    assert hand.wait(2) == [(MOVE, 0)]
-    assert hand.value(0x43) == pytest.approx(50.0)
-    assert {0, 7} <= hand.flags()
-
-
-def test_it_homes_before_anything_else_moves():
-    hand = Hand(referenced=False)
-    assert hand.to(MOVE, 60) == 3
-    assert hand.tell(0x20, b"\x03") == (24, b"")
-    assert hand.tell(0x20, b"\x00") == (26, b"")
-    assert 0 not in hand.flags()
-    assert hand.wait(3) == [(0x20, 0)]
-    assert 0 in hand.flags()
-    assert hand.value(0x43) == pytest.approx(110.0)
-
-
-def test_grasping_finds_a_part_holds_it_and_says_when_it_is_lost():
-    hand = Hand(object_mm=40.0)
-    assert hand.to(GRASP, 0.0) == 0
-    assert (hand.state(), hand.value(0x43), hand.value(0x45)) == (HOLDING, 40.0, 40.0)
-    assert hand.to(GRASP, 0.0) == 16
-    assert hand.to(MOVE, 60.0) == 16
-    hand.emulator.object_mm = None
-    hand.wait(0.1)
-    assert (hand.state(), hand.value(0x45)) == (PART_LOST, 0.0)
-    assert hand.to(RELEASE, 80.0) == 0
-    assert (hand.state(), hand.value(0x43)) == (IDLE, pytest.approx(80.0))
-
-
-def test_grasping_nothing_fails_and_must_be_released():
-    hand = Hand()
-    assert hand.to(GRASP, 30.0) == 18
-    assert (hand.state(), hand.value(0x43)) == (NO_PART, pytest.approx(27.0))  # 3 mm of clamping travel
-    assert hand.to(GRASP, 0.0) == 16
-    assert hand.to(RELEASE, 60.0) == 0
-    assert hand.to(RELEASE, 60.0) == 16  # from idle
-
-
-def test_positioning_into_an_object_is_blocked():
-    hand = Hand(object_mm=40.0)
-    assert hand.to(MOVE, 20.0) == 29
-    assert 2 in hand.flags()
-    assert hand.value(0x43) == 40.0
-
-
-def test_stop_aborts_a_motion_and_leaves_it_usable():
-    hand = Hand(opening_mm=100.0)
-    hand.tell(MOVE, b"\x02" + struct.pack("<ff", 10, 50))
-    hand.wait(0.2)
-    first, second = hand.emulator.receive(Packet(STOP))
-    assert (first.id, first.payload) == (MOVE, b"\x13\x00")
-    assert (second.id, second.payload) == (STOP, b"\x00\x00")
-    assert not hand.emulator.moves
-    assert 6 in hand.flags()
-    assert hand.to(MOVE, 50.0) == 0
-
-
 def test_a_fast_stop_ends_only_with_an_acknowledgement():
     hand = Hand(opening_mm=100.0)
     assert hand.tell(ACK, b"ack")[0] == 16  # nothing to acknowledge
@@ -169,12 +102,6 @@ def test_a_fast_stop_ends_only_with_an_acknowledgement():
     assert hand.tell(ACK, b"nak")[0] == 24
     assert hand.tell(ACK, b"ack")[0] == 0
     assert (hand.state(), 12 in hand.flags()) == (IDLE, False)
-
-
-def test_a_fault_shows_its_flag():
-    hand = Hand()
-    hand.emulator.fail("temperature")
-    assert {12, 14} <= hand.flags()
 
 
 def test_limits_are_held_and_what_is_outside_is_refused():
@@ -196,41 +123,6 @@ def test_setting_it_while_it_moves_is_a_fast_stop():
     assert hand.tell(0x32, struct.pack("<f", 20))[0] == 16
     assert hand.emulator.in_fast_stop
     assert not hand.emulator.moves
-
-
-def test_it_can_be_tared_with_force_fingers_and_not_while_holding():
-    hand = Hand(object_mm=40.0)
-    assert hand.tell(0x38)[0] == 1
-    hand.emulator.has_force_fingers = True
-    assert hand.tell(0x38)[0] == 0
-    hand.to(GRASP, 0.0)
-    assert hand.tell(0x38)[0] == 16
-
-
-def test_updates_come_by_themselves_until_told_to_end():
-    hand = Hand()
-    assert hand.tell(0x43, b"\x01\x14\x00")[0] == 0  # every 20 ms
-    assert hand.wait(0.2) == [(0x43, 0)] * 10
-    assert hand.tell(0x43, b"\x03\x14\x00")[0] == 28  # only when it changes: nobody asks for it
-    assert hand.tell(0x43, b"\x01\x00\x00")[0] == 28
-    assert hand.wait(0.2) == []
-    hand.tell(0x43, b"\x01\x14\x00")
-    hand.tell(0x43, bytes(3))
-    assert hand.wait(0.2) == []
-
-
-def test_an_answer_that_fits_no_packet_is_a_range_error():
-    hand = Hand()
-    assert hand.tell(0x06, bytes(254)) == (0, bytes(254))
-    assert [hand.tell(0x06, bytes(size)) for size in (255, 256)] == [(28, b"")] * 2
-
-
-def test_a_command_is_answered_as_told_once_and_not_done():
-    hand = Hand(opening_mm=100.0)
-    hand.emulator.next_status = {GRASP: 20}
-    assert hand.to(GRASP, 0.0) == 20
-    assert hand.value(0x43) == 100.0
-    assert hand.to(GRASP, 0.0) == 18
 
 
 def test_a_client_that_goes_without_a_word_leaves_a_fast_stop():
@@ -272,9 +164,3 @@ def test_faults_come_at_their_rate_and_the_same_from_the_same_seed():
         assert 140 <= sum(faults.counts.values()) <= 260
     assert runs[0] == runs[1]
     assert not any(LineFaults().on(packet) is None for _ in range(5))
-
-
-@pytest.mark.parametrize("settings", [{"rate": 1.5}, {"rate": -0.1}, {"kinds": ["gone"]}])
-def test_faults_that_cannot_be_are_refused(settings):
-    with pytest.raises(RobotConfigError):
-        LineFaults(**settings)

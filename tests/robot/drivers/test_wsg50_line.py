@@ -8,7 +8,7 @@ import pytest
 from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.link import LinkLost
 from robot.errors import DeviceError
-from tests.emulators.wsg50.faults import LineFaults, Piece
+from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.waiting import until
 from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench
@@ -194,9 +194,3 @@ def test_grasps_over_a_bad_line_end_right_or_with_a_reason_and_never_closing(por
             else:
                 pytest.fail(f"ten tries, {faults.counts}")
         faults.rate = 0.0
-
-
-def test_pieces_of_the_script_are_those_of_the_faults():
-    script = Script()
-    script.tell({STOP: "disconnect"})
-    assert list(script.on(wsg50.Packet(STOP))) == [Piece(None)]

@@ -435,7 +435,9 @@ def test_a_terminal_that_goes_away_is_noticed():
 
 def test_without_pyserial_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(DeviceError, match="needs pyserial, which is missing; run pip install pyserial"):
+    with pytest.raises(
+        DeviceError, match=r"needs pyserial, which is missing; run pip install 'touch-retrieval\[gripper\]'"
+    ):
         Link("loop://").open()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot.errors import PlanError, RobotConfigError
-from robot.grasping.plan import plan_grasp
+from robot.grasping.planner import plan_grasp
 from robot.grasping.settings import GraspSettings
 from robot.readings import Region
 from robot.settings import build
@@ -146,8 +146,8 @@ def test_settings_come_from_plain_values():
     with pytest.raises(RobotConfigError, match="no setting 'jitter'; it knows clearance_mm, finger_mm"):
         build(GraspSettings, {"jitter": 3})
     for wrong, said in (
-        ({"force_n": [1, 2, 3]}, "force_n must be a list of 2"),
-        ({"force_n": ["a", "b"]}, "force_n must be a list of 2, each of them a number"),
+        ({"force_n": [1, 2, 3]}, "force_n must be a list of length 2"),
+        ({"force_n": ["a", "b"]}, r"force_n\[0\] must be a number, got 'a'"),
         ({"lift_mm": "high"}, "lift_mm must be a number"),
     ):
         with pytest.raises(RobotConfigError, match=said):

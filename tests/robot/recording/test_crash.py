@@ -141,7 +141,7 @@ def test_a_process_that_is_killed_leaves_whole_grasps(tmp_path):
         "writer = recording.RecordingWriter(sys.argv[1], {'source': 'test', 'sensor': 'GelSight'})\n"
         "image = np.zeros((2, 2, 3), np.uint8)\n"
         "writer.append('1', 'mug', {'photo': image, 'touch_a': image})\n"
-        "recording.sync_folder = lambda folder: os._exit(9)\n"
+        "recording.sync = lambda folder: os._exit(9)\n"
         "writer.append('2', 'mug', {'photo': image, 'touch_a': image})\n"
     )
     root = Path(module.__file__).parents[1]

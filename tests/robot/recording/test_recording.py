@@ -170,7 +170,6 @@ BAD_LINES = {
     "[]": "one JSON object",
     '"x"': "one JSON object",
     "\udcff": "must be JSON in UTF-8",
-    "[" * 100_000: "must be JSON",
     json.dumps({**ROW, "grasp_id": "0"}): "'0' has a line already",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "grasp_id"}): "grasp_id is missing",
@@ -178,13 +177,13 @@ BAD_LINES = {
     json.dumps({key: ROW[key] for key in ROW if key != "touch_a_file_name"}): "at least one touch",
     json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a non-empty printable string, got 5",
     json.dumps({**ROW, "object_id": " "}): "object_id must be a non-empty",
-    json.dumps({**ROW, "object_id": "\ud800"}): "object_id must be a non-empty printable",
+    json.dumps({**ROW, "object_id": "\ud800"}): "escaped utf-16 surrogate pair",
     json.dumps({**ROW, "sequence_id": ["a"]}): "sequence_id must be",
     json.dumps({**ROW, "force_n": "5"}): "force_n must be a finite number, got '5'",
     json.dumps({**ROW, "force_n": True}): "force_n must be a finite number, got True",
-    json.dumps({**ROW, "force_n": float("nan")}): "finite, got NaN",
-    json.dumps({**ROW, "force_n": float("inf")}): "finite, got Infinity",
-    json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "time_s must be a finite number, got inf",
+    json.dumps({**ROW, "force_n": float("nan")}): "must be JSON in UTF-8, without NaN",
+    json.dumps({**ROW, "force_n": float("inf")}): "must be JSON in UTF-8, without NaN",
+    json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "of finite numbers: Number out of range",
     json.dumps({**ROW, "time_s": 10**400}): "time_s must be a finite number",
     json.dumps({**ROW, "grasped": 1}): "grasped must be true or false, got 1",
     json.dumps({**ROW, "outcome": "lost"}): "outcome must be one of held, missed, slipped, no_plan, got 'lost'",
@@ -445,7 +444,7 @@ def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name
     path.unlink()
     for make in (os.mkfifo, lambda there: os.symlink("/dev/zero", there), os.mkdir):
         make(path)
-        with pytest.raises(RecordingError, match=r"pipe, a socket or a device|folder, not a file"):
+        with pytest.raises(RecordingError, match=r"is a (pipe|device), not a regular file|is a folder, not a file"):
             read_recording(tmp_path)
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
@@ -454,7 +453,7 @@ def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name
 
 def test_a_pipe_where_the_lines_are_to_stand_is_refused(tmp_path):
     os.mkfifo(tmp_path / "metadata.jsonl")
-    with pytest.raises(StorageError, match="it is a pipe, a socket or a device"):
+    with pytest.raises(StorageError, match="is a pipe, not a regular file"):
         RecordingWriter(tmp_path, INFO)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".json"] == []
 
@@ -463,7 +462,7 @@ def test_a_picture_that_is_no_file_is_refused_without_being_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     with (
         RecordingWriter(tmp_path / "r", INFO) as writer,
-        pytest.raises(RecordingError, match=r"photo: .*pipe, a socket or a device"),
+        pytest.raises(RecordingError, match=r"photo: .*is a pipe, not a regular file"),
     ):
         writer.append("1", "mug", {**pictures(), "photo": tmp_path / "pipe.png"})
 

@@ -11,8 +11,8 @@ import pytest
 from robot.collect import CollectSettings, collect
 from robot.errors import RecordingError, RobotConfigError, SceneError, UnknownName
 from robot.rig import load_rig
-from robot.sim.objects.mesh import Mesh, load_mesh_object
-from tests.meshes import CORNERS, CUBE, obj, ply, sphere, stl
+from robot.sim.objects.mesh import Mesh
+from tests.meshes import CORNERS, CUBE, load_mesh_object, obj, ply, sphere, stl
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
 pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")

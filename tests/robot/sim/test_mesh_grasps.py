@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from robot.collect import CollectSettings, collect
-from robot.errors import UngraspableError
+from robot.errors import RobotConfigError, UngraspableError
 from robot.grasping.attempt import Attempter
 from robot.grasping.settings import GraspSettings
 from robot.readings import Pose
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
-from robot.sim.objects.mesh import Mesh, load_mesh_object, mesh_object, read_mesh
+from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
 from robot.sim.objects.resting import UP, resting_ups, tipping_angle, turn_up
-from tests.meshes import BOTTLE, box, revolved, sphere, stl
+from tests.meshes import BOTTLE, box, load_mesh_object, revolved, sphere, stl
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
 pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
@@ -291,6 +291,16 @@ def test_several_jobs_skip_the_same_objects_and_write_the_same_bytes(tmp_path):
     collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
     collect(make_rig, tmp_path / "s", objects=3, seed=1, settings=settings, jobs=2)
     assert files(tmp_path / "r") == files(tmp_path / "s")
+
+
+def test_a_file_chooses_the_planner_of_meshes_and_refuses_that_of_meshes_without_meshes(tmp_path):
+    three(tmp_path / "meshes")
+    assert type(load_rig("sim", seed=0, meshes=str(tmp_path / "meshes")).planner).__name__ == "MeshPlanner"
+    (tmp_path / "rig.toml").write_text(f'rig = "sim"\nmeshes = "{tmp_path}/meshes"\n[planner]\nname = "cylinder"\n')
+    assert type(load_rig(str(tmp_path / "rig.toml"), seed=0).planner).__name__ == "CylinderPlanner"
+    (tmp_path / "rig.toml").write_text('rig = "sim"\n[planner]\nname = "mesh"\n')
+    with pytest.raises(RobotConfigError, match=r'rig\.toml: \[planner\]: name = "mesh" plans for meshes'):
+        load_rig(str(tmp_path / "rig.toml"), seed=0)
 
 
 def test_a_mesh_that_stands_in_its_file_is_not_turned(tmp_path):

@@ -66,7 +66,7 @@ def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path):
     assert files(tmp_path / "parts") == files(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("left", ["metadata.jsonl.part", "pictures.json.part"])
+@pytest.mark.parametrize("left", [".metadata.jsonl.0a.tmp", ".pictures.json.0a.tmp"])
 def test_what_was_killed_while_its_folder_was_made_can_be_begun_again(tmp_path, left):
     (tmp_path / left).write_bytes(b'{"ki')
     assert collect_pictures("photo", tmp_path, objects=1, seed=5) == 1
