@@ -2,7 +2,6 @@
 
 import secrets
 import time
-from dataclasses import asdict
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Annotated
@@ -18,7 +17,7 @@ from retrieval.serve.errors import Problem, problems
 from retrieval.serve.recording import recordable
 from retrieval.serve.service import Keeping, Parts, Service
 from retrieval.serve.store import Choice, Run, Store, new_id
-from retrieval.serve.trials import CHOICES, Trial, Trials, results
+from retrieval.serve.trials import CHOICES, Share, Trial, Trials, results
 from retrieval.serve.uploads import json_body, read_json
 
 router = APIRouter(tags=["human test"])
@@ -35,16 +34,6 @@ class NewRun(BaseModel):
     seed: int | None = Field(None, ge=0, lt=2**31)
 
 
-class ShareDocument(BaseModel):
-    """Right answers, their share and its exact interval of 95 %; null before the first."""
-
-    right: int
-    trials: int
-    share: float | None
-    low: float | None
-    high: float | None
-
-
 class RunDocument(BaseModel):
     """A series and how it stands. next: the first trial that was not done, null at the end."""
 
@@ -55,8 +44,8 @@ class RunDocument(BaseModel):
     choices: int
     answered: int
     next: int | None
-    human: ShareDocument
-    model: ShareDocument
+    human: Share
+    model: Share
     chance: float
 
 
@@ -109,8 +98,8 @@ def _document(run: Run, store: Store) -> RunDocument:
         choices=CHOICES,
         answered=len(chosen),
         next=min(left, default=None),
-        human=ShareDocument(**asdict(human)),
-        model=ShareDocument(**asdict(model)),
+        human=human,
+        model=model,
         chance=1 / CHOICES,
     )
 

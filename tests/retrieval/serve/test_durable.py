@@ -1,6 +1,5 @@
 """What was acknowledged is there after SIGKILL, once."""
 
-import base64
 import random
 import signal
 import threading
@@ -14,11 +13,6 @@ from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter
 from tests.retrieval.serve.test_history import INFO
 from tests.serving import command, service
-
-
-@pytest.fixture(scope="module")
-def body(touch):
-    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
 
 
 def killed_while_people_speak(index, folder, body, name, after_s):

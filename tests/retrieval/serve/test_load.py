@@ -1,6 +1,5 @@
 """Many at once, askers who leave, deadlines, queries answered together, new generations of the index, and the end."""
 
-import base64
 import shutil
 import signal
 import socket
@@ -21,11 +20,6 @@ from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
 from tests.serving import command, listening, problem, service
 from tests.waiting import until
-
-
-@pytest.fixture(scope="module")
-def body(touch):
-    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
 
 
 class Held:

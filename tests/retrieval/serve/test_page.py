@@ -12,21 +12,10 @@ from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from retrieval.serve.service import Grasped, LiveRig
 from tests import synthetic
-from tests.browser import address, ask, choose, chromium, gel_files, page, serious
+from tests.browser import address, ask, choose, page, serious
 
 pytestmark = pytest.mark.slow
 JPEG = synthetic._jpeg(synthetic.draw_background(1))
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def files(touch, tmp_path_factory):
-    return gel_files(tmp_path_factory.mktemp("gels"), touch)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +114,7 @@ def test_every_verdict_is_said_in_words(opened, files, index, verdict, claim, to
     with Searcher.open(index) as searcher:
         document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
     if verdict != "none of these":
-        document |= {"none_probability": None, "posterior": None}
+        document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior", "information"))
     if verdict in ("no contact", "not a gel image"):
         document |= {"results": [], "query": {"touches": [["a.png", "b.png"]], "grasps": [verdict]}}
     opened.route("**/v1/query", lambda route: route.fulfill(json=document))
@@ -156,17 +145,25 @@ def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened
     assert len(shown) == len(document["results"])
 
 
+def test_the_probability_of_the_objects_that_are_not_listed_is_the_one_of_the_service(opened, files, index):
+    with Searcher.open(index) as searcher:
+        document = searcher.query(files[:2], top=3).to_dict() | {"unlisted_probability": 0.4375}
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
+    assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
+
+
 def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, index):
     """The history of a service holds such."""
     with Searcher.open(index) as searcher:
         document = searcher.query(files[:2], none_prior=0.999).to_dict()
-    del document["advice"], document["more_grasps"]
+    del document["advice"], document["more_grasps"], document["information"], document["unlisted_probability"]
     for match in document["results"]:
         del match["probability_if_present"]
     opened.route("**/v1/query", lambda route: route.fulfill(json=document))
     ask(opened, files[:2])
     opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
-    assert opened.locator(".advice, .if-present").count() == 0
+    assert opened.locator(".advice, .if-present, .another").count() == 0
 
 
 def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):

@@ -13,19 +13,13 @@ from retrieval.serve.rig import of_index, of_rig
 from retrieval.training.train import train
 from robot.recording.folder import RecordingWriter
 from robot.sim.rig import SimRig
-from tests.browser import address, chromium, page
+from tests.browser import address, page
 from tests.conftest import TINY
 from tests.replay_rig import replay_file
 
 pytestmark = pytest.mark.slow
 SEED = 20_000
 SHOWN = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
