@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import Json, Model, Values
+from retrieval.commands.options import Json, Model, Values, resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
 
@@ -75,11 +75,8 @@ def report(
     out.mkdir(parents=True, exist_ok=True)
     grasps = partial(_recording, recording, out, quick)
     sample = Sample(path, grasps, out / "features", QUICK if quick else Scale())
-    try:
+    with resumable(f"what was measured is kept in {out}"):
         document = measure(sample, out, only, table=table, need_no_model=need_no_model)
-    except KeyboardInterrupt:
-        say(f"what was measured is kept in {out}; the same command goes on with it")
-        raise
     page, *_ = write_frontier(out, document)
     say(f"page: {page}")
     return document
@@ -88,14 +85,14 @@ def report(
 def _recording(given: Path | None, out: Path, quick: bool) -> Path:
     if given is not None:
         return given
-    from retrieval.console.progress import CollectBar
+    from retrieval.console.progress import CountedBar
     from robot.collect import CollectSettings, collect
     from robot.rig import load_rig
 
     objects, grasps = (6, 2) if quick else (30, 4)
     folder = out / "recording"
     say(f"collecting {grasps} grasps of each of {objects} simulated objects into {folder}")
-    with CollectBar() as bar:
+    with CountedBar("collect", "grasps") as bar:
         collect(
             partial(load_rig, "sim", seed=SEED),
             folder,
@@ -103,6 +100,6 @@ def _recording(given: Path | None, out: Path, quick: bool) -> Path:
             seed=SEED,
             settings=CollectSettings(grasps=grasps),
             jobs=os.cpu_count() or 1,
-            progress=bar,
+            progress=lambda now: bar(now.settled, now.wanted, str(now)),
         )
     return folder

@@ -13,17 +13,13 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from retrieval.errors import BadInput, RetrievalError
+from retrieval.errors import RetrievalError
 
 
 def print_json(document: Any) -> None:
-    """One JSON document on stdout, in ASCII. Raises BadInput for one that is nested too deeply."""
-    try:
-        text = json.dumps(document, allow_nan=False)
-    except RecursionError as error:
-        raise BadInput("the metadata of the results is nested too deeply for JSON; leave out --json") from error
+    """One JSON document on stdout, in ASCII."""
     with printing():
-        print(text)
+        print(json.dumps(document, allow_nan=False))
 
 
 def show(text: str) -> None:
