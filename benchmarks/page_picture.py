@@ -17,8 +17,8 @@ from PIL import Image
 from retrieval.commands.demo import PHOTOS, example
 from retrieval.data.dataset import load_grasps
 from retrieval.serve.rig import of_index
-from robot.recording.folder import RecordingWriter
 from tests.browser import address, ask, chromium, page
+from tests.serving import keeping
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "page.jpg"
 SIZE = {"width": 1280, "height": 960}
@@ -38,8 +38,7 @@ def main():
     index = folder / "index"
     with (
         tempfile.TemporaryDirectory() as history,
-        RecordingWriter(Path(history, "recording"), {"source": "nobody", "sensor": "simulated"}) as writer,
-        address(index, of_index(index), writer, folder / "recording", history=Path(history)) as url,
+        keeping(index, Path(history), folder / "recording", of_index(index), address) as url,
         chromium() as browser,
         page(browser, url) as opened,
     ):

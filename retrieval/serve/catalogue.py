@@ -3,6 +3,7 @@
 An id is looked up in the index, and the file is the one that the index names: no text of a request is part of a path.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -22,13 +23,14 @@ from retrieval.serve.documents import (
 )
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
+from retrieval.serve.keeping import recordable
 from retrieval.serve.service import Parts
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
 SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """Files that every browser shows, by their first bytes; others are sent as JPEG."""
-_PICTURES: dict[int | str, dict[str, Any]] = {
+PICTURES: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
 }
 WHOLE_PX = 4096
@@ -83,7 +85,7 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
     return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
 
 
-@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
 def photo(request: Request, photo: str, parts: Parts) -> Response:
     """A photo of the catalogue, or a gel image of a reference touch, as it is; what browsers do not show, as JPEG."""
     opened = parts.generations.current
@@ -105,7 +107,7 @@ def photo(request: Request, photo: str, parts: Parts) -> Response:
     return _picture(data, kind, row, "whole")
 
 
-@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
 def small(
     request: Request,
     photo: str,
@@ -136,6 +138,13 @@ def _unchanged(request: Request, row: dict[str, object], size: str) -> Response 
 
 def _picture(data: bytes, kind: str, row: dict[str, object], size: str) -> Response:
     return Response(data, media_type=kind, headers={"etag": _tag(row, size), "cache-control": "private, no-cache"})
+
+
+def shown_picture(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
+    """A picture's file as a response: PNG or JPEG as it is, another as PNG. Raises ImageError."""
+    data = recordable(data)
+    kind = next(kind for magic, kind in SHOWN.items() if data.startswith(magic))
+    return Response(data, media_type=kind, headers=headers)
 
 
 @router.get("/v1/nearest/{photo:path}", responses=problems("unknown", "bad-input"))

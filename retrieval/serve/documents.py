@@ -179,9 +179,3 @@ class GraspDocument(BaseModel):
     object_id: str
     touches: list[str]
     background: list[str] | None
-
-
-class Health(BaseModel):
-    """status: "ok", or why not."""
-
-    status: str

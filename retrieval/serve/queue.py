@@ -208,18 +208,12 @@ def _tell(jobs: list[_Job], answers: list[Any]) -> None:
 
 def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
     """The answer of each job, or the exception that is its answer; one bad query spoils no other."""
-    if len(jobs) > 1 and (together := _batch(opened, jobs)) is not None:
-        return list(together)
-    return [_answer(opened, job) for job in jobs]
-
-
-def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
-    try:
-        found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
-    except BaseException:  # each alone says which of them it was
-        return None
-    return [Answered(result, opened.model) for result in found]
+    if len(jobs) > 1:
+        with suppress(BaseException):  # else each alone says which of them it was
+            found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
+            return [Answered(result, opened.model) for result in found]
+    return [_answer(opened, job) for job in jobs]
 
 
 def _answer(opened: Opened, job: _Job) -> Any:

@@ -7,13 +7,12 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.browser import address, ask, page, serious
+from tests.serving import keeping
 
 pytestmark = pytest.mark.slow
 MANY = 100_000
-INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
 
 
 @pytest.fixture(scope="module")
@@ -21,10 +20,7 @@ def url(index, tmp_path_factory):
     """A service that keeps what it is told, with a recording of twelve objects that the model never saw."""
     folder = tmp_path_factory.mktemp("kept")
     unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with (
-        RecordingWriter(folder / "recording", INFO) as writer,
-        address(index, None, writer, unseen, history=folder) as found,
-    ):
+    with keeping(index, folder, unseen, serve=address) as found:
         yield found
 
 

@@ -7,10 +7,9 @@ from PIL import Image
 
 from retrieval.data.dataset import load_grasps
 from retrieval.search.build.build_index import build_index
-from robot.recording.folder import RecordingWriter
 from tests.browser import address, ask, page, serious
 from tests.referenced import NAMES, a_model
-from tests.serving import problem, service
+from tests.serving import keeping, problem, service
 
 
 @pytest.fixture
@@ -48,10 +47,7 @@ def test_a_gel_image_is_no_photo_to_compare_with(index, touches):
 
 
 def test_what_was_said_of_an_object_without_photos_is_kept_but_no_gel_becomes_a_photo(index, touches, tmp_path):
-    with (
-        RecordingWriter(tmp_path / "recording", {"source": "what people said", "sensor": "drawn gel"}) as writer,
-        service(index, None, writer, history=tmp_path) as client,
-    ):
+    with keeping(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):
             asked = client.post("/v1/query", **files(touches[name][0]))
             said = {"query": asked.headers["x-query-id"], "said": "object", "object_id": name}
