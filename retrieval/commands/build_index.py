@@ -167,7 +167,7 @@ def _shards(asked: int | None, out: str, *, of_shards: bool) -> int | None:
 def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
     """Write what the model sees of some photos of the index, or of its first shard."""
     from indexes.store.folder import IndexStore
-    from retrieval.report.views import write_views
+    from retrieval.report.pages import write_views
 
     first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
     rows = first.open(verify=False).rows

@@ -127,7 +127,9 @@ class Keeping:
             return None
         name = new_id()
         write = self._writer.submit(
-            self._attempt, name, lambda: self.store.keep(name, asked.touches, asked.background, *answered)
+            self._attempt,
+            name,
+            lambda: self.store.keep(name, asked.pictures.files[0], asked.pictures.background, *answered),
         )
         self._waiting[name] = write
         write.add_done_callback(lambda _: self._waiting.pop(name, None))

@@ -223,16 +223,6 @@ class Asked:
     options: Options
 
     @property
-    def touches(self) -> Sequence[Sequence[bytes]]:
-        """The files of the touches of a single object."""
-        return self.pictures.files[0]
-
-    @property
-    def background(self) -> Sequence[bytes] | None:
-        """The files of the no-contact frames."""
-        return self.pictures.background
-
-    @property
     def keywords(self) -> dict[str, Any]:
         """The keywords of `Searcher.query`, all but the touches; the pictures must have been read."""
         options = self.options.model_dump(include={"top", "candidates", "none_prior"})
@@ -240,7 +230,8 @@ class Asked:
 
     def goes_with(self, other: "Asked") -> bool:
         """Whether both can be answered together."""
-        return {**self.keywords, "background": self.background} == {**other.keywords, "background": other.background}
+        background = self.pictures.background == other.pictures.background
+        return background and {**self.keywords, "background": None} == {**other.keywords, "background": None}
 
 
 def pictures_of(
