@@ -14,6 +14,7 @@ from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.serving import INFO, keeping, problem, service
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +125,8 @@ def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index,
         said = say(client, query, "object", name)
         assert (said.status_code, said.json()["recorded"]) == (201, False)
         assert b'retrieve_unrecorded_total{what="said"} 1.0' in client.get("/metrics").content
-    with keeping(index, folder) as client:
-        client.get("/v1/history")
+    with keeping(index, folder):  # in a thread of its own, which the end of the service does not wait for
+        until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 

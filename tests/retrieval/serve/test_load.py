@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
@@ -183,6 +184,8 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
         until(lambda: asked(url, body).json()["index"]["generation"] == "gen-000002", 60)
         (own / "CURRENT").write_text("gen-000009\n")
         until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
+        time.sleep(0.5)  # ten polls
+        assert value(url, "retrieve_reload_failures_total") == 1  # and one line in the log, not one for each poll
         assert asked(url, body).json()["index"]["generation"] == "gen-000002"
 
 
