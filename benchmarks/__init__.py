@@ -21,6 +21,7 @@ Each runs in a checkout of the repository:
     python -m benchmarks.rehearsal             collect, check, train, index and query without hardware
     python -m benchmarks.structure             files, lines and imports of the packages; ways through the code
     python -m benchmarks.reference             writes docs/reference.md, docs/commands.md and docs/datasets.md
+    python -m benchmarks.page_picture DEMO     makes docs/images/page.jpg
     python -m benchmarks.notebooks             runs the notebooks again and stores their outputs
 
 No time is asserted anywhere; the arms of a ratio take turns, so that a busy machine slows all of them.

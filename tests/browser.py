@@ -94,11 +94,3 @@ def ask(opened, files):
     choose(opened, "Choose gel images", files)
     opened.get_by_role("button", name="Ask", exact=True).click()
     opened.locator(".answer").wait_for()
-
-
-def gel_files(folder, touch):
-    """The gel images of two grasps, named as a person may name them."""
-    names = [folder / name for name in ("first_a.png", "first_b.png", "second_a.png", "second_b.png")]
-    for name, source in zip(names, [*touch, *touch], strict=True):
-        name.write_bytes(source.read_bytes())
-    return names

@@ -12,7 +12,11 @@ from fastapi.testclient import TestClient
 from retrieval.serve.app import create_app
 from retrieval.serve.run import Server, configured
 from retrieval.serve.settings import ServiceSettings
+from robot.recording.folder import RecordingWriter
 from tests.waiting import running
+
+INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
+"""Of the recording of what people said."""
 
 
 @contextmanager
@@ -21,6 +25,17 @@ def service(index, rig=None, recorder=None, trials=None, **settings):
     app = create_app(ServiceSettings(index=index, **settings), rig, recorder, trials)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
+
+
+@contextmanager
+def keeping(index, folder, trials=None, rig=None, serve=service, info=INFO):
+    """What `serve` gives (`service`, `listening` or `browser.address`), of a service that stores its history in a
+    folder."""
+    with (
+        RecordingWriter(folder / "recording", info) as writer,
+        serve(index, rig, writer, trials, history=folder) as found,
+    ):
+        yield found
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What another grasp tells, beside what the page says that it may be expected to tell.
+"""What a further grasp tells, compared with `next_grasp_bits` of the answer before it (`retrieval.model.information`).
 
     python -m benchmarks.models.next_grasp RECORDING --photos 2
 
@@ -8,7 +8,6 @@ and 100 objects, with the object and without it in turn, with the shipped checkp
 """
 
 import argparse
-import math
 import sys
 import tempfile
 from collections import defaultdict
@@ -18,35 +17,13 @@ import numpy as np
 
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.information import information
+from retrieval.model.posterior import NONE_PRIOR
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher
 
 SIZES, GRASPS, DRAWS = (20, 100), (1, 2, 3), 8
-
-
-def worth(grasps, dependence):
-    """So many grasps of one object weigh as much as this many that know nothing of each other."""
-    return grasps / (1 + dependence * (grasps - 1))
-
-
-def expected_bits(left, grasps, dependence):
-    """What another grasp may be expected to tell, of so many bits that are left."""
-    return left * (1 - math.exp(worth(grasps, dependence) - worth(grasps + 1, dependence)))
-
-
-def another_grasp(answer):
-    """Bits that another grasp is expected to tell, bits that are left, and what all these grasps would weigh."""
-    believed = np.array([*(match.probability for match in answer.results), answer.none_probability])
-    grasps, dependence = answer.posterior["grasps"], answer.posterior["dependence"]
-    left = entropy(believed)
-    return expected_bits(left, grasps, dependence), left, worth(grasps + 1, dependence)
-
-
-def entropy(believed):
-    """In bits."""
-    some = believed[believed > 0]
-    return float(-np.sum(some * np.log2(some)))
 
 
 def judged(folder, recording, photos):
@@ -71,13 +48,16 @@ def judged(folder, recording, photos):
         return np.array(logits, dtype=np.float64), np.array(owners), np.array(shown), searcher.posterior
 
 
-def believed_of(posterior, logits, shown, catalogue, grasps):
-    """Probabilities of a catalogue's objects, and of none, last."""
+def answer(posterior, logits, shown, catalogue, grasps):
+    """Probabilities of a catalogue's objects, of none last; and the information of this answer."""
     here = np.isin(shown, catalogue)
     owner = np.searchsorted(catalogue, shown[here])
     objects = posterior.object_logits(logits[here], owner, np.bincount(owner), grasps)
     belief = posterior.believe(objects, grasps)
-    return np.append(belief.objects, belief.none)
+    told = information(
+        posterior, grasps, belief.none, belief.objects.tolist(), objects=len(catalogue), none_prior=NONE_PRIOR
+    )
+    return np.append(belief.objects, belief.none), told
 
 
 def measured(logits, owners, shown, posterior, size, grasps, draw):
@@ -89,13 +69,11 @@ def measured(logits, owners, shown, posterior, size, grasps, draw):
             *have, more = draw.permutation(mine)[: grasps + 1]
             others = draw.permutation(names[names != name])[:size]
             catalogue = np.sort(others if number % 2 else np.append(others[1:], name))
-            before = believed_of(posterior, logits[have].sum(0), shown, catalogue, grasps)
-            after = believed_of(posterior, logits[[*have, more]].sum(0), shown, catalogue, grasps + 1)
+            before, told = answer(posterior, logits[have].sum(0), shown, catalogue, grasps)
+            after, later = answer(posterior, logits[[*have, more]].sum(0), shown, catalogue, grasps + 1)
             kept = after > 0
             moved = np.sum(after[kept] * np.log2(after[kept] / before[kept]))
-            left = entropy(before)
-            expected = expected_bits(left, grasps, posterior.dependence)
-            found.append((expected, moved, left - entropy(after)))
+            found.append((told.next_grasp_bits, moved, told.remaining_bits - later.remaining_bits))
     return np.array(found)
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import SEED, SPLIT, Recording, read_split
+from retrieval.commands.options import SEED, SPLIT, CheckpointOut, Recording, read_split
 from retrieval.console.files import TEXT, require_ours
 from retrieval.console.output import say
 
@@ -13,7 +13,7 @@ from retrieval.console.output import say
 def adapt(
     recording: Recording,
     *,
-    out: Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")],
+    out: CheckpointOut,
     model: Annotated[
         Path | None, typer.Option(help="checkpoint to start from (default: the shipped one of as many fingers)")
     ] = None,

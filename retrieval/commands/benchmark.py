@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.import_ import run_importer
-from retrieval.commands.options import COUNT, INIT, Command, Json, Values, training_config
+from retrieval.commands.options import (
+    COUNT,
+    Command,
+    Init,
+    Iterations,
+    Json,
+    ReportOut,
+    Values,
+    resumable,
+    training_config,
+)
 from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
@@ -38,7 +48,7 @@ def real(
         ),
     ],
     *,
-    out: Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")],
+    out: ReportOut,
     protocols: Annotated[
         str | None,
         typer.Option(help=f"which to ask, with commas between: {', '.join(PROTOCOLS)} (default: those with data)"),
@@ -50,10 +60,8 @@ def real(
         ),
     ] = None,
     preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
-    init: Annotated[str | None, typer.Option(help=INIT)] = None,
-    iterations: Annotated[
-        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
-    ] = None,
+    init: Init = None,
+    iterations: Iterations = None,
     model: Annotated[
         Values | None,
         typer.Option(parser=Values.read, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"),
@@ -74,7 +82,7 @@ def real(
     data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in asked}
     config = training_config(preset, iterations, init=init)
     cache = cache or out / "cache"
-    try:
+    with resumable(f"what was made is kept in {cache}"):
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
         skipped = {name: missing[of] for name, of in data_set_of.items() if of in missing}
         if protocols or len(skipped) < len(asked):
@@ -94,9 +102,6 @@ def real(
             skipped=skipped,
             cache=cache,
         )
-    except KeyboardInterrupt:
-        say(f"what was made is kept in {cache}; the same command goes on with it")
-        raise
     text, page, *_ = write_report(out, recordings)
     say(f"report: {text}, {page}")
     if json:
@@ -107,11 +112,13 @@ def real(
 
 def _recordings(data: Path, names: Iterable[str], made: Path) -> tuple[dict[str, Path], dict[str, str]]:
     """Recordings by data set, those that are no recordings yet imported below `made`; and what is missing, why."""
+    from retrieval.data.dataset import recording_source
     from robot.importers import data_set_of
 
     if not data.is_dir():
         raise BadInput(f"{data} must be a folder with data sets in it, such as vt60/ or billets/")
-    recorded = _sources(data)
+    folders = [path for path in (data, *sorted(data.iterdir())) if (path / "recording.json").is_file()]
+    recorded = {recording_source(folder): folder for folder in reversed(folders)}
     found: dict[str, Path] = {}
     missing: dict[str, str] = {}
     for name in dict.fromkeys(names):
@@ -123,14 +130,6 @@ def _recordings(data: Path, names: Iterable[str], made: Path) -> tuple[dict[str,
         else:
             missing[name] = f"there is no {name}/ with {about.expects.replace('`', '')}, and no recording of it"
     return found, missing
-
-
-def _sources(data: Path) -> dict[str, Path]:
-    """Recordings in a folder, or the folder itself, by the source that they name."""
-    from retrieval.data.dataset import recording_source
-
-    folders = [path for path in (data, *sorted(data.iterdir())) if (path / "recording.json").is_file()]
-    return {recording_source(folder): folder for folder in reversed(folders)}
 
 
 def _models(given: Iterable[str]) -> Mapping[str, Path]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from indexes import KINDS
-from retrieval.commands.options import COUNT, SHARE, Json, Model, Number
+from retrieval.commands.options import COUNT, SHARE, Json, Model, Number, resumable
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.data.storage import is_url
@@ -110,7 +110,7 @@ def build_index(
         from retrieval.cluster.building import by_ray
 
         run = by_ray()
-    try:
+    with resumable(f"what was embedded is kept in {StoredCluster(out).work if is_url(out) else out}"):
         if shards is None:
             report = build.build_index(catalogue, checkpoint, Path(out), **asked)
         else:
@@ -118,10 +118,6 @@ def build_index(
             report = build_cluster.build_cluster(
                 catalogue, checkpoint, out, shards, bad_share=allowed, run=run, **asked
             )
-    except KeyboardInterrupt:
-        kept = StoredCluster(out).work if is_url(out) else out
-        say(f"what was embedded is kept in {kept}; the same command goes on with it")
-        raise
     defaults.remember("index", out)
     if defaults.is_shipped(path) and (made := export_to_cache(checkpoint)):
         say(f"for queries without PyTorch, once: {made}")
@@ -171,7 +167,7 @@ def _shards(asked: int | None, out: str, *, of_shards: bool) -> int | None:
 def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
     """Write what the model sees of some photos of the index, or of its first shard."""
     from indexes.store.folder import IndexStore
-    from retrieval.report.views import write_views
+    from retrieval.report.pages import write_views
 
     first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
     rows = first.open(verify=False).rows

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import Json, Recording, read_split
+from retrieval.commands.options import Json, Recording, SplitFile, read_split
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -14,9 +14,7 @@ from retrieval.errors import BadInput, RetrievalError
 def check(
     recording: Recording,
     *,
-    split: Annotated[
-        Path | None, typer.Option(help="JSON file with train, validation and test objects to check")
-    ] = None,
+    split: SplitFile = None,
     model: Annotated[Path | None, typer.Option(help="check the split that this checkpoint was trained with")] = None,
     json: Json = False,
 ) -> None:

@@ -5,21 +5,21 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, SEED, WORKERS, refuse
+from retrieval.commands.options import COUNT, SEED, Jobs, Objects, refuse, resumable
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
-from retrieval.console.progress import Bar, CollectBar
+from retrieval.console.progress import CountedBar
 from retrieval.errors import BadInput, RetrievalError
 
 
 def collect(
     *,
     rig: Annotated[str, typer.Option(help="which rig, by name or TOML file; sim is the simulated one")] = "sim",
-    objects: Annotated[int, typer.Option(parser=COUNT, help="how many objects")] = 98,
+    objects: Objects = 98,
     grasps: Annotated[int, typer.Option(parser=COUNT, help="accepted grasps of each object")] = 44,
     out: Annotated[Path, typer.Option(help="recording folder to write or to go on with")],
     seed: Annotated[int, typer.Option(parser=SEED, help="seed of every random choice")] = 0,
-    jobs: Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")] = 1,
+    jobs: Jobs = 1,
     gate: Annotated[
         Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the area of contact)")
     ] = None,
@@ -62,22 +62,18 @@ def collect(
         require_ours(sheet, PREVIEW)
     decide, gate_name = _load_gate(gate)
     settings = CollectSettings(grasps=grasps)
-    try:
-        with CollectBar() as bar:
-            tallies = collect_grasps(
-                partial(load_rig, rig, seed=seed),
-                out,
-                objects=objects,
-                seed=seed,
-                settings=settings,
-                gate=decide,
-                gate_name=gate_name,
-                jobs=jobs,
-                progress=bar,
-            )
-    except KeyboardInterrupt:
-        say(f"what was collected is whole in {out}; the same command goes on with it")
-        raise
+    with resumable(f"what was collected is whole in {out}"), CountedBar("collect", "grasps") as bar:
+        tallies = collect_grasps(
+            partial(load_rig, rig, seed=seed),
+            out,
+            objects=objects,
+            seed=seed,
+            settings=settings,
+            gate=decide,
+            gate_name=gate_name,
+            jobs=jobs,
+            progress=lambda now: bar(now.settled, now.wanted, str(now)),
+        )
     for line in acceptance_table(tallies, wanted=settings.grasps).splitlines():
         say(line)
     accepted = sum(each.accepted for each in tallies)
@@ -112,20 +108,8 @@ def _collect_pictures(kind: str, rig: str, objects: int, out: Path, seed: int, j
     """`--photos-only`, `--touches-only`."""
     from robot.sim.pictures import collect_pictures
 
-    try:
-        with Bar("collect", objects, "objects") as bar:
-            count = collect_pictures(
-                kind,
-                out,
-                objects=objects,
-                seed=seed,
-                rig=rig,
-                jobs=jobs,
-                progress=lambda done, total: bar.advance(done - bar.done),
-            )
-    except KeyboardInterrupt:
-        say(f"what was made is whole in {out}; the same command goes on with it")
-        raise
+    with resumable(f"what was made is whole in {out}"), CountedBar("collect", "objects") as bar:
+        count = collect_pictures(kind, out, objects=objects, seed=seed, rig=rig, jobs=jobs, progress=bar)
     say(f"{out}: {count} pictures of {objects} objects")
 
 

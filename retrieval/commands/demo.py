@@ -17,7 +17,7 @@ import typer
 
 from retrieval.commands.build_index import build_index
 from retrieval.commands.collect import collect
-from retrieval.commands.options import COUNT, WORKERS, Values
+from retrieval.commands.options import Jobs, Objects, Values
 from retrieval.commands.query import query
 from retrieval.commands.serve import serve as serve_index
 from retrieval.console.output import say
@@ -35,8 +35,8 @@ PHOTOS, TOUCHES = 3, 3
 def demo(
     *,
     out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
-    objects: Annotated[int, typer.Option(parser=COUNT, help="how many objects")] = 20,
-    jobs: Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")] = 2,
+    objects: Objects = 20,
+    jobs: Jobs = 2,
     serve: Annotated[bool, typer.Option("--serve", help="then open a page that asks the index, until Ctrl-C")] = False,
 ) -> None:
     """The whole job on the simulated rig; ends with an HTML page."""

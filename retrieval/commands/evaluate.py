@@ -8,16 +8,18 @@ import typer
 from retrieval.commands.options import (
     COUNT,
     DEFAULT_PRESET,
-    INIT,
     SEED,
-    SPLIT,
-    InitPhoto,
-    InitTouch,
+    Init,
+    InitTower,
+    Iterations,
     Json,
     LabelledPhotos,
     LabelledTouches,
     Recording,
+    ReportOut,
+    SplitFile,
     read_split,
+    resumable,
     training_config,
 )
 from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
@@ -31,7 +33,7 @@ WRITTEN = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, 
 def evaluate(
     recording: Recording,
     *,
-    out: Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")],
+    out: ReportOut,
     methods: Annotated[
         str | None, typer.Option(help=f"methods to compare, with commas between: {', '.join(METHODS)} (default: all)")
     ] = None,
@@ -40,19 +42,17 @@ def evaluate(
         typer.Option(help="preset, such as tiny, small, mobilenet or relief, or TOML file (default: small)"),
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
-    init: Annotated[str | None, typer.Option(help=INIT)] = None,
-    init_photo: InitPhoto = None,
-    init_touch: InitTouch = None,
+    init: Init = None,
+    init_photo: InitTower = None,
+    init_touch: InitTower = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
-    iterations: Annotated[
-        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")
-    ] = None,
+    iterations: Iterations = None,
     seeds: Annotated[int, typer.Option(parser=COUNT, help="trainings of each method")] = 1,
     seed: Annotated[
         int | None, typer.Option(parser=SEED, help="seed of split, queries and first training, instead of the preset's")
     ] = None,
-    split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
+    split: SplitFile = None,
     cache: Annotated[
         Path | None, typer.Option(help="folder where features of images are kept (default: OUT/features)")
     ] = None,
@@ -62,24 +62,16 @@ def evaluate(
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import write_report
 
-    if model and (preset or init or init_photo or init_touch):
+    inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
+    if model and (preset or any(inits.values())):
         raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
     for name, kind in WRITTEN.items():
         require_ours(out / name, kind)
-    try:
+    with resumable(f"what was made is kept in {out}"):
         results = run(
             recording,
             out,
-            config=training_config(
-                preset,
-                iterations,
-                init=init,
-                init_photo=init_photo,
-                init_touch=init_touch,
-                photos=photos,
-                touches=touches,
-                seed=seed,
-            ),
+            config=training_config(preset, iterations, **inits, photos=photos, touches=touches, seed=seed),
             preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
             methods=methods.split(",") if methods else tuple(METHODS),
             model=model,
@@ -87,9 +79,6 @@ def evaluate(
             split=read_split(split),
             cache=cache,
         )
-    except KeyboardInterrupt:
-        say(f"what was made is kept in {out}; the same command goes on with it")
-        raise
     text, page, *_ = write_report(out, recording)
     say(f"report: {text}, {page}")
     if json:

@@ -7,7 +7,7 @@ import typer
 
 from retrieval.commands.options import SPLIT, Recording, read_split
 from retrieval.console.output import say
-from retrieval.console.progress import Bar
+from retrieval.console.progress import CountedBar
 
 
 def export_recording(
@@ -24,8 +24,8 @@ def export_recording(
     export, objects = EXPORTERS.resolve(to), read_split(split)
     source = read_recording(recording)
     parts = None if objects is None else {part: getattr(objects, part) for part in ("train", "validation", "test")}
-    with Bar("export", len(source.grasps), "grasps") as bar:
-        written = export(source, out, parts=parts, progress=lambda done, total: bar.advance())
+    with CountedBar("export", "grasps") as bar:
+        written = export(source, out, parts=parts, progress=bar)
     for note in (*source.notes, *written.notes):
         say(note)
     say(f"{out}: {written.grasps} grasps as {to}")

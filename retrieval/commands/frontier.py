@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import Json, Model, Values
+from retrieval.commands.options import Json, Model, Values, resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
 
@@ -68,11 +68,8 @@ def report(
     path, why = defaults.find_model(model)
     say(f"model: {path} ({why})")
     grasps = partial(_recording, recording, out, quick)
-    try:
+    with resumable(f"what was measured is kept in {out}"):
         document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, need_no_model=need_no_model)
-    except KeyboardInterrupt:
-        say(f"what was measured is kept in {out}; the same command goes on with it")
-        raise
     say(f"page: {out / 'frontier.html'}")
     return document
 
@@ -80,14 +77,14 @@ def report(
 def _recording(given: Path | None, out: Path, quick: bool) -> Path:
     if given is not None:
         return given
-    from retrieval.console.progress import CollectBar
+    from retrieval.console.progress import CountedBar
     from robot.collect import CollectSettings, collect
     from robot.rig import load_rig
 
     objects, grasps = (6, 2) if quick else (30, 4)
     folder = out / "recording"
     say(f"collecting {grasps} grasps of each of {objects} simulated objects into {folder}")
-    with CollectBar() as bar:
+    with CountedBar("collect", "grasps") as bar:
         collect(
             partial(load_rig, "sim", seed=SEED),
             folder,
@@ -95,6 +92,6 @@ def _recording(given: Path | None, out: Path, quick: bool) -> Path:
             seed=SEED,
             settings=CollectSettings(grasps=grasps),
             jobs=os.cpu_count() or 1,
-            progress=bar,
+            progress=lambda now: bar(now.settled, now.wanted, str(now)),
         )
     return folder

@@ -1,7 +1,6 @@
 """`retrieve import`: a public data set, or pictures of one's own, become a recording."""
 
 import shlex
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +8,7 @@ import typer
 
 from retrieval.commands.options import Values
 from retrieval.console.output import say, show
-from retrieval.console.progress import Bar
+from retrieval.console.progress import CountedBar
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
@@ -54,15 +53,8 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
     """Import with a bar on stderr. Raises what the importer raises."""
     from robot.importers import load_importer
 
-    bars: list[Bar] = []
-    with ExitStack() as shown:
-
-        def progress(done: int, total: int) -> None:
-            if not bars:
-                bars.append(shown.enter_context(Bar(f"import {name}", total, "grasps")))
-            bars[0].advance(done - bars[0].done)
-
-        return load_importer(name)(source, out, progress, **options)
+    with CountedBar(f"import {name}", "grasps") as bar:
+        return load_importer(name)(source, out, bar, **options)
 
 
 def _list() -> list[str]:

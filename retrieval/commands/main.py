@@ -45,21 +45,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _command in (
-    demo,
-    collect,
-    import_,
-    export_recording,
-    check,
-    train,
-    adapt,
-    build_index,
-    query,
-    export,
-    evaluate,
-    frontier,
-    serve,
-):
+_COMMANDS = (demo, collect, import_, export_recording, check, train, adapt, build_index, query, export, evaluate)
+for _command in (*_COMMANDS, frontier, serve):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)
 app.add_typer(benchmark.app)
@@ -86,7 +73,9 @@ def retrieve(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    _replace_closed_streams()
+    # A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     prepare_streams()
     program = typer.main.get_command(app)
     if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that asks what may follow
@@ -108,26 +97,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
             give_up_stdout()
             return 1
-        except KeyboardInterrupt:
-            return _stopped(context, interrupts)
-        except Exception as error:
-            if context is not None and context.params["debug"]:
+        except (Exception, KeyboardInterrupt) as error:
+            if isinstance(error, Exception) and context is not None and context.params["debug"]:
                 raise
             return _explain(context, error, interrupts)
 
 
-def _stopped(context: Any, interrupts: list[int]) -> int:
-    by = "SIGTERM" if signal.SIGTERM in interrupts else "Ctrl-C"
-    return _fail(context, f"stopped by {by}", 1)
-
-
-def _explain(context: Any, error: Exception, interrupts: list[int]) -> int:
+def _explain(context: Any, error: BaseException, interrupts: list[int]) -> int:
     """Say what went wrong in one line; returns the exit code."""
     code = getattr(error, "exit_code", None)  # every error tree of the project carries one
     if code is not None:
         return _fail(context, str(error), code)
-    if interrupts:
-        return _stopped(context, interrupts)
+    if interrupts or isinstance(error, KeyboardInterrupt):
+        return _fail(context, f"stopped by {'SIGTERM' if signal.SIGTERM in interrupts else 'Ctrl-C'}", 1)
     if isinstance(error, OSError):  # wrong use where another path would have done
         message = f"{error.filename or 'a file'}: {error.strerror or error}"
         return _fail(context, message, 2 if error.errno in _WRONG_PATHS else 1)
@@ -141,9 +123,3 @@ def _fail(context: Any, message: str, code: int) -> int:
         message = f"{message[: LONGEST - LAST]} ... {message[-LAST:]}"
     say(f"{' '.join(filter(None, words))}: {message}")
     return code
-
-
-def _replace_closed_streams() -> None:
-    """A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout."""
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115

@@ -1,6 +1,8 @@
 """What several commands share: options, options of several values, and what is read where an option names it."""
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -9,6 +11,7 @@ import typer
 from typer.core import TyperCommand
 
 from _touch_retrieval.files import read_json
+from retrieval.console.output import say
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
@@ -17,19 +20,27 @@ if TYPE_CHECKING:
 
 DEFAULT_PRESET = "small"
 DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
-INIT = "first weights of the towers: random, imagenet, shipped, or a state dict file"
-INIT_OF = "first weights of one tower alone: a file, as `train --task relief` writes it"
 SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
+Index = Annotated[
+    str | None,
+    typer.Option(help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"),
+]
+IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")]
+NoVerify = Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")]
 Model = Annotated[
     str | None,
     typer.Option(
         help=f"checkpoint; shipped and shipped-one-finger name those of the package (default: {DEFAULT_MODEL})"
     ),
 ]
-InitPhoto = Annotated[str | None, typer.Option(help=INIT_OF)]
-InitTouch = Annotated[str | None, typer.Option(help=INIT_OF)]
+Init = Annotated[
+    str | None, typer.Option(help="first weights of the towers: random, imagenet, shipped, or a state dict file")
+]
+InitTower = Annotated[
+    str | None, typer.Option(help="first weights of one tower alone: a file, as `train --task relief` writes it")
+]
 LabelledPhotos = Annotated[
     str | None,
     typer.Option("--photos", help="labelled photos (`collect --photos-only`) to train on too, with --touches"),
@@ -39,6 +50,9 @@ LabelledTouches = Annotated[
     typer.Option("--touches", help="labelled touches (`collect --touches-only`) to pair with them by labels"),
 ]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
+SplitFile = Annotated[Path | None, typer.Option(help=SPLIT)]
+CheckpointOut = Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")]
+ReportOut = Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")]
 
 _BETWEEN = "\0"  # which no word of a command line holds
 
@@ -81,6 +95,9 @@ class Number:
 
 COUNT, SEED, WORKERS = Number(int, 1, 10**9), Number(int, 0, 2**32 - 1), Number(int, 1, 1024)
 SHARE, SECONDS = Number(float, 0, 1), Number(float, 0, 86_400)
+Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")]
+Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")]
+Objects = Annotated[int, typer.Option(parser=COUNT, help="how many objects")]
 
 
 class Command(TyperCommand):
@@ -121,6 +138,16 @@ def refuse(why: str, **given: object) -> None:
     for name, value in given.items():
         if value is not None and value is not False:
             raise BadInput(f"--{name.replace('_', '-')} {why}")
+
+
+@contextmanager
+def resumable(what: str) -> Iterator[None]:
+    """Say on Ctrl-C what is stored, and that the same command continues from there."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"{what}; the same command goes on with it")
+        raise
 
 
 def read_split(path: Path | None) -> "Split | None":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, SHARE, Json, Values
+from retrieval.commands.options import COUNT, SHARE, Index, IndexModel, Json, NoVerify, Values
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
@@ -29,13 +29,8 @@ def query(
             "contact",
         ),
     ] = None,
-    index: Annotated[
-        str | None,
-        typer.Option(
-            help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"
-        ),
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
+    index: Index = None,
+    model: IndexModel = None,
     top: Annotated[int, typer.Option(parser=COUNT, help="objects to return")] = 10,
     candidates: Annotated[
         int | None,
@@ -49,7 +44,7 @@ def query(
     ] = 0.5,
     json: Json = False,
     html: Annotated[Path | None, typer.Option(help="write a page with photos and gel images")] = None,
-    no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
+    no_verify: NoVerify = False,
 ) -> int:
     """Which object is in the hand?"""
     from retrieval.search import defaults

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -10,9 +10,6 @@ from retrieval.commands.options import Command, Json
 from retrieval.console.files import HAND_EYE, require_folder, require_ours
 from retrieval.console.output import print_json, say, show
 from retrieval.errors import RetrievalError
-
-if TYPE_CHECKING:
-    from robot.sight.hand_eye import Errors
 
 HELP = "See what a rig of real devices is made of, and calibrate its camera."
 
@@ -68,17 +65,16 @@ def calibrate(
     require_folder(out)
     found = fit_hand_eye(*read_pairs(points))
     for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
-        say(f"{name}: {_off_by(errors)}" if errors else f"{name}: {found.no_affine}")
+        if errors is None:
+            say(f"{name}: {found.no_affine}")
+            continue
+        say(
+            f"{name}: points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "
+            f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
+        )
     if found.warning:
         say(f"warning: {found.warning}")
     if found.rigid_errors.loo_mean_mm > SUSPECT_MM:
         raise RetrievalError(f"nothing was written: an arm cannot be steered by points {SUSPECT_MM:g} mm off and more")
     found.save(out)
     say(f"{out}: written from {len(found.rig_mm)} points; name it as hand_eye under [camera]")
-
-
-def _off_by(errors: "Errors") -> str:
-    return (
-        f"points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "
-        f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
-    )

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, SECONDS, SHARE, WORKERS, Number, refuse
+from retrieval.commands.options import COUNT, SECONDS, SHARE, WORKERS, Index, IndexModel, NoVerify, Number, refuse
 from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
     from retrieval.search.query.opening import OpenShards
-    from retrieval.serve.service import LiveRig
     from robot.recording.folder import RecordingWriter
 
 TOKEN = "RETRIEVE_TOKEN"
@@ -24,13 +23,8 @@ TOKEN = "RETRIEVE_TOKEN"
 
 def serve(
     *,
-    index: Annotated[
-        str | None,
-        typer.Option(
-            help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"
-        ),
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")] = None,
+    index: Index = None,
+    model: IndexModel = None,
     host: Annotated[str, typer.Option(help="where to listen; other machines reach it only with a token")] = "127.0.0.1",
     port: Annotated[int, typer.Option(parser=Number(int, 0, 2**16 - 1), help="port; 0 for a free one")] = 8000,
     token_file: Annotated[
@@ -84,7 +78,7 @@ def serve(
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
-    no_verify: Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")] = False,
+    no_verify: NoVerify = False,
 ) -> None:
     """Answer over HTTP, and show a page, until Ctrl-C or SIGTERM."""
     try:
@@ -95,17 +89,13 @@ def serve(
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
     from retrieval.data.storage import is_url
     from retrieval.search import defaults
+    from retrieval.serve.rig import of_index, of_rig
 
     if no_history:
         refuse("names where to keep what --no-history keeps nowhere; give one of them", history=history)
+    how = {"replicas": replicas, "most_replicas": most_replicas, "shard_wait": shard_wait, "least_share": least_share}
     if not cluster:
-        refuse(
-            "is for shards that Ray holds; give --cluster too",
-            replicas=replicas,
-            most_replicas=most_replicas,
-            shard_wait=shard_wait,
-            least_share=least_share,
-        )
+        refuse("is for shards that Ray holds; give --cluster too", **how)
     path, why = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({why})")
@@ -125,17 +115,8 @@ def serve(
     )
     with ExitStack() as closed:
         recorder = _recorder(settings.history, path, closed) if settings.history else None
-        held = None
-        if cluster:
-            how: dict[str, Any] = {
-                "replicas": replicas,
-                "most_replicas": most_replicas,
-                "wait_s": shard_wait,
-                "least_share": least_share,
-            }
-            given = {name: value for name, value in how.items() if value is not None}
-            held = _held(path, closed, given, not no_verify)
-        app = create_app(settings, _live_rig(rig, path), recorder, trials, held)
+        held = _held(path, closed, how, not no_verify) if cluster else None
+        app = create_app(settings, of_rig(rig, path) if rig else of_index(path), recorder, trials, held)
 
         def started(bound: int) -> None:
             address = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
@@ -147,17 +128,17 @@ def serve(
 
 
 def _held(index: str | Path, closed: ExitStack, how: Mapping[str, Any], verify: bool) -> "OpenShards":
-    """What opens shards on Ray, which is joined or started. how: fields of `Held` that were given. Raises BadInput
-    where there is no cluster to hold."""
+    """What opens shards on Ray, which is joined or started. how: options of it by name, None for those left out. Raises
+    BadInput where there is no cluster to hold."""
     from retrieval.cluster.serving import Deployments, Held
     from retrieval.cluster.session import connected
     from retrieval.search.sharding.object_store import is_cluster
 
     if not is_cluster(index):
         raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
-    settings = Held(**how)
-    ray = closed.enter_context(connected())
-    deployments = Deployments(ray, settings, verify)
+    given = {name.replace("shard_wait", "wait_s"): value for name, value in how.items() if value is not None}
+    settings = Held(**given)
+    deployments = Deployments(closed.enter_context(connected()), settings, verify)
     closed.callback(deployments.close)
     return deployments.open
 
@@ -185,10 +166,3 @@ def _token(file: Path | None) -> str | None:
         return read_regular(file).decode("ascii").strip()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file} must hold a token in ASCII: {error}") from error
-
-
-def _live_rig(rig: str | None, index: str | Path) -> "LiveRig | None":
-    """What the rig gives the service; without --rig, the simulated one where the index shows its objects."""
-    from retrieval.serve.rig import of_index, of_rig
-
-    return of_rig(rig, index) if rig else of_index(index)

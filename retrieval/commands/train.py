@@ -6,15 +6,15 @@ from typing import Annotated, Any, Literal
 import typer
 
 from retrieval.commands.options import (
-    COUNT,
-    INIT,
     SEED,
-    SPLIT,
     WORKERS,
-    InitPhoto,
-    InitTouch,
+    CheckpointOut,
+    Init,
+    InitTower,
+    Iterations,
     LabelledPhotos,
     LabelledTouches,
+    SplitFile,
     read_split,
     refuse,
     training_config,
@@ -35,23 +35,21 @@ def train(
             "--init-photo or --init-touch; grasp-success: did the grasp succeed?"
         ),
     ] = "match",
-    out: Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")],
+    out: CheckpointOut,
     config: Annotated[
         str | None,
         typer.Option(help="preset, such as small, mobilenet, relief or paper, or TOML file (default: small)"),
     ] = None,
-    init: Annotated[str | None, typer.Option(help=INIT)] = None,
-    init_photo: InitPhoto = None,
-    init_touch: InitTouch = None,
+    init: Init = None,
+    init_photo: InitTower = None,
+    init_touch: InitTower = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
-    iterations: Annotated[
-        int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the configuration's")
-    ] = None,
+    iterations: Iterations = None,
     seed: Annotated[
         int | None, typer.Option(parser=SEED, help="seed of split, pairs and weights, instead of the configuration's")
     ] = None,
-    split: Annotated[Path | None, typer.Option(help=SPLIT)] = None,
+    split: SplitFile = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
     cache: Annotated[
         Path | None,
@@ -71,14 +69,26 @@ def train(
     if task == "grasp-success":
         others = {"config": config, "split": split, "resume": resume, "cache": cache, **inits}
         refuse("is of matchers; --task grasp-success takes --iterations and --seed", **others)
-        _train_gate(recording, out, iterations, seed)
+        from retrieval.training.grasp_success import train_gate
+
+        numbers = {"iterations": iterations, "seed": seed}
+        gate: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+        for line in train_gate(recording, out, **gate).lines():
+            say(line)
         return
     if task == "relief":
         if split or init_photo or init_touch or photos or touches:
             raise BadInput(
                 "--task relief needs no split and no pairs, and makes what --init-photo and --init-touch take"
             )
-        _train_relief(recording, out, config, init, iterations, seed, resume, cache)
+        from retrieval.training.relief import ITERATIONS, train_relief
+
+        settings = training_config(config, None, init=init, seed=seed)
+        steps = ITERATIONS if iterations is None else iterations
+        report = train_relief(recording, out, settings, iterations=steps, resume=resume, cache=cache)
+        for line in report.lines():
+            say(line)
+        say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
         return
     from retrieval.search import defaults
     from retrieval.training import distributed
@@ -101,32 +111,3 @@ def train(
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
     say(f"{out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
-
-
-def _train_relief(
-    pictures: Path,
-    out: Path,
-    config: str | None,
-    init: str | None,
-    iterations: int | None,
-    seed: int | None,
-    resume: bool,
-    cache: Path | None,
-) -> None:
-    from retrieval.training.relief import ITERATIONS, train_relief
-
-    settings = training_config(config, None, init=init, seed=seed)
-    steps = ITERATIONS if iterations is None else iterations
-    report = train_relief(pictures, out, settings, iterations=steps, resume=resume, cache=cache)
-    for line in report.lines():
-        say(line)
-    say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
-
-
-def _train_gate(recording: Path, out: Path, iterations: int | None, seed: int | None) -> None:
-    from retrieval.training.grasp_success import train_gate
-
-    given: dict[str, Any] = {"iterations": iterations, "seed": seed}
-    given = {name: value for name, value in given.items() if value is not None}
-    for line in train_gate(recording, out, **given).lines():
-        say(line)

@@ -115,7 +115,9 @@ def require_ours(path: Path, kind: Kind) -> None:
     except (FileNotFoundError, NotADirectoryError):  # what is wrong with its folder is said when it is written
         return
     except OSError as error:
-        raise BadInput(f"{path} {_why(error)}; name a file to write {kind.name} to") from error
+        why = error.strerror or str(error)
+        why = why if why.startswith(("is ", "has ")) else f"cannot be opened ({why})"
+        raise BadInput(f"{path} {why}; name a file to write {kind.name} to") from error
     raise BadInput(
         f"{path} is not {kind.name} that this program wrote, and is left as it is; name another file, or move it away"
     )
@@ -125,11 +127,6 @@ def require_folder(path: Path) -> None:
     """Raise BadInput unless the folder of a file to write exists: a wrong path is more likely than a wish for it."""
     if not path.parent.is_dir():
         raise BadInput(f"{path} cannot be written, as there is no folder {path.parent}; make it, or name another file")
-
-
-def _why(error: OSError) -> str:
-    reason = error.strerror or str(error)
-    return reason if reason.startswith(("is ", "has ")) else f"cannot be opened ({reason})"
 
 
 def write_output(path: Path, data: bytes, kind: Kind) -> None:

@@ -18,9 +18,8 @@ from retrieval.errors import RetrievalError
 
 def print_json(document: Any) -> None:
     """One JSON document on stdout, in ASCII."""
-    text = json.dumps(document, allow_nan=False)
     with printing():
-        print(text)
+        print(json.dumps(document, allow_nan=False))
 
 
 def show(text: str) -> None:

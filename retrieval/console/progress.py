@@ -2,8 +2,7 @@
 
 import sys
 import time
-from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 from retrieval.console.output import printable, say
 
@@ -55,34 +54,24 @@ class Bar:
             text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left:.0f} s left"
             say(f"{text}  {note}".rstrip())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._rich:
             self._rich.stop()
 
 
-class Collected(Protocol):
-    """What `CollectBar` asks of robot.collect.Progress, whose text says the rest."""
+class CountedBar:
+    """A bar that is made at its first call, which says how many units are done and how many there are."""
 
-    @property
-    def settled(self) -> int: ...
-    @property
-    def wanted(self) -> int: ...
-
-
-class CollectBar:
-    """Shows robot.collect's progress on a bar, which is made when the first is told."""
-
-    def __init__(self) -> None:
+    def __init__(self, title: str, unit: str) -> None:
+        self.title, self.unit = title, unit
         self._bar: Bar | None = None
 
-    def __call__(self, now: Collected) -> None:
+    def __call__(self, done: int, total: int, note: str = "") -> None:
         if self._bar is None:
-            self._bar = Bar("collect", now.wanted, "grasps", done=now.settled).__enter__()
-        self._bar.advance(now.settled - self._bar.done, str(now))
+            self._bar = Bar(self.title, total, self.unit, done=done).__enter__()
+        self._bar.advance(done - self._bar.done, note)
 
-    def __enter__(self) -> "CollectBar":
+    def __enter__(self) -> "CountedBar":
         return self
 
     def __exit__(self, *error: Any) -> None:

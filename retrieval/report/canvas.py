@@ -115,16 +115,13 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, 
     write_atomically(path, data.getvalue())
     width, height = agg.get_width_height()
     named = figure.findobj(lambda artist: artist.get_gid() is not None)
-    return {artist.get_gid(): [_box(corners, width, height) for corners in _corners(artist)] for artist in named}
-
-
-def _corners(artist: Any) -> list[tuple[float, float, float, float]]:
-    """Left, bottom, right, top in pixels from the lower left."""
-    if hasattr(artist, "get_xydata"):
-        return [(x, y, x, y) for x, y in artist.get_transform().transform(artist.get_xydata())]
-    return [artist.get_window_extent().extents]
-
-
-def _box(corners: tuple[float, float, float, float], width: float, height: float) -> Box:
-    left, bottom, right, top = corners
-    return Box(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)
+    places = {}
+    for artist in named:
+        corners = [artist.get_window_extent().extents]  # left, bottom, right, top in pixels from the lower left
+        if hasattr(artist, "get_xydata"):
+            corners = [(x, y, x, y) for x, y in artist.get_transform().transform(artist.get_xydata())]
+        places[artist.get_gid()] = [
+            Box(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)
+            for left, bottom, right, top in corners
+        ]
+    return places

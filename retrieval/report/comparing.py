@@ -1,7 +1,6 @@
 """Sections that set the methods side by side, and say whether the result can be believed."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator
 
 from retrieval.metrics.registry import PHOTO_COUNTS, PHOTO_TO_TOUCH, SET_SIZES, TOUCH_TO_PHOTO, of_grasps, of_photos
 from retrieval.report import galleries, plots, tables
@@ -47,6 +46,7 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
     """How often the object is found within N guesses."""
     if not builder.any("guesses_k5", "guesses_k10"):
         return
+    methods = builder.results.data["methods"]
     yield builder.picture(
         "guess-curves.png",
         f"Rising curves. {builder.values('guesses_k5')}. {builder.values('guesses_k10')}.",
@@ -55,7 +55,10 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
         plots.guess_curves,
         builder.results,
         spots={
-            f"{name} guesses_k{k}": _guessed(builder, name, k)
+            f"{name} guesses_k{k}": [
+                (f"{method_label(name)}: found with guess {number} of {k}", shown)
+                for number, shown in enumerate(methods[name].get("guessed", {}).get(str(k), []), start=1)
+            ]
             for name in reversed(builder.results.learned)  # the last lies on top
             for k in (5, 10)
         },
@@ -63,13 +66,6 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
     for k in (5, 10):
         if table := tables.guesses(builder.results, f"guesses_k{k}"):
             yield Details(f"Numbers for {k} candidates", (table,))
-
-
-def _guessed(builder: Builder, name: str, k: int) -> list[tuple[str, Sequence[Any]]]:
-    """For each point of a guess curve what it is, and touches whose object takes that many guesses."""
-    found = builder.results.data["methods"][name].get("guessed", {}).get(str(k), [])
-    label = method_label(name)
-    return [(f"{label}: found with guess {number} of {k}", shown) for number, shown in enumerate(found, start=1)]
 
 
 def grasps_and_photos(builder: Builder) -> Iterator[Block | None]:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 from PIL import Image
 
+from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.report.canvas import FIGURE_DPI, Box
 from retrieval.report.pages import data_uri, jpeg, render, script, thumbnail
 
@@ -109,6 +110,14 @@ class Document:
     title: str
     lead: tuple[Block, ...]
     sections: tuple[Section, ...] = field(default=())
+
+
+def write_document(document: Document, out: Path) -> list[Path]:
+    """Write a document, whose pictures lie under `out`, as report.md and report.html; returns both paths."""
+    text, page = out / "report.md", out / "report.html"
+    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
+    write_output(page, text_bytes(to_html(document, out)), PAGE)
+    return [text, page]
 
 
 # HTML ------------------------------------------------------------------------------------------------

@@ -6,11 +6,10 @@ Every number comes from results.json or timings.json; nothing is measured here.
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.data.dataset import AnyRecording, load_grasps
 from retrieval.report import comparing, looking, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, to_html, to_markdown
+from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
 from retrieval.report.results import (
     FEW,
     FEW_MEANS,
@@ -59,10 +58,7 @@ def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
         tuple(_lead(builder)),
         tuple(section for section in sections if section.blocks),
     )
-    text, page = out / "report.md", out / "report.html"
-    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
-    write_output(page, text_bytes(to_html(document, out)), PAGE)
-    return [text, page, *builder.figures]
+    return [*write_document(document, out), *builder.figures]
 
 
 def _lead(builder: Builder) -> Iterator[Block]:

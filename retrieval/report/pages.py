@@ -1,6 +1,9 @@
-"""What pages are made of: the package's templates, thumbnails of image files, and images inside a page."""
+"""What pages are made of: the package's templates, thumbnails of image files, images inside a page; and contact sheets
+of what the matcher sees of a catalogue's photos."""
 
 import base64
+import io
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -10,13 +13,19 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
+from retrieval.console.files import GENERATOR, PREVIEW, write_output
 from retrieval.data.images import read_rgb
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 from retrieval.errors import ImageError
 
 Thumbnail = NDArray[np.uint8]
 """(H, W, 3) red first."""
+COLUMNS = 2
+"""Photos of a contact sheet side by side."""
 
 
 def render(name: str, **values: Any) -> str:
@@ -52,3 +61,17 @@ def jpeg(image: Thumbnail) -> bytes:
 def data_uri(data: bytes, kind: str) -> str:
     """The bytes of an image file as an address that needs no file; kind is "jpeg" or "png"."""
     return f"data:image/{kind};base64," + base64.b64encode(data).decode("ascii")
+
+
+def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> None:
+    """Write a PNG with the views of photos, one at least, two to a row. Raises ImageError, BadInput."""
+    strips = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
+    height, width = strips[0].shape[:2]
+    columns = min(COLUMNS, len(strips))
+    sheet = Image.new("RGB", (columns * width, -(-len(strips) // columns) * height), "white")
+    for place, strip in enumerate(strips):
+        sheet.paste(Image.fromarray(strip), (place % columns * width, place // columns * height))
+    made_by, content = PngInfo(), io.BytesIO()
+    made_by.add_text("Software", GENERATOR)
+    sheet.save(content, "PNG", pnginfo=made_by)
+    write_output(out, content.getvalue(), PREVIEW)

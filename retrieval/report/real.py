@@ -5,11 +5,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from _touch_retrieval.files import read_json
-from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
 from retrieval.console.output import show
-from retrieval.data.dataset import Grasp, load_grasps
-from retrieval.errors import BadInput
+from retrieval.data.dataset import load_grasps
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.measuring import QUARTILES, quartile_name
 from retrieval.evaluation.real.protocol import PHOTO
@@ -17,18 +14,7 @@ from retrieval.evaluation.real.references import with_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report import galleries
 from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
-from retrieval.report.document import (
-    Block,
-    Details,
-    Document,
-    Listing,
-    Picture,
-    Section,
-    Table,
-    Text,
-    to_html,
-    to_markdown,
-)
+from retrieval.report.document import Block, Details, Document, Listing, Picture, Section, Table, Text, write_document
 from retrieval.report.galleries import Grasps
 from retrieval.report.results import (
     FEW,
@@ -39,6 +25,7 @@ from retrieval.report.results import (
     file_name,
     method_label,
     percent,
+    read_results_file,
     with_interval,
 )
 from retrieval.report.tables import probability
@@ -64,42 +51,27 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     recordings: by data set, for the pictures of queries; those that are missing are left out. Returns the files
     written. Raises BadInput for results that cannot be read, RetrievalError where matplotlib is missing.
     """
-    results = _read(out / "results.json")
+    results = read_results_file(out / "results.json", SCHEMA_VERSION, "benchmark real")
     entries = _ordered(results)
     figures = [out / "figures" / "overview.png"]
     draw(figures[0], overview, entries)
     sections = []
     for name, entry in entries.items():
-        recording = recordings.get(entry["recording"]["data_set"])
-        grasps = {grasp.grasp_id: grasp for grasp in _grasps(recording, entry["entry"])} if recording else {}
+        grasps: Grasps = {}
+        if recording := recordings.get(entry["recording"]["data_set"]):
+            asked = load_grasps(recording)
+            asked = asked if entry["entry"] == PHOTO else with_references(asked)
+            grasps = {grasp.grasp_id: grasp for grasp in asked}
         sections.append(Section(entry["title"], tuple(_section(name, entry, grasps, out, figures))))
+    words = " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
     lead: tuple[Block, ...] = (
         Text(RULE),
-        Picture("figures/overview.png", _overview_words(entries), OVERVIEW),
+        Picture("figures/overview.png", words, OVERVIEW),
         *(Text(f"{name} was not asked: {why}.") for name, why in results["skipped"].items()),
     )
     settings = Section("How this was made", (Details("Settings", (Listing.of_json(results["setting"]),)),))
     document = Document("What a touch says, on real data", lead, (*sections, settings))
-    text, page = out / "report.md", out / "report.html"
-    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
-    write_output(page, text_bytes(to_html(document, out)), PAGE)
-    return [text, page, *figures]
-
-
-def _grasps(recording: Path, entry: str) -> list[Grasp]:
-    """Those that a protocol asked, with what showed their objects."""
-    grasps = load_grasps(recording)
-    return grasps if entry == PHOTO else with_references(grasps)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        results = read_json(path)
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve benchmark real`") from error
-    if not isinstance(results, dict) or results.get("schema_version") != SCHEMA_VERSION:
-        raise BadInput(f"{path} must hold results of version {SCHEMA_VERSION}; run `retrieve benchmark real`")
-    return results
+    return [*write_document(document, out), *figures]
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -184,9 +156,8 @@ def numbers(entry: Entry) -> Table:
     counted = any(row["counted"] for row in entry["rows"].values())
     rows = []
     for name, row in entry["rows"].items():
-        rows.append(
-            (_label(name, row), *_values(row["measures"], labels), *_counts(row["counted"], counted), _yes(row))
-        )
+        touch = {None: "", True: "yes", False: "no"}[row["verdict"] and row["verdict"]["counts_as_touch"]]
+        rows.append((_label(name, row), *_values(row["measures"], labels), *_counts(row["counted"], counted), touch))
         if row["blurred"]:
             rows.append((BLURRED, *_values(row["blurred"], labels), *_counts(None, counted), ""))
     for name, one in entry["controls"].items():
@@ -222,10 +193,6 @@ def _counts(counted: Mapping[str, Any] | None, wanted: bool) -> list[str]:
         return [""] if wanted else []
     right = sum(counted["right"]) / len(counted["right"])
     return [f"{right:.3g} of {counted['asked']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
-
-
-def _yes(row: Entry) -> str:
-    return "" if row["verdict"] is None else "yes" if row["verdict"]["counts_as_touch"] else "no"
 
 
 def controls(entry: Entry) -> Table:
@@ -326,10 +293,6 @@ OVERVIEW = (
     "The measure that decides, of each protocol: filled with touches, hollow with blurred ones, and 95 % intervals; "
     "dashed: chance."
 )
-
-
-def _overview_words(entries: Mapping[str, Entry]) -> str:
-    return " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
 
 
 def overview(entries: Mapping[str, Entry]) -> Figure:

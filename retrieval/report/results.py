@@ -68,22 +68,21 @@ class Results:
 
 def read_results(out: Path) -> Results:
     """Read `out`/results.json, and `out`/timings.json where it is. Raises BadInput."""
-    data = _read(out / "results.json")
-    if (found := data.get("schema_version")) != SCHEMA_VERSION:
-        raise BadInput(
-            f"{out / 'results.json'} must have schema version {SCHEMA_VERSION}, got {found!r}; run `retrieve evaluate`"
-        )
     timings = out / "timings.json"
-    return Results(data, _read(timings) if timings.exists() else {})
+    data = read_results_file(out / "results.json", SCHEMA_VERSION, "evaluate")
+    return Results(data, read_results_file(timings, None, "evaluate") if timings.exists() else {})
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_results_file(path: Path, version: int | None, command: str) -> dict[str, Any]:
+    """Read a JSON object of `retrieve COMMAND`, of this schema version unless it is None. Raises BadInput."""
     try:
         data = read_json(path)
     except (OSError, ValueError) as error:
-        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve evaluate`") from error
+        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve {command}`") from error
     if not isinstance(data, dict):
-        raise BadInput(f"{path} must hold a JSON object, got a {type(data).__name__}; run `retrieve evaluate`")
+        raise BadInput(f"{path} must hold a JSON object, got a {type(data).__name__}; run `retrieve {command}`")
+    if version is not None and (found := data.get("schema_version")) != version:
+        raise BadInput(f"{path} must have schema version {version}, got {found!r}; run `retrieve {command}`")
     return data
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import anyio.to_thread
 from fastapi import FastAPI
 from pydantic import BaseModel
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.query.opening import OpenShards
@@ -23,11 +22,10 @@ from retrieval.serve.generations import Generations
 from retrieval.serve.health import SessionBody
 from retrieval.serve.history import FeedbackBody
 from retrieval.serve.human import ChoiceBody, NewRun
-from retrieval.serve.keeping import Keeping
+from retrieval.serve.keeping import Keeping, Recorder
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queries import AgreementBody
 from retrieval.serve.queue import Queue
-from retrieval.serve.recording import Recorder
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
@@ -108,8 +106,7 @@ def create_app(
     app.include_router(page_files.router_of())
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimit, seconds=settings.body_s)
-    app.add_middleware(Guard, settings=settings)
-    app.add_middleware(Counted, metrics=metrics)
+    app.add_middleware(Guard, settings=settings, metrics=metrics)
     return app
 
 
@@ -156,23 +153,6 @@ def _in_daemon(work: Callable[[], None]) -> asyncio.Future[None]:
 
     Thread(target=run, daemon=True).start()
     return done
-
-
-class Counted:
-    """Counts responses by status."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self.app, self.metrics = app, metrics
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, and count its response (ASGI)."""
-
-        async def counted(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                self.metrics.responses.labels(message["status"]).inc()
-            await send(message)
-
-        await self.app(scope, receive, counted if scope["type"] == "http" else send)
 
 
 def _document(app: FastAPI) -> dict[str, Any]:

@@ -3,6 +3,9 @@
 An id is looked up in the index, and the file is the one that the index names: no text of a request is part of a path.
 """
 
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -22,13 +25,14 @@ from retrieval.serve.documents import (
 )
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
+from retrieval.serve.keeping import recordable
 from retrieval.serve.service import Parts
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
 SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """Files that every browser shows, by their first bytes; others are sent as JPEG."""
-_PICTURES: dict[int | str, dict[str, Any]] = {
+PICTURES: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
 }
 WHOLE_PX = 4096
@@ -48,10 +52,6 @@ def _row(opened: Opened, photo: str) -> dict[str, object]:
     if row is None:
         raise Problem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them")
     return row
-
-
-def _gone(path: str) -> Problem:
-    return Problem("unknown", f"the photo {path!r} cannot be read any more; run `retrieve build-index` again")
 
 
 Offset = Annotated[int, Query(ge=0, le=2**31)]
@@ -83,29 +83,21 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
     return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
 
 
-@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
 def photo(request: Request, photo: str, parts: Parts) -> Response:
     """A photo of the catalogue, or a gel image of a reference touch, as it is; what browsers do not show, as JPEG."""
-    opened = parts.generations.current
-    row = _row(opened, photo)
-    if response := _unchanged(request, row, "whole"):
-        return response
-    listed = listed_photo(row)
-    path = opened.searcher.catalogue / listed.path
-    try:
+
+    def read(path: Path, _: dict[str, object]) -> bytes | None:
         data = read_bytes(path)
-    except ImageError:
-        raise _gone(listed.path) from None
-    kind = next((kind for magic, kind in SHOWN.items() if data.startswith(magic)), None)
-    if kind is None:
+        if data.startswith(tuple(SHOWN)):
+            return data
         image = thumbnail(path, WHOLE_PX)
-        if image is None:
-            raise _gone(listed.path)
-        data, kind = jpeg(image), "image/jpeg"
-    return _picture(data, kind, row, "whole")
+        return None if image is None else jpeg(image)
+
+    return _catalogue_picture(request, parts, photo, "whole", read)
 
 
-@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**_PICTURES, **problems("unknown")})
+@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
 def small(
     request: Request,
     photo: str,
@@ -113,29 +105,37 @@ def small(
     px: Annotated[int, Query(ge=32, le=1024, description="of the longer side")] = 320,
 ) -> Response:
     """A photo, or a gel image of a reference touch, as a small JPEG."""
+
+    def read(path: Path, row: dict[str, object]) -> bytes | None:
+        return parts.thumbnails.of(path, str(row.get("digest")), px)
+
+    return _catalogue_picture(request, parts, photo, str(px), read)
+
+
+def _catalogue_picture(
+    request: Request, parts: Parts, photo: str, size: str, read: Callable[[Path, dict[str, object]], bytes | None]
+) -> Response:
+    """What `read` makes of the photo's file, PNG or JPEG, unless the client has it; it is gone where that is None."""
     opened = parts.generations.current
     row = _row(opened, photo)
-    if response := _unchanged(request, row, str(px)):
-        return response
+    headers = {"etag": f'"{row.get("digest")}-{size}"', "cache-control": "private, no-cache"}
+    if row.get("digest") and request.headers.get("if-none-match") == headers["etag"]:
+        return Response(status_code=304, headers=headers)
     listed = listed_photo(row)
-    data = parts.thumbnails.of(opened.searcher.catalogue / listed.path, str(row.get("digest")), px)
+    data = None
+    with suppress(ImageError):
+        data = read(opened.searcher.catalogue / listed.path, row)
     if data is None:
-        raise _gone(listed.path)
-    return _picture(data, "image/jpeg", row, str(px))
+        told = f"the photo {listed.path!r} cannot be read any more; run `retrieve build-index` again"
+        raise Problem("unknown", told)
+    return shown_picture(data, headers)
 
 
-def _tag(row: dict[str, object], size: str) -> str:
-    return f'"{row.get("digest")}-{size}"'
-
-
-def _unchanged(request: Request, row: dict[str, object], size: str) -> Response | None:
-    if row.get("digest") and request.headers.get("if-none-match") == _tag(row, size):
-        return Response(status_code=304, headers={"etag": _tag(row, size)})
-    return None
-
-
-def _picture(data: bytes, kind: str, row: dict[str, object], size: str) -> Response:
-    return Response(data, media_type=kind, headers={"etag": _tag(row, size), "cache-control": "private, no-cache"})
+def shown_picture(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
+    """A picture's file as a response: PNG or JPEG as it is, another as PNG. Raises ImageError."""
+    data = recordable(data)
+    kind = next(kind for magic, kind in SHOWN.items() if data.startswith(magic))
+    return Response(data, media_type=kind, headers=headers)
 
 
 @router.get("/v1/nearest/{photo:path}", responses=problems("unknown", "bad-input"))

@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Self, TypedDict, Unpack
 from urllib.parse import quote
 
@@ -64,9 +63,7 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
@@ -111,20 +108,14 @@ class Client:
                 raise RetrievalError(
                     f"{self.url} cannot be reached ({error}); is `retrieve serve` running there?"
                 ) from error
-            pause = _pause_s(response)
+            told = response.headers.get("retry-after", "")
+            pause = float(told) if told.isdecimal() else 1.0  # a proxy may name a date
             if response.status_code not in (429, 503) or time.monotonic() + pause > until:
                 break
             time.sleep(pause)
         if response.is_error:
             raise _error(response)
         return response
-
-
-def _pause_s(response: httpx.Response) -> float:
-    """How long a busy service wants to be left alone: a second, unless it says how many (a proxy before it may name a
-    date)."""
-    told = response.headers.get("retry-after", "")
-    return float(told) if told.isdecimal() else 1.0
 
 
 def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:

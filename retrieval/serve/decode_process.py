@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from retrieval.data.resize import RgbImage
 from retrieval.errors import ImageError
 from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
 from retrieval.model.judge import BLOCKS
@@ -83,11 +82,8 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
     if isinstance(found, PictureSize):
         return frame({"size": found})
     arrays = [found.touch] if found.blocks is None else [found.touch, found.blocks]
-    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, *map(_bytes_of, arrays))
-
-
-def _bytes_of(image: RgbImage) -> bytes:
-    return np.ascontiguousarray(image, np.float32).tobytes()
+    contents = [np.ascontiguousarray(image, np.float32).tobytes() for image in arrays]
+    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, *contents)
 
 
 def _one_thread() -> None:

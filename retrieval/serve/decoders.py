@@ -37,10 +37,7 @@ class Decoders:
 
     async def start(self) -> None:
         """Start the processes, so that the first query does not wait for them. Raises RetrievalError."""
-        await asyncio.gather(*(self._start_one() for _ in range(PROCESSES)))
-
-    async def _start_one(self) -> None:
-        self._idle.append(await _Process.start())
+        self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
 
     async def close(self) -> None:
         """End all processes; what is being read fails."""
@@ -61,8 +58,9 @@ class Decoders:
         for (name, _), one in zip(named, found, strict=True):
             if isinstance(one, BaseException):
                 raise one
-            if isinstance(one, PictureSize):
-                _check_size(name, one)
+            if isinstance(one, PictureSize) and one.pixels > MAX_PIXELS:
+                told = f"{one.width} x {one.height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
+                raise ImageError(name, told)
         first = [one for one in found if not isinstance(one, BaseException)]
         total = sum(one.pixels for one in first if isinstance(one, PictureSize))
         if total > MAX_BODY_PIXELS:
@@ -166,10 +164,3 @@ class _Process:
         self._process.stdin.close()
         await self._process.stdout.read()
         await self._process.wait()
-
-
-def _check_size(name: str, size: PictureSize) -> None:
-    if size.pixels > MAX_PIXELS:
-        raise ImageError(
-            name, f"{size.width} x {size.height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
-        )

@@ -1,10 +1,15 @@
-"""The documents of the service as OpenAPI says them, and those that the service makes itself. The answer to a query is
-made by `QueryResult.to_dict` (`retrieval.search.query.answer`), sent as it is: its form stands here, and a test
-compares."""
+"""The documents of the service as OpenAPI describes them, and those that the service makes itself.
+
+`QueryResult.to_dict` (`retrieval.search.query.answer`) makes the answer to a query, which is sent as it is. OpenAPI
+reads its dataclasses; the rest of its form stands here, and a test compares.
+"""
 
 from typing import Any
 
 from pydantic import BaseModel, Field
+
+from retrieval.model.information import Information
+from retrieval.search.query.answer import NearestReference
 
 EXAMPLE: dict[str, Any] = {
     "query": {
@@ -26,8 +31,16 @@ EXAMPLE: dict[str, Any] = {
     "timing_ms": {"decode": 2.1, "encode": 14.0, "candidates": 0.1, "rerank": 0.6, "total": 17.0},
     "verdict": "match",
     "none_probability": 0.02,
+    "unlisted_probability": 0.02,
     "more_grasps": None,
     "advice": None,
+    "information": {
+        "gained_bits": 4.22,
+        "remaining_bits": 0.37,
+        "possible_bits": 5.32,
+        "next_grasp_bits": 0.04,
+        "next_effective_grasps": 1.11,
+    },
     "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "judged_objects": 20, "unjudged_probability": 0.0},
     "results": [
         {
@@ -43,15 +56,6 @@ EXAMPLE: dict[str, Any] = {
 }
 
 
-class ReferenceDocument(BaseModel):
-    """The reference touch of an object that is nearest: its gel images, paths in the catalogue. adds: what the object's
-    references add to the logit of its photos; null for an object without photos."""
-
-    touch: list[str]
-    cosine: float
-    adds: float | None
-
-
 class MatchDocument(BaseModel):
     """One object of a ranking, shown by its best photo, whose id is `photo`. probability_if_present: given that the
     catalogue has the object. reference: only where the catalogue has touches of the object."""
@@ -60,16 +64,17 @@ class MatchDocument(BaseModel):
     object_id: str
     logit: float
     probability: float | None
-    probability_if_present: float | None = None  # absent in answers that a history keeps from before
+    probability_if_present: float | None = None
     photo: str
     metadata: dict[str, Any]
-    reference: ReferenceDocument | None = None
+    reference: NearestReference | None = None
 
 
 class QueryDocument(BaseModel):
-    """The document of `retrieve query --json`. more_grasps: further grasps after which the verdict is expected to be
-    "match"; null for other verdicts than "none of these", and where more grasps do not help. advice: a sentence for
-    people on how to get a clearer answer."""
+    """The document of `retrieve query --json`. unlisted_probability: of all objects that `results` does not list.
+    more_grasps: further grasps after which the verdict is expected to be "match"; null for other verdicts than "none of
+    these", and where more grasps do not help. advice: a sentence for people on how to get a clearer answer. Optional
+    keys are absent from answers that a history holds of earlier versions."""
 
     model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
 
@@ -78,8 +83,10 @@ class QueryDocument(BaseModel):
     timing_ms: dict[str, float]
     verdict: str
     none_probability: float | None
+    unlisted_probability: float | None = None
     more_grasps: int | None = None
     advice: str | None = None
+    information: Information | None = None
     posterior: dict[str, Any] | None
     results: list[MatchDocument]
 
@@ -172,9 +179,3 @@ class GraspDocument(BaseModel):
     object_id: str
     touches: list[str]
     background: list[str] | None
-
-
-class Health(BaseModel):
-    """status: "ok", or why not."""
-
-    status: str

@@ -74,18 +74,21 @@ class Generations:
         gc.collect()  # what the one before held in circles
 
     async def watch(self) -> None:
-        """Take up each new generation; one that cannot be opened is told, and the old one goes on answering."""
-        failed, again = "", 0.0
+        """Take up each new generation. One that cannot be opened is reported, and the old one goes on answering; the
+        same failure is reported again after _AGAIN_S."""
+        failed: str | None = None
+        again = 0.0
         while True:
             await asyncio.sleep(self._settings.poll_s)
-            now = asyncio.get_running_loop().time()
+            now, name = asyncio.get_running_loop().time(), ""  # "": of a manifest that cannot be read
             try:
                 name = (await asyncio.to_thread(manifest_of, self._settings.index)).generation
-                if name == self.current.name or (name == failed and now < again):
+                if name != self.current.name and (name != failed or now >= again):
+                    await asyncio.to_thread(self.open)
+                    log.warning("generation %s answers from now on", self.current.name)
+            except Exception as error:  # whatever is wrong with it
+                if name == failed and now < again:
                     continue
                 failed, again = name, now + _AGAIN_S
-                await asyncio.to_thread(self.open)
-                log.warning("generation %s answers from now on", self.current.name)
-            except Exception as error:  # whatever is wrong with it
                 self._metrics.reload_failures.inc()
                 log.warning("a new generation cannot be taken up, %s goes on answering: %s", self.current.name, error)

@@ -1,15 +1,20 @@
 """Whether the service lives, whether it is ready, and its numbers; and the page's cookie."""
 
 from fastapi import APIRouter, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
-from retrieval.serve.documents import Health
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.security import COOKIE, same_token
 from retrieval.serve.service import Parts
-from retrieval.serve.uploads import json_body, read_json
+from retrieval.serve.uploads import RequestBody, json_body, read_json
 
 router = APIRouter(tags=["health"])
+
+
+class Health(BaseModel):
+    """status: "ok", or why not."""
+
+    status: str
 
 
 @router.get("/healthz")
@@ -32,10 +37,8 @@ async def metrics(parts: Parts) -> Response:
     return Response(parts.metrics.page(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
-class SessionBody(BaseModel):
+class SessionBody(RequestBody):
     """The service's token."""
-
-    model_config = ConfigDict(extra="forbid")
 
     token: str = Field(max_length=1000)
 

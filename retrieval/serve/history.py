@@ -6,28 +6,26 @@ import json
 import zipfile
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 from string import ascii_lowercase
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
 from retrieval.search.query.objects import listed_photo
-from retrieval.serve.catalogue import SHOWN
+from retrieval.serve.catalogue import PICTURES, shown_picture
 from retrieval.serve.documents import QueryDocument
 from retrieval.serve.errors import Problem, problems
 from retrieval.serve.generations import Opened
-from retrieval.serve.recording import recordable
 from retrieval.serve.service import Keeping, Parts, Service
 from retrieval.serve.store import BACKGROUND, NONE, OBJECT, RIGHT, Kept
-from retrieval.serve.uploads import json_body, read_json
+from retrieval.serve.uploads import RequestBody, json_body, read_json
 
 router = APIRouter(tags=["history"])
 Said = Literal["right", "object", "none"]
@@ -77,10 +75,8 @@ class NearTouchesDocument(BaseModel):
     items: list[NearTouch]
 
 
-class FeedbackBody(BaseModel):
+class FeedbackBody(RequestBody):
     """right: the answer was; object: it was the object named; none: it is not in the catalogue."""
-
-    model_config = ConfigDict(extra="forbid")
 
     query: str = Field(min_length=1, max_length=64, description="the X-Query-Id of the answer")
     said: Said
@@ -149,7 +145,7 @@ async def history(
     )
     end = offset + len(found)
     items = [HistoryItem(**_item(kept)) for kept in found]
-    return HistoryDocument(total=total, offset=offset, next=end if end < total and found else None, items=items)
+    return HistoryDocument(total=total, offset=offset, next=end if offset < end < total else None, items=items)
 
 
 # What an answer did not say, such as a reference touch, it does not say here either.
@@ -163,10 +159,7 @@ async def entry(name: str, parts: Parts) -> HistoryEntry:
 @router.get(
     "/v1/history/{name}/touches/{grasp}/{finger}",
     response_class=Response,
-    responses={
-        200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"},
-        **problems("unknown", "not-ready"),
-    },
+    responses={**PICTURES, **problems("unknown", "not-ready")},
 )
 async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
     """A gel image as it was sent; what browsers do not show, as PNG. grasp: from 1, 0 for the no-contact frames."""
@@ -176,9 +169,8 @@ async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
         data = await run_in_threadpool(_keeping(parts).store.picture, name, grasp, finger)
     if data is None:
         raise Problem("unknown", f"the query has no picture of grasp {grasp}, finger {finger[:10]!r}")
-    shown = await run_in_threadpool(recordable, data)
-    kind = next(kind for magic, kind in SHOWN.items() if shown.startswith(magic))
-    return Response(shown, media_type=kind, headers={"cache-control": "private, max-age=86400, immutable"})
+    headers = {"cache-control": "private, max-age=86400, immutable"}
+    return await run_in_threadpool(shown_picture, data, headers)
 
 
 @router.get("/v1/history/{name}/nearest", responses=problems("unknown", "bad-input", "not-ready"))
@@ -248,14 +240,13 @@ def _meant(body: FeedbackBody, kept: Kept, opened: Opened) -> tuple[str, str | N
     if body.object_id is None:
         raise Problem("bad-input", 'said "object" must name it in object_id')
     shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
-    return OBJECT, body.object_id, _photo(opened, shown or _first_photo(opened, body.object_id))
-
-
-def _first_photo(opened: Opened, object_id: str) -> str:
-    rows = opened.shard.page([], object_id, 0, 1).rows
-    if not rows:
-        raise Problem("bad-input", f'the index has no object {object_id!r}; say "none" where the catalogue lacks it')
-    return listed_photo(rows[0]).path
+    if shown is None:
+        rows = opened.shard.page([], body.object_id, 0, 1).rows
+        if not rows:
+            told = f'the index has no object {body.object_id!r}; say "none" where the catalogue lacks it'
+            raise Problem("bad-input", told)
+        shown = listed_photo(rows[0]).path
+    return OBJECT, body.object_id, _photo(opened, shown)
 
 
 def _photo(opened: Opened, photo: str) -> bytes | None:
@@ -292,9 +283,11 @@ def _archive(keeping: Keeping) -> Iterator[bytes]:
     sink = _Sink()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:  # pictures are compressed already
         folder = keeping.folder / "recording"
-        for path in _files_of(folder):
-            archive.write(path, f"recording/{path.relative_to(folder)}")
-            yield sink.taken()
+        # Lines of metadata come after the images, so that what they name is in the archive.
+        for path in (folder / "recording.json", *sorted((folder / "images").glob("*.*")), folder / "metadata.jsonl"):
+            if path.is_file() and path.suffix != ".part":
+                archive.write(path, f"recording/{path.relative_to(folder)}")
+                yield sink.taken()
         with archive.open("history.jsonl", "w", force_zip64=True) as lines:
             for name in keeping.store.names():
                 if (kept := keeping.store.query(name)) is not None:
@@ -303,19 +296,12 @@ def _archive(keeping: Keeping) -> Iterator[bytes]:
     yield sink.taken()
 
 
-def _files_of(folder: Path) -> list[Path]:
-    """The files of a recording; the lines of metadata come after the images, so that what they name is in the
-    archive."""
-    found = [folder / "recording.json", *sorted((folder / "images").glob("*.*")), folder / "metadata.jsonl"]
-    return [path for path in found if path.is_file() and path.suffix != ".part"]
-
-
 class _Sink(io.RawIOBase):
     """A file for `zipfile` to write to, out of which what was written is taken as it comes."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._parts: list[bytes] = []
+        self._data = bytearray()
 
     def writable(self) -> bool:
         """Always: this is what `zipfile` asks."""
@@ -323,10 +309,11 @@ class _Sink(io.RawIOBase):
 
     def write(self, data: Any) -> int:
         """Hold it until it is taken."""
-        self._parts.append(bytes(data))
+        self._data += data
         return len(data)
 
     def taken(self) -> bytes:
         """All that was written since."""
-        parts, self._parts = self._parts, []
-        return b"".join(parts)
+        data = bytes(self._data)
+        self._data.clear()
+        return data

@@ -2,47 +2,32 @@
 
 import secrets
 import time
-from dataclasses import asdict
-from pathlib import Path
 from string import ascii_lowercase
 from typing import Annotated
 
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as InPath
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
-from retrieval.serve.catalogue import SHOWN
+from retrieval.serve.catalogue import PICTURES, shown_picture
 from retrieval.serve.errors import Problem, problems
-from retrieval.serve.recording import recordable
 from retrieval.serve.service import Keeping, Parts, Service
 from retrieval.serve.store import Choice, Run, Store, new_id
-from retrieval.serve.trials import CHOICES, Trial, Trials, results
-from retrieval.serve.uploads import json_body, read_json
+from retrieval.serve.trials import CHOICES, Share, Trial, Trials, results
+from retrieval.serve.uploads import RequestBody, json_body, read_json
 
 router = APIRouter(tags=["human test"])
 Number = Annotated[int, InPath(ge=1, le=10_000)]
 
 
-class NewRun(BaseModel):
+class NewRun(RequestBody):
     """A series to be done: how many trials, by whom; the same seed gives the same trials."""
-
-    model_config = ConfigDict(extra="forbid")
 
     count: int = Field(20, ge=1, le=10_000)
     who: str = Field("", max_length=200)
     seed: int | None = Field(None, ge=0, lt=2**31)
-
-
-class ShareDocument(BaseModel):
-    """Right answers, their share and its exact interval of 95 %; null before the first."""
-
-    right: int
-    trials: int
-    share: float | None
-    low: float | None
-    high: float | None
 
 
 class RunDocument(BaseModel):
@@ -55,8 +40,8 @@ class RunDocument(BaseModel):
     choices: int
     answered: int
     next: int | None
-    human: ShareDocument
-    model: ShareDocument
+    human: Share
+    model: Share
     chance: float
 
 
@@ -75,15 +60,13 @@ class TrialDocument(BaseModel):
     number: int
     touches: list[str]
     photos: list[str]
-    choice: int | None
-    truth: int | None
-    model: int | None
+    choice: int | None = None
+    truth: int | None = None
+    model: int | None = None
 
 
-class ChoiceBody(BaseModel):
+class ChoiceBody(RequestBody):
     """The photo that shows the object, counted from 1."""
-
-    model_config = ConfigDict(extra="forbid")
 
     choice: int = Field(ge=1, le=CHOICES)
 
@@ -102,15 +85,12 @@ def _document(run: Run, store: Store) -> RunDocument:
     human, model = results(chosen)
     left = set(range(1, run.count + 1)) - {one.number for one in chosen}
     return RunDocument(
-        id=run.id,
-        who=run.who,
-        seed=run.seed,
-        count=run.count,
+        **vars(run),
         choices=CHOICES,
         answered=len(chosen),
         next=min(left, default=None),
-        human=ShareDocument(**asdict(human)),
-        model=ShareDocument(**asdict(model)),
+        human=human,
+        model=model,
         chance=1 / CHOICES,
     )
 
@@ -176,9 +156,7 @@ def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
         number=number,
         touches=[f"{where}/touches/{finger}" for finger in ascii_lowercase[: len(drawn.grasp.touches)]],
         photos=[f"{where}/photos/{place}" for place in range(1, CHOICES + 1)],
-        choice=done.choice if done else None,
-        truth=done.truth if done else None,
-        model=done.model if done else None,
+        **({"choice": done.choice, "truth": done.truth, "model": done.model} if done else {}),
     )
 
 
@@ -202,7 +180,7 @@ async def choose(request: Request, name: str, number: Number, parts: Parts) -> T
 @router.get(
     "/v1/trials/{name}/{number}/touches/{finger}",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"}, **problems("unknown")},
+    responses={**PICTURES, **problems("unknown")},
 )
 def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     """A gel image of the grasp."""
@@ -210,20 +188,14 @@ def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     place = ascii_lowercase.find(finger) if len(finger) == 1 else -1
     if not 0 <= place < len(files):
         raise Problem("unknown", f"the grasp has no finger {finger[:10]!r}")
-    return _picture(files[place])
+    return shown_picture(read_bytes(files[place]))
 
 
 @router.get(
     "/v1/trials/{name}/{number}/photos/{place}",
     response_class=Response,
-    responses={200: {"content": {"image/png": {}, "image/jpeg": {}}, "description": "it"}, **problems("unknown")},
+    responses={**PICTURES, **problems("unknown")},
 )
 def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
     """One of the photos, counted from 1."""
-    return _picture(_trial(parts, _run(parts, name), number).photos[place - 1])
-
-
-def _picture(path: Path) -> Response:
-    data = recordable(read_bytes(path))
-    kind = next(kind for magic, kind in SHOWN.items() if data.startswith(magic))
-    return Response(data, media_type=kind)
+    return shown_picture(read_bytes(_trial(parts, _run(parts, name), number).photos[place - 1]))

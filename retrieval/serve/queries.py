@@ -1,7 +1,7 @@
 """The paths of queries: one object, several, an answer grasp by grasp, and where a photo agrees with a touch."""
 
 from fastapi import APIRouter, Request
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from retrieval.search.query.agreement import agreement
 from retrieval.search.query.answer import QueryResult
@@ -16,6 +16,7 @@ from retrieval.serve.uploads import (
     BatchBody,
     Grasps,
     Picture,
+    RequestBody,
     json_body,
     pictures_of,
     read_json,
@@ -80,10 +81,8 @@ async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     return DocumentResponse({"answers": [answer.to_dict() for answer in answers]})
 
 
-class AgreementBody(BaseModel):
+class AgreementBody(RequestBody):
     """A photo of the catalogue by its id, and touches."""
-
-    model_config = ConfigDict(extra="forbid")
 
     photo: str = Field(min_length=1, max_length=4096, examples=["mug/1.jpg"])
     touches: Grasps

@@ -47,7 +47,7 @@ class _Job:
 
 class Queue:
     """Requests that wait for the model, in the order in which they came. The threads that work on them take one after
-    the other themselves: none waits for the event loop in between."""
+    the other themselves: none waits for the event loop in between. held: requests that wait or are in work."""
 
     def __init__(
         self, generations: Generations, settings: ServiceSettings, metrics: Metrics, decoders: Decoders
@@ -57,7 +57,7 @@ class Queue:
         self._jobs: deque[_Job] = deque()
         self._changed, self._closed = Condition(), False
         self._threads: list[Thread] = []
-        self._held = 0
+        self.held = 0
 
     def start(self) -> None:
         """Begin to answer, for the event loop that calls."""
@@ -75,18 +75,13 @@ class Queue:
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
 
-    @property
-    def held(self) -> int:
-        """Requests that wait or are in work."""
-        return self._held
-
     def require_room(self) -> None:
         """Raises Problem where one more request would not be held; asked before its body is read."""
-        if self._held >= self._settings.queue:
+        if self.held >= self._settings.queue:
             self._metrics.dropped.labels("busy").inc()
             raise Problem(
                 "busy",
-                f"{self._held} requests are held already; come again",
+                f"{self.held} requests are held already; come again",
                 {"retry-after": "1", "connection": "close"},
             )
 
@@ -115,7 +110,7 @@ class Queue:
         self.require_room()
         now = time.monotonic()
         seconds = min(self._settings.deadline_s, (deadline_ms or 1e9) / 1e3)
-        self._held += 1
+        self.held += 1
         self._metrics.held.inc()
         answer = asyncio.ensure_future(self._answer(work, pictures, asked, now, now + seconds))
         answer.add_done_callback(self._let_go)
@@ -159,7 +154,7 @@ class Queue:
                     self._jobs.remove(job)
 
     def _let_go(self, answer: asyncio.Future[Any]) -> None:
-        self._held -= 1
+        self.held -= 1
         self._metrics.held.dec()
         if not answer.cancelled():
             answer.exception()  # which nobody may be there to ask for
@@ -208,18 +203,12 @@ def _tell(jobs: list[_Job], answers: list[Any]) -> None:
 
 def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
     """The answer of each job, or the exception that is its answer; one bad query spoils no other."""
-    if len(jobs) > 1 and (together := _batch(opened, jobs)) is not None:
-        return list(together)
-    return [_answer(opened, job) for job in jobs]
-
-
-def _batch(opened: Opened, jobs: list[_Job]) -> list[Answered] | None:
     asked = [job.asked for job in jobs if job.asked is not None]
-    try:
-        found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
-    except BaseException:  # each alone says which of them it was
-        return None
-    return [Answered(result, opened.model) for result in found]
+    if len(jobs) > 1:
+        with suppress(BaseException):  # else each alone says which of them it was
+            found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
+            return [Answered(result, opened.model) for result in found]
+    return [_answer(opened, job) for job in jobs]
 
 
 def _answer(opened: Opened, job: _Job) -> Any:

@@ -43,7 +43,12 @@ def of_rig(spec: str, index: str | Path) -> LiveRig:
         return _simulated(cast("SimRig", rig))
     for sensor in rig.sensors.values():
         sensor.connect()
-    return LiveRig({name: partial(_jpeg_of, sensor, Lock()) for name, sensor in rig.sensors.items()})
+
+    def picture(sensor: TactileSensor, lock: Lock) -> bytes:
+        with lock:
+            return _encoded(".jpg", sensor.read().pixels)
+
+    return LiveRig({name: partial(picture, sensor, Lock()) for name, sensor in rig.sensors.items()})
 
 
 def of_index(index: str | Path) -> LiveRig | None:
@@ -106,11 +111,6 @@ def _simulated(rig: "SimRig") -> LiveRig:
     jaws = _Jaws(rig)
     sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
     return LiveRig(sensors, jaws.grasp)
-
-
-def _jpeg_of(sensor: TactileSensor, lock: Lock) -> bytes:
-    with lock:
-        return _encoded(".jpg", sensor.read().pixels)
 
 
 def _encoded(ending: str, pixels: npt.NDArray[np.uint8]) -> bytes:

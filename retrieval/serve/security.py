@@ -15,6 +15,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from retrieval.serve.errors import Problem, problem_of
+from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -56,10 +57,10 @@ def same_token(given: str, token: str) -> bool:
 
 
 class Guard:
-    """Refuses strangers before anything of a request is read, and adds HEADERS to every response."""
+    """Refuses strangers before anything of a request is read, adds HEADERS to every response, and counts it."""
 
-    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
-        self.app, self.settings = app, settings
+    def __init__(self, app: ASGIApp, settings: ServiceSettings, metrics: Metrics) -> None:
+        self.app, self.settings, self.metrics = app, settings, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or refuse it (ASGI)."""
@@ -73,6 +74,7 @@ class Guard:
             nonlocal begun
             if message["type"] == "http.response.start":
                 begun = True
+                self.metrics.responses.labels(message["status"]).inc()
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
@@ -96,7 +98,10 @@ class Guard:
             await problem_of(error).response()(scope, receive, with_headers)
 
     def _refusal(self, path: str, headers: Headers) -> Problem | None:
-        host = _host_name(headers.get("host", ""))
+        try:
+            host = urlsplit(f"//{headers.get('host', '')}").hostname
+        except ValueError:
+            host = None
         if self.settings.is_local and host not in _LOCAL_NAMES:
             return Problem("wrong-host", "this service hears this machine alone: ask it as localhost or 127.0.0.1")
         origin = headers.get("origin")
@@ -111,13 +116,6 @@ class Guard:
             return None
         why = "send the service's token as `Authorization: Bearer TOKEN`"
         return Problem("no-token", why, {"www-authenticate": "Bearer"})
-
-
-def _host_name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
 
 
 def _given_tokens(headers: Headers) -> list[str]:

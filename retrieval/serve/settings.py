@@ -58,10 +58,9 @@ class ServiceSettings:
         for name in ("deadline_s", "body_s", "poll_s"):
             if not 0 < getattr(self, name) <= MAX_WAIT_S:
                 raise ConfigError(f"{name} must be above 0 and at most {MAX_WAIT_S} seconds; got {getattr(self, name)}")
-        if not 0 <= self.batch_ms <= 1000:
-            raise ConfigError(f"batch_ms must be from 0 to 1000; got {self.batch_ms}")
-        if not 0 <= self.port < 2**16:
-            raise ConfigError(f"port must be from 0 to 65535; got {self.port}")
+        for name, most in (("batch_ms", 1000), ("port", 2**16 - 1)):
+            if not 0 <= getattr(self, name) <= most:
+                raise ConfigError(f"{name} must be from 0 to {most}; got {getattr(self, name)}")
         if self.token is None and not self.is_local:
             raise ConfigError(
                 f"{self.host} can be reached from other machines, so a token must be given: write {LEAST_TOKEN} or "

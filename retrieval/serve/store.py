@@ -11,7 +11,7 @@ import secrets
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_lowercase
@@ -149,14 +149,11 @@ class Store:
 
     def _identity(self) -> list[tuple[int, int] | None]:
         """Device and inode of the database and of its write-ahead log, by their names; None for a missing one."""
-        found: list[tuple[int, int] | None] = []
-        for path in (self.path, self.path.with_name(f"{self.path.name}-wal")):
-            try:
+        found: list[tuple[int, int] | None] = [None, None]
+        for place, path in enumerate((self.path, self.path.with_name(f"{self.path.name}-wal"))):
+            with suppress(OSError):
                 status = os.stat(path)
-            except OSError:
-                found.append(None)
-            else:
-                found.append((status.st_dev, status.st_ino))
+                found[place] = status.st_dev, status.st_ino
         return found
 
     def _require_in_place(self) -> None:

@@ -6,7 +6,6 @@ multipart/form-data   gelsight, once for each image, fingers in their order, gra
 
 import asyncio
 import base64
-import binascii
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from string import ascii_lowercase
@@ -103,11 +102,9 @@ def too_large(most: int) -> Problem:
 
 
 def _decoded(text: Any) -> bytes:
-    if not isinstance(text, str):
-        raise ValueError("must be a picture's file in base64")
     try:
         return base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError) as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"must be a picture's file in base64: {error}") from error
 
 
@@ -117,10 +114,14 @@ Grasps = Annotated[list[Annotated[list[Picture], Field(min_length=1)]], Field(mi
 _PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGNgYGAAAAAEAAH2FzhVAAAAAElFTkSuQmCC"
 
 
-class Options(BaseModel):
-    """What may be said beside the touches; as the options of `retrieve query`."""
+class RequestBody(BaseModel):
+    """A JSON body; other keys than those of its model are refused."""
 
     model_config = ConfigDict(extra="forbid")
+
+
+class Options(RequestBody):
+    """Options of a query besides the touches, as those of `retrieve query`."""
 
     top: int = Field(10, ge=1, le=1000, description="objects to return")
     candidates: int | None = Field(
@@ -137,9 +138,7 @@ class Options(BaseModel):
 class QueryBody(Options):
     """The touches of one object."""
 
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"touches": [[_PIXEL, _PIXEL]], "top": 3}]}
-    )
+    model_config = {"json_schema_extra": {"examples": [{"touches": [[_PIXEL, _PIXEL]], "top": 3}]}}
 
     touches: Grasps = Field(description="grasps, each with an image for each finger")
     background: list[Picture] | None = Field(None, description="no-contact frames, one for each finger")
@@ -148,9 +147,7 @@ class QueryBody(Options):
 class BatchBody(Options):
     """The touches of several objects."""
 
-    model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"examples": [{"objects": [[[_PIXEL, _PIXEL]], [[_PIXEL, _PIXEL]]]}]}
-    )
+    model_config = {"json_schema_extra": {"examples": [{"objects": [[[_PIXEL, _PIXEL]], [[_PIXEL, _PIXEL]]]}]}}
 
     objects: Annotated[list[Grasps], Field(min_length=1, max_length=MOST_OBJECTS)]
     background: list[Picture] | None = Field(None, description="no-contact frames, one for each finger")
@@ -171,10 +168,7 @@ QUERY_BODY = {
                         "description": "gel images: the fingers of a grasp in their order, grasp after grasp",
                     },
                     "background": {"type": "array", "items": {"type": "string", "format": "binary"}},
-                    "top": {"type": "integer"},
-                    "candidates": {"type": "integer"},
-                    "none_prior": {"type": "number"},
-                    "deadline_ms": {"type": "number"},
+                    **Options.model_json_schema()["properties"],
                 },
             }
         },
@@ -229,29 +223,15 @@ class Asked:
     options: Options
 
     @property
-    def touches(self) -> Sequence[Sequence[bytes]]:
-        """The files of the touches of a single object."""
-        return self.pictures.files[0]
-
-    @property
-    def background(self) -> Sequence[bytes] | None:
-        """The files of the no-contact frames."""
-        return self.pictures.background
-
-    @property
     def keywords(self) -> dict[str, Any]:
         """The keywords of `Searcher.query`, all but the touches; the pictures must have been read."""
-        said = self.options
-        return {
-            "background": self.pictures.frames,
-            "top": said.top,
-            "candidates": said.candidates,
-            "none_prior": said.none_prior,
-        }
+        options = self.options.model_dump(include={"top", "candidates", "none_prior"})
+        return {"background": self.pictures.frames, **options}
 
     def goes_with(self, other: "Asked") -> bool:
         """Whether both can be answered together."""
-        return {**self.keywords, "background": self.background} == {**other.keywords, "background": other.background}
+        background = self.pictures.background == other.pictures.background
+        return background and {**self.keywords, "background": None} == {**other.keywords, "background": None}
 
 
 def pictures_of(

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
+from retrieval.model.information import Information, information, unlisted_probability
 from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.posterior import Posterior
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 CLEAR = 0.5
@@ -134,6 +136,30 @@ class QueryResult:
         like = "this one" if self.grasps.count(CONTACT) == 1 else "these"
         return f'Another grasp would help: {self.more_grasps} more like {like} would make the verdict "match".'
 
+    @property
+    def unlisted_probability(self) -> float | None:
+        """Probability of all objects of the catalogue that `results` does not list; None without probabilities."""
+        none = self.none_probability
+        return (
+            None if none is None else unlisted_probability(none, [match.probability or 0.0 for match in self.results])
+        )
+
+    @property
+    def information(self) -> Information | None:
+        """What the grasps told, what is left, and what a further grasp is expected to tell; None without
+        probabilities."""
+        said, none = self.posterior, self.none_probability
+        if said is None or none is None:
+            return None
+        return information(
+            Posterior(said["slope"], said["offset"], said["dependence"]),
+            said["grasps"],
+            none,
+            [match.probability or 0.0 for match in self.results],
+            objects=said["objects"],
+            none_prior=said["none_prior"],
+        )
+
     @classmethod
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
         """Inverse of `to_dict`. Raises BadInput for another document."""
@@ -149,14 +175,17 @@ class QueryResult:
 
     def to_dict(self) -> dict[str, Any]:
         """The document of `retrieve query --json`."""
+        told = self.information
         return {
             "query": {"touches": self.touches, "grasps": self.grasps},
             "index": self.index,
             "timing_ms": self.timing_ms,
             "verdict": self.verdict,
             "none_probability": self.none_probability,
+            "unlisted_probability": self.unlisted_probability,
             "more_grasps": self.more_grasps,
             "advice": self.advice,
+            "information": None if told is None else asdict(told),
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],
         }

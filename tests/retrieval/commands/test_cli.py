@@ -48,14 +48,21 @@ def test_the_two_commands_work_exactly_as_written(workplace, capsys):
     assert said.err.splitlines()[-1].startswith("not a gel image: what was given for grasp 1 does not look like a gel")
 
 
+@pytest.fixture
+def built(workplace, model, capsys):
+    """That folder with an index of its catalogue."""
+    main(["build-index", "catalog/", "--model", str(model)])
+    capsys.readouterr()
+    return workplace
+
+
+QUERY = ["query", "--gelsight", "a.png", "b.png"]
 EVERY_OBJECT_IS_KNOWN = ("--none-prior", "0")
 """What a query is given where its verdict is not the point; the fixture's model can tell nothing apart."""
 
 
-def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
-    query = ["query", "--gelsight", "a.png", "b.png"]
-    assert main([*query, "--none-prior", "0.999", "--json"]) == 3
+def test_the_exit_code_tells_none_of_these_from_a_match(built, capsys):
+    assert main([*QUERY, "--none-prior", "0.999", "--json"]) == 3
     said = capsys.readouterr()
     document = json.loads(said.out)
     assert document["verdict"] == "none of these"
@@ -67,7 +74,7 @@ def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys
         f"the object, this is {best['object_id']} with probability {best['probability_if_present']:.2f}. "
         f"{document['advice']}"
     )
-    assert main([*query, *EVERY_OBJECT_IS_KNOWN, "--json"]) == 0
+    assert main([*QUERY, *EVERY_OBJECT_IS_KNOWN, "--json"]) == 0
     said = capsys.readouterr()
     document = json.loads(said.out)
     assert (document["verdict"], document["none_probability"]) == ("match", 0.0)
@@ -76,10 +83,8 @@ def test_the_exit_code_tells_none_of_these_from_a_match(workplace, model, capsys
     assert said.err.splitlines()[-1] == last
 
 
-def test_a_prior_of_1_is_wrong_use(workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
-    capsys.readouterr()
-    assert main(["query", "--gelsight", "a.png", "b.png", "--none-prior=1"]) == 2
+def test_a_prior_of_1_is_wrong_use(built, capsys):
+    assert main([*QUERY, "--none-prior=1"]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert 'the prior of "none of these" must be at least 0 and less than 1; got 1.0' in said.err
@@ -87,7 +92,7 @@ def test_a_prior_of_1_is_wrong_use(workplace, model, capsys):
 
 def test_an_index_built_elsewhere_is_found_again_from_where_it_was_built_only(workplace, model, capsys, monkeypatch):
     assert main(["build-index", "catalog/", "--model", str(model), "--out", "away/index"]) == 0
-    assert main(["query", "--gelsight", "a.png", "b.png", *EVERY_OBJECT_IS_KNOWN]) == 0
+    assert main([*QUERY, *EVERY_OBJECT_IS_KNOWN]) == 0
     assert f"index: {workplace / 'away/index'} (the last one built from this folder)" in capsys.readouterr().err
     monkeypatch.chdir(workplace / "away" / "index")
     assert main(["query", "--gelsight", "../../a.png", "../../b.png"]) == 2
@@ -117,12 +122,12 @@ def test_a_built_index_is_built_again_with_its_own_model(workplace, model, capsy
 def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model), "--json"])
     assert json.loads(capsys.readouterr().out)["photos"] == 24
-    query = ["query", "--gelsight", "a.png", "b.png", "--gelsight", "a.png", "b.png", "--top", "3", "--json"]
+    query = [*QUERY, "--gelsight", "a.png", "b.png", "--top", "3", "--json"]
     assert main([*query, *EVERY_OBJECT_IS_KNOWN]) == 0
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {
         *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
-        *("more_grasps", "advice"),
+        *("more_grasps", "advice", "unlisted_probability", "information"),
     }
     touches = [["a.png", "b.png"], ["a.png", "b.png"]]
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
@@ -136,26 +141,23 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     assert set(document["results"][0]) == {"rank", "object_id", "logit", *probabilities, "photo", "metadata"}
 
 
-def test_html_is_written_beside_the_table(workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
-    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html", *EVERY_OBJECT_IS_KNOWN]) == 0
+def test_html_is_written_beside_the_table(built, capsys):
+    assert main([*QUERY, "--html", "out.html", *EVERY_OBJECT_IS_KNOWN]) == 0
     assert "data:image/jpeg;base64," in Path("out.html").read_text()
-    assert main(["query", "--gelsight", "a.png", "b.png", "--html", "out.html", *EVERY_OBJECT_IS_KNOWN]) == 0
+    assert main([*QUERY, "--html", "out.html", *EVERY_OBJECT_IS_KNOWN]) == 0
 
 
 @pytest.mark.parametrize("name", ["a.png", "index/CURRENT", "index/gen-000001/manifest.json", "own.html"])
-def test_html_is_written_over_no_file_of_another_kind(workplace, model, capsys, name):
-    main(["build-index", "catalog/", "--model", str(model)])
+def test_html_is_written_over_no_file_of_another_kind(built, capsys, name):
     Path("own.html").write_text("<!doctype html><title>mine</title>")
     before = Path(name).read_bytes()
-    capsys.readouterr()
-    assert main(["query", "--gelsight", "a.png", "b.png", "--index", "index", "--html", name]) == 2
+    assert main([*QUERY, "--index", "index", "--html", name]) == 2
     assert f"{name} is not a page that this program wrote" in capsys.readouterr().err
     assert Path(name).read_bytes() == before
 
 
 WRONG_USE = {
-    "no index": (["query", "--gelsight", "a.png", "b.png"], "run `retrieve build-index CATALOGUE` first"),
+    "no index": (QUERY, "run `retrieve build-index CATALOGUE` first"),
     "one gel image": (
         ["query", "--gelsight", "a.png", "--index", "index"],
         "takes 2 gel image(s) for one touch; got 1",
@@ -278,14 +280,12 @@ def test_an_error_is_one_line_where_much_could_be_listed(words, tmp_path, monkey
 @pytest.mark.parametrize(
     "words",
     [
-        ["query", "--gelsight", "a.png", "b.png", "--html", "none/there/x.html"],
+        [*QUERY, "--html", "none/there/x.html"],
         ["export", "--out", "none/m.onnx"],
         ["rig", "calibrate", "points.csv", "--out", "none/hand_eye.json"],
     ],
 )
-def test_no_folder_is_made_for_a_file_that_is_to_be_written(words, workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
-    capsys.readouterr()
+def test_no_folder_is_made_for_a_file_that_is_to_be_written(words, built, capsys):
     assert main(words) == 2
     assert f"there is no folder {Path(words[-1]).parent}; make it" in capsys.readouterr().err
     assert not Path("none").exists()
@@ -319,25 +319,18 @@ def test_a_checkpoint_of_another_name_is_refused_before_anything_is_read(task, t
 
 
 @pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
-def test_a_history_that_is_no_file_is_refused(make, workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
+def test_a_history_that_is_no_file_is_refused(make, built, capsys):
     Path("kept").mkdir()
     make("kept/history.sqlite")
-    capsys.readouterr()
     assert main(["serve", "--index", "index", "--history", "kept", "--port", "0"]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert re.search(r"kept/history.sqlite must be the history of a service: is a (folder|pipe), not a", last)
 
 
-def test_a_history_whose_folder_is_a_file_is_refused(workplace, model, capsys):
-    main(["build-index", "catalog/", "--model", str(model)])
-    capsys.readouterr()
+def test_a_history_whose_folder_is_a_file_is_refused(built, capsys):
     assert main(["serve", "--index", "index", "--history", "a.png", "--port", "0"]) == 2
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .startswith("retrieve serve: the history must be a folder, but a.png is")
-    )
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("retrieve serve: the history must be a folder, but a.png is")
 
 
 WRONG_WORDS = {
@@ -465,23 +458,12 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     assert "kept step 2" in capsys.readouterr().err
     assert main(["build-index", "catalog"]) == 0
     assert f"model: {workplace / 'm.safetensors'} (the last one trained in this folder)" in capsys.readouterr().err
-    assert main(["query", "--gelsight", "a.png", "b.png", "--json", *EVERY_OBJECT_IS_KNOWN]) == 0
+    assert main([*QUERY, "--json", *EVERY_OBJECT_IS_KNOWN]) == 0
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 
 
-COLLECT = [
-    "collect",
-    "--rig",
-    "tests.fake_rig:FakeRig",
-    "--objects",
-    "2",
-    "--grasps",
-    "2",
-    "--seed",
-    "3",
-    "--out",
-    "rec",
-]
+COLLECT = ["collect", "--rig", "tests.fake_rig:FakeRig", "--objects", "2", "--grasps", "2"]
+COLLECT += ["--seed", "3", "--out", "rec"]
 
 
 def test_a_recording_is_collected_and_its_acceptance_printed(workplace, capsys):
@@ -588,17 +570,15 @@ def test_an_option_that_would_be_ignored_is_wrong_use(words, said, workplace, ca
     assert sorted(path.name for path in workplace.iterdir()) == ["a.png", "b.png", "catalog"]
 
 
-def test_a_reader_that_leaves_early_is_no_error_message(workplace, model):
-    main(["build-index", "catalog/", "--model", str(model)])
-    query = [sys.executable, "-m", "retrieval", "query", "--gelsight", "a.png", "b.png", "--index", "index"]
+def test_a_reader_that_leaves_early_is_no_error_message(built):
+    query = [sys.executable, "-m", "retrieval", *QUERY, "--index", "index"]
     done = subprocess.run(f"{' '.join(query)} | true", shell=True, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     assert "Broken pipe" not in done.stderr
 
 
-def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(workplace, model):
+def test_closed_streams_neither_stop_a_command_nor_dirty_stdout(built):
     """Python's print falls back to stdout where stderr is closed."""
-    main(["build-index", "catalog/", "--model", str(model)])
     query = f"{sys.executable} -m retrieval query --gelsight a.png b.png --index index --json --none-prior 0"
     done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
     assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)

@@ -20,12 +20,7 @@ def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
     assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [
-        ["ok", "arm"],
-        ["ok", "gripper"],
-        ["ok", "gel"],
-        ["ok", "gel"],
-        ["ok", "camera"],
-        ["ok", "skew"],
+        ["ok", device] for device in ("arm", "gripper", "gel", "gel", "camera", "skew")
     ]
 
 
@@ -119,6 +114,8 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
 ):
     from tests.fake_rig import FakeGripper, FakeRig
 
+    collect = ["collect", "--rig", "tests.fake_rig:FakeRig", "--objects", "2", "--grasps", "4"]
+    collect += ["--seed", "3", "--out", "rec"]
     rigs, real_prepare, real_grasp = [], FakeRig.prepare, FakeGripper._grasp
 
     def ended(self, force_n, speed_mm_s):
@@ -130,44 +127,10 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
     monkeypatch.setattr(FakeGripper, "_grasp", ended)
     monkeypatch.setattr(FakeRig, "prepare", lambda self, *which: (rigs.append(self), real_prepare(self, *which))[1])
     before = signal.getsignal(signal.SIGTERM)
-    assert (
-        main(
-            [
-                "collect",
-                "--rig",
-                "tests.fake_rig:FakeRig",
-                "--objects",
-                "2",
-                "--grasps",
-                "4",
-                "--seed",
-                "3",
-                "--out",
-                "rec",
-            ]
-        )
-        == 1
-    )
+    assert main(collect) == 1
     assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
     assert signal.getsignal(signal.SIGTERM) is before
     assert rigs[0].world.force is None
     assert not any(device.is_connected for device in rigs[0].devices)
     monkeypatch.setattr(FakeGripper, "_grasp", real_grasp)
-    assert (
-        main(
-            [
-                "collect",
-                "--rig",
-                "tests.fake_rig:FakeRig",
-                "--objects",
-                "2",
-                "--grasps",
-                "4",
-                "--seed",
-                "3",
-                "--out",
-                "rec",
-            ]
-        )
-        == 0
-    )
+    assert main(collect) == 0

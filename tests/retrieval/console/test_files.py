@@ -44,7 +44,6 @@ def test_nothing_but_a_file_of_its_kind_is_written_over(tmp_path):
         "index": b"gen-000001\n",
         "page": b"<!doctype html><title>mine</title>",
         "settings": b'{"mine": 1}',
-        "deep": b"[" * 100_000,
         "weights": (8).to_bytes(8, "little") + b"{}      ",
         "huge header": (2**63).to_bytes(8, "little"),
     }

@@ -17,8 +17,8 @@ from retrieval.search.query.objects import listed_photo
 from retrieval.serve.errors import Problem
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording
-from tests.retrieval.serve.test_history import INFO, ask, say
-from tests.serving import service
+from tests.retrieval.serve.test_history import ask, say
+from tests.serving import INFO, service
 
 HALF = "\ud83d"  # the first half of an emoji
 NAME = "mug\udcff"  # the byte ff in a file name

@@ -44,6 +44,8 @@ def same_answers(ours, theirs):
     for document in (ours, theirs):
         document["numbers"] = [
             document.pop("none_probability"),
+            document.pop("unlisted_probability"),
+            *(document.pop("information") or {}).values(),
             *(match.pop(name) for match in document["results"] for name in NUMBERS),
             *(document["posterior"] or {}).values(),
         ]

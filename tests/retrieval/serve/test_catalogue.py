@@ -5,13 +5,7 @@ import io
 import pytest
 from PIL import Image
 
-from tests.serving import problem, service
-
-
-@pytest.fixture(scope="module")
-def client(index):
-    with service(index) as opened:
-        yield opened
+from tests.serving import problem
 
 
 def test_the_pages_hold_every_photo_once_in_the_order_of_the_index(client, searcher):

@@ -1,6 +1,5 @@
 """What was acknowledged is there after SIGKILL, once."""
 
-import base64
 import random
 import signal
 import threading
@@ -11,14 +10,7 @@ import pytest
 
 from retrieval.data.dataset import load_grasps
 from retrieval.serve.store import Store
-from robot.recording.folder import RecordingWriter
-from tests.retrieval.serve.test_history import INFO
-from tests.serving import command, service
-
-
-@pytest.fixture(scope="module")
-def body(touch):
-    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
+from tests.serving import command, keeping
 
 
 def killed_while_people_speak(index, folder, body, name, after_s):
@@ -52,10 +44,7 @@ def test_every_word_that_was_acknowledged_before_a_kill_is_there_once(index, tou
     name, draw, every = searcher.generation.rows[0]["object_id"], random.Random(0), []
     for _ in range(3):
         every += killed_while_people_speak(index, tmp_path, body, name, draw.random())
-    with (
-        RecordingWriter(tmp_path / "recording", said_by(tmp_path)) as writer,
-        service(index, None, writer, history=tmp_path) as client,
-    ):
+    with keeping(index, tmp_path, info=said_by(tmp_path)) as client:
         client.get("/v1/history")
         kept = [client.get(f"/v1/history/{query}").json() for query in every]
     assert [(one["said"], one["object_id"]) for one in kept] == [("object", name)] * len(every)
@@ -84,6 +73,5 @@ def test_a_database_whose_writer_was_killed_has_all_that_it_said_it_has(tmp_path
     assert left.recordable() == [("1", "mug")]
     assert left.picture("1", 1, "a") == touch[0].read_bytes()
     assert left.photo("1") == b"photo"
-    assert INFO["sensor"]
     left.close()
     store.close()

@@ -13,9 +13,8 @@ from retrieval.data.dataset import load_grasps
 from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
-from tests.serving import problem, service
-
-INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
+from tests.serving import INFO, keeping, problem, service
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +31,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def client(index, folder):
-    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as opened:
+    with keeping(index, folder) as opened:
         yield opened
 
 
@@ -126,8 +125,8 @@ def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index,
         said = say(client, query, "object", name)
         assert (said.status_code, said.json()["recorded"]) == (201, False)
         assert b'retrieve_unrecorded_total{what="said"} 1.0' in client.get("/metrics").content
-    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
-        client.get("/v1/history")
+    with keeping(index, folder):  # in a thread of its own, which the end of the service does not wait for
+        until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 
@@ -204,10 +203,7 @@ def test_a_service_that_keeps_nothing_says_so(index, touches):
 def examined(index, folder, tmp_path):
     """A service with a recording of twelve objects that the model never saw."""
     unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with (
-        RecordingWriter(folder / "recording", INFO) as writer,
-        service(index, None, writer, unseen, history=folder) as opened,
-    ):
+    with keeping(index, folder, unseen) as opened:
         yield opened
 
 
@@ -249,10 +245,7 @@ def test_a_series_counts_the_persons_choices_beside_the_models(examined):
 def test_too_few_unseen_objects_are_told(index, folder, recording, tmp_path):
     """The model was trained on most objects of that recording."""
     shutil.copytree(recording, tmp_path / "seen")
-    with (
-        RecordingWriter(folder / "recording", INFO) as writer,
-        service(index, None, writer, tmp_path / "seen", history=folder) as client,
-    ):
+    with keeping(index, folder, tmp_path / "seen") as client:
         assert "needs 10 objects that the model was not trained on" in problem(
             client.post("/v1/trials", json={}), 422, "bad-input"
         )

@@ -1,12 +1,12 @@
 """Many at once, askers who leave, deadlines, queries answered together, new generations of the index, and the end."""
 
-import base64
 import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
@@ -21,11 +21,6 @@ from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
 from tests.serving import command, listening, problem, service
 from tests.waiting import until
-
-
-@pytest.fixture(scope="module")
-def body(touch):
-    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
 
 
 class Held:
@@ -189,6 +184,8 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
         until(lambda: asked(url, body).json()["index"]["generation"] == "gen-000002", 60)
         (own / "CURRENT").write_text("gen-000009\n")
         until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
+        time.sleep(0.5)  # ten polls
+        assert value(url, "retrieve_reload_failures_total") == 1  # and one line in the log, not one for each poll
         assert asked(url, body).json()["index"]["generation"] == "gen-000002"
 
 

@@ -10,26 +10,20 @@ from schemathesis import GenerationMode
 from schemathesis.specs.openapi import checks
 
 from retrieval.serve.errors import KINDS
-from robot.recording.folder import RecordingWriter
-from tests.serving import listening, service
+from tests.serving import keeping, listening
 
 CHECKS = (checks.status_code_conformance, checks.content_type_conformance, checks.response_schema_conformance)
 
 
 @pytest.fixture(scope="module")
 def asked(index, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("kept")
-    with (
-        RecordingWriter(folder / "recording", {"source": "said", "sensor": "drawn"}) as writer,
-        listening(index, None, writer, history=folder) as (url, _),
-    ):
+    with keeping(index, tmp_path_factory.mktemp("kept"), serve=listening) as (url, _):
         yield schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex="stream$")
 
 
 @pytest.fixture(scope="module")
-def told(index):
-    with service(index) as client:
-        return client.get("/openapi.json").json()
+def told(client):
+    return client.get("/openapi.json").json()
 
 
 def test_every_body_has_an_example_and_every_reference_leads_somewhere(told):

@@ -9,24 +9,12 @@ import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
 from retrieval.serve.service import Grasped, LiveRig
 from tests import synthetic
-from tests.browser import address, ask, choose, chromium, gel_files, page, serious
+from tests.browser import address, ask, choose, page, serious
 
 pytestmark = pytest.mark.slow
 JPEG = synthetic._jpeg(synthetic.draw_background(1))
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def files(touch, tmp_path_factory):
-    return gel_files(tmp_path_factory.mktemp("gels"), touch)
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +46,12 @@ def url(index, rig):
 def opened(browser, url):
     with page(browser, url) as found:
         yield found
+
+
+def ask_for(document, opened, files):
+    """Ask a service that answers with this document."""
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
 
 
 def test_dropped_gel_images_become_grasps_by_their_names(opened, files):
@@ -121,15 +115,13 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
         ("uncalibrated", None, "This model was never calibrated"),
     ],
 )
-def test_every_verdict_is_said_in_words(opened, files, index, verdict, claim, told):
-    with Searcher.open(index) as searcher:
-        document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
+def test_every_verdict_is_said_in_words(opened, files, searcher, verdict, claim, told):
+    document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
     if verdict != "none of these":
-        document |= {"none_probability": None, "posterior": None}
+        document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior", "information"))
     if verdict in ("no contact", "not a gel image"):
         document |= {"results": [], "query": {"touches": [["a.png", "b.png"]], "grasps": [verdict]}}
-    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
-    ask(opened, files[:2])
+    ask_for(document, opened, files)
     shown = opened.locator(".verdict")
     shown.get_by_text(told).wait_for()
     assert shown.get_by_role("heading").inner_text() == (claim or opened.locator(".photo .name").first.inner_text())
@@ -137,16 +129,14 @@ def test_every_verdict_is_said_in_words(opened, files, index, verdict, claim, to
     assert opened.locator(".mark").all_inner_texts() == ([marks[verdict]] if verdict in marks else [])
 
 
-def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened, files, index):
+def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened, files, searcher):
     """The page computes neither."""
-    with Searcher.open(index) as searcher:
-        document = searcher.query(files[:2], none_prior=0.999).to_dict()
+    document = searcher.query(files[:2], none_prior=0.999).to_dict()
     assert document["verdict"] == "none of these"
     document |= {"advice": "Another grasp would help: 2 more."}
     for place, match in enumerate(document["results"]):
         match["probability_if_present"] = 0.625 / 2**place
-    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
-    ask(opened, files[:2])
+    ask_for(document, opened, files)
     best = document["results"][0]["object_id"]
     verdict = opened.locator(".verdict")
     verdict.get_by_text(f"If it has the object, this is {best} with probability 62.5\u00a0%.").wait_for()
@@ -156,17 +146,21 @@ def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened
     assert len(shown) == len(document["results"])
 
 
-def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, index):
+def test_the_probability_of_the_objects_that_are_not_listed_is_the_one_of_the_service(opened, files, searcher):
+    document = searcher.query(files[:2], top=3).to_dict() | {"unlisted_probability": 0.4375}
+    ask_for(document, opened, files)
+    assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
+
+
+def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, searcher):
     """The history of a service holds such."""
-    with Searcher.open(index) as searcher:
-        document = searcher.query(files[:2], none_prior=0.999).to_dict()
-    del document["advice"], document["more_grasps"]
+    document = searcher.query(files[:2], none_prior=0.999).to_dict()
+    del document["advice"], document["more_grasps"], document["information"], document["unlisted_probability"]
     for match in document["results"]:
         del match["probability_if_present"]
-    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
-    ask(opened, files[:2])
+    ask_for(document, opened, files)
     opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
-    assert opened.locator(".advice, .if-present").count() == 0
+    assert opened.locator(".advice, .if-present, .another").count() == 0
 
 
 def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):

@@ -2,14 +2,14 @@
 
 import pytest
 
-from tests.browser import address, ask, chromium, gel_files, page
+from tests.browser import address, ask, page
 
 
 @pytest.fixture(scope="module")
-def opened(index, touch, tmp_path_factory):
+def opened(index, browser, files):
     """The page, after gel images of two grasps were chosen and asked about."""
-    with address(index) as url, chromium() as browser, page(browser, url) as found:
-        ask(found, gel_files(tmp_path_factory.mktemp("gels"), touch))
+    with address(index) as url, page(browser, url) as found:
+        ask(found, files)
         yield found
 
 

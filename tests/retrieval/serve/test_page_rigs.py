@@ -11,21 +11,15 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.serve.rig import of_index, of_rig
 from retrieval.training.train import train
-from robot.recording.folder import RecordingWriter
 from robot.sim.rig import SimRig
-from tests.browser import address, chromium, page
+from tests.browser import address, page
 from tests.conftest import TINY
 from tests.replay_rig import replay_file
+from tests.serving import keeping
 
 pytestmark = pytest.mark.slow
 SEED = 20_000
 SHOWN = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +47,7 @@ def live(opened):
 
 
 def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(browser, index, tmp_path):
-    with (
-        RecordingWriter(tmp_path / "recording", {"source": "said", "sensor": "simulated"}) as writer,
-        address(index, of_index(index), writer, history=tmp_path) as url,
-        page(browser, url) as opened,
-    ):
+    with keeping(index, tmp_path, rig=of_index(index), serve=address) as url, page(browser, url) as opened:
         assert live(opened).evaluate("one => one.naturalWidth") > 100
         opened.get_by_role("button", name="Grasp something").click()
         opened.locator(".answer").wait_for()

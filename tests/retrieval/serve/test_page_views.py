@@ -5,29 +5,14 @@ import json
 import zipfile
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
 import pytest
 
-from benchmarks.models.next_grasp import another_grasp
-from retrieval.search.query.searcher import Searcher
-from robot.recording.folder import RecordingWriter
 from tests import synthetic
-from tests.browser import address, ask, chromium, gel_files, page, serious
+from tests.browser import address, ask, page, serious
+from tests.serving import keeping
 
 pytestmark = pytest.mark.slow
 MANY = 100_000
-INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def files(touch, tmp_path_factory):
-    return gel_files(tmp_path_factory.mktemp("gels"), touch)
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +20,7 @@ def url(index, tmp_path_factory):
     """A service that keeps what it is told, with a recording of twelve objects that the model never saw."""
     folder = tmp_path_factory.mktemp("kept")
     unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with (
-        RecordingWriter(folder / "recording", INFO) as writer,
-        address(index, None, writer, unseen, history=folder) as found,
-    ):
+    with keeping(index, folder, unseen, serve=address) as found:
         yield found
 
 
@@ -64,35 +46,48 @@ def test_how_the_answer_changed_grasp_by_grasp_is_drawn_and_told_in_numbers(open
     assert last == opened.locator(".photo.none .p").inner_text()
 
 
-def test_which_grasp_would_tell_most_by_itself_is_said_in_bits(opened, files, index):
-    with Searcher.open(index) as searcher:
-        expected = [divergence_bits(searcher.query([files[at : at + 2]], top=100)) for at in (0, 2)]
+INFORMATION = {
+    "gained_bits": 1.25,
+    "remaining_bits": 2.5,
+    "possible_bits": 4.0,
+    "next_grasp_bits": 0.375,
+    "next_effective_grasps": 1.625,
+}
+
+
+def informed(answer, **changes):
+    """The document of an answer with this information, which its probabilities contradict."""
+    return answer.to_dict() | {"information": INFORMATION | changes}
+
+
+def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, files, searcher):
+    """The page computes none: neither that of each grasp by itself, nor that of the next one."""
+    grasps = [files[:2], files[2:]]
+    whole = informed(searcher.query(grasps))
+    alone = [
+        informed(one, gained_bits=bits) for one, bits in zip(searcher.query_many(grasps), (0.5, 3.125), strict=True)
+    ]
+    growing = {"answers": [one.to_dict() for one in searcher.query_growing(grasps)], "alone": alone}
+    opened.route("**/v1/query", lambda route: route.fulfill(json=whole))
+    opened.route("**/v1/query/growing*", lambda route: route.fulfill(json=growing))
     ask(opened, files)
+    another = opened.get_by_role("region", name="Another grasp").inner_text()
+    assert "would tell about 0.38 of the 2.5 bits that are open" in another
+    assert "3 grasps of one object weigh as much as 1.63 independent ones" in another
+    assert "The matcher cannot suggest where to grasp" in another
     section = opened.get_by_role("region", name="Grasp by grasp")
-    said = section.get_by_text("would tell most").inner_text()
-    assert f"grasp {1 + int(np.argmax(expected))} would tell most: {max(expected):.1f} of the 4.0 bits" in said
+    told = section.get_by_text("would tell most").inner_text()
+    assert "grasp 2 would tell most: 3.1 of the 4.0 bits" in told
     section.get_by_text("As numbers").click()
     row = section.get_by_role("row", name="The grasp by itself tells").get_by_role("cell")
-    assert [float(text.split()[0]) for text in row.all_inner_texts()] == pytest.approx(expected, abs=0.0051)
+    assert row.all_inner_texts() == ["0.50 bits", "3.13 bits"]
 
 
-def divergence_bits(answer):
-    """Of the probabilities of eight objects and none from those before, 1/16 each and 1/2."""
-    now = np.array([*(match.probability for match in answer.results), answer.none_probability])
-    before = np.array([1 / 16] * 8 + [1 / 2])
-    return float(np.sum(now * np.log2(now / before)))
-
-
-@pytest.mark.parametrize("grasps", [1, 2])
-def test_what_another_grasp_may_be_expected_to_tell_is_said_in_bits(opened, files, index, grasps):
-    with Searcher.open(index) as searcher:
-        expected, left, weight = another_grasp(searcher.query([files[at : at + 2] for at in (0, 2)][:grasps], top=100))
-    ask(opened, files[: 2 * grasps])
-    said = opened.get_by_role("region", name="Another grasp").inner_text()
-    about = f"about {expected:.2f} of the {left:.1f} bits" if expected >= 0.005 else "hardly anything"
-    assert f"would tell {about}" in said
-    assert f"{grasps + 1} grasps of one object weigh as much as {weight:.2f} independent ones" in said
-    assert "the matcher cannot say" in said
+def test_another_grasp_of_under_a_hundredth_bit_would_tell_hardly_anything(opened, files, searcher):
+    document = informed(searcher.query(files[:2]), next_grasp_bits=0.004)
+    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
+    ask(opened, files[:2])
+    assert "would tell hardly anything" in opened.get_by_role("region", name="Another grasp").inner_text()
 
 
 def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):

@@ -6,7 +6,7 @@ import pytest
 
 from retrieval.serve.documents import MatchDocument, QueryDocument
 from tests import synthetic
-from tests.serving import problem, service
+from tests.serving import problem
 
 
 @pytest.fixture(scope="module")
@@ -15,12 +15,6 @@ def grasps(tmp_path_factory):
     objects = synthetic.make_objects(1, seed=9)
     files = synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 2)[objects[0].object_id]
     return [[path.read_bytes() for path in grasp] for grasp in files]
-
-
-@pytest.fixture(scope="module")
-def client(index):
-    with service(index) as opened:
-        yield opened
 
 
 def encoded(grasps):

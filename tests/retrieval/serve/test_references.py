@@ -7,10 +7,9 @@ from PIL import Image
 
 from retrieval.data.dataset import load_grasps
 from retrieval.search.build.build_index import build_index
-from robot.recording.folder import RecordingWriter
-from tests.browser import address, ask, chromium, page, serious
+from tests.browser import address, ask, page, serious
 from tests.referenced import NAMES, a_model
-from tests.serving import problem, service
+from tests.serving import keeping, problem, service
 
 
 @pytest.fixture
@@ -48,10 +47,7 @@ def test_a_gel_image_is_no_photo_to_compare_with(index, touches):
 
 
 def test_what_was_said_of_an_object_without_photos_is_kept_but_no_gel_becomes_a_photo(index, touches, tmp_path):
-    with (
-        RecordingWriter(tmp_path / "recording", {"source": "what people said", "sensor": "drawn gel"}) as writer,
-        service(index, None, writer, history=tmp_path) as client,
-    ):
+    with keeping(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):
             asked = client.post("/v1/query", **files(touches[name][0]))
             said = {"query": asked.headers["x-query-id"], "said": "object", "object_id": name}
@@ -64,8 +60,8 @@ def test_what_was_said_of_an_object_without_photos_is_kept_but_no_gel_becomes_a_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(index, touches, width):
-    with chromium() as browser, address(index) as url, page(browser, url, width) as opened:
+def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(browser, index, touches, width):
+    with address(index) as url, page(browser, url, width) as opened:
         ask(opened, touches[NAMES[1]][1])
         card = opened.locator(".photo.object", has_text=NAMES[1])
         assert card.locator(".reference img").count() == 2
@@ -82,8 +78,8 @@ def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(index
 
 
 @pytest.mark.slow
-def test_an_object_without_photos_is_said_to_be_one_on_the_page(index, touches):
-    with chromium() as browser, address(index) as url, page(browser, url) as opened:
+def test_an_object_without_photos_is_said_to_be_one_on_the_page(browser, index, touches):
+    with address(index) as url, page(browser, url) as opened:
         ask(opened, touches[NAMES[2]][0])
         opened.locator(".photo.object", has_text=NAMES[2]).locator("button").click()
         dialog = opened.get_by_role("dialog", name=NAMES[2])

@@ -11,12 +11,6 @@ TOKEN = "a token of some length"
 
 
 @pytest.fixture(scope="module")
-def client(index):
-    with service(index) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
 def guarded(index):
     with service(index, host="0.0.0.0", token=TOKEN) as opened:
         yield opened

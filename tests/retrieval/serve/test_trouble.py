@@ -25,8 +25,7 @@ from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import Asked, Options, pictures_of
 from robot.recording.folder import RecordingWriter
 from tests.retrieval.serve.test_connections import opened
-from tests.retrieval.serve.test_history import INFO
-from tests.serving import listening, problem, service
+from tests.serving import INFO, keeping, listening, problem
 from tests.waiting import until
 
 
@@ -47,7 +46,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def client(index, folder):
-    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as opened:
+    with keeping(index, folder) as opened:
         yield opened
 
 
@@ -90,13 +89,13 @@ def test_the_writer_survives_a_thousand_unforeseen_exceptions(index, folder, gra
         raised.append(error)
         raise error
 
-    with RecordingWriter(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
-        keeping, names = client.app.state.service.keeping, []
+    with keeping(index, folder) as client:
+        kept, names = client.app.state.service.keeping, []
         with monkeypatch.context() as patch:
-            patch.setattr(keeping.store, "keep", fail)
+            patch.setattr(kept.store, "keep", fail)
             for _ in range(1_000):
-                until(lambda: len(keeping._waiting) < WAITING)
-                names.append(keeping.keep(Asked(pictures_of([[grasp]], None), Options()), Answered(None, "m")))
+                until(lambda: len(kept._waiting) < WAITING)
+                names.append(kept.keep(Asked(pictures_of([[grasp]], None), Options()), Answered(None, "m")))
             until(lambda: len(raised) == 1_000)
         assert client.get("/v1/history").json()["total"] == 0
         assert "could not be stored: 'x'" in problem(client.get(f"/v1/history/{names[1]}"), 404, "unknown")
@@ -168,10 +167,10 @@ def test_nothing_is_acknowledged_once_the_database_was_deleted_or_replaced(clien
 def test_a_database_that_hangs_is_told_and_closing_does_not_wait_for_it(folder, monkeypatch):
     monkeypatch.setattr("retrieval.serve.store._LOCK_S", 0.1)
     with RecordingWriter(folder / "recording", INFO) as writer:
-        keeping = Keeping(folder, writer, ServiceSettings(index="x"), Metrics())
-        with keeping.store._lock, pytest.raises(RetrievalError, match="sqlite does not answer"):
-            keeping.store.names()
-        keeping.close()
+        kept = Keeping(folder, writer, ServiceSettings(index="x"), Metrics())
+        with kept.store._lock, pytest.raises(RetrievalError, match="sqlite does not answer"):
+            kept.store.names()
+        kept.close()
 
 
 # The rig -------------------------------------------------------------------------------------------------------------

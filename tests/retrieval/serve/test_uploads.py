@@ -15,12 +15,6 @@ from tests.serving import listening, problem, service
 
 
 @pytest.fixture(scope="module")
-def client(index):
-    with service(index) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
 def url(index):
     with listening(index, body_s=0.3) as (address, _):
         yield address

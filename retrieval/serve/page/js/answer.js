@@ -28,7 +28,7 @@ export function answerPanel({ index, answer, id, asked, kept = null }) {
         parts.map((part) => card(part, answer, open)),
       ),
     parts.length > 0 && asked.touches.length > 1 && answer.none_probability !== null && growingPanel(asked),
-    parts.length > 0 && answer.posterior && anotherGrasp(answer),
+    parts.length > 0 && answer.information && anotherGrasp(answer),
     found(answer),
   );
 }
@@ -39,9 +39,9 @@ function shares(answer) {
   if (!objects.length || answer.none_probability === null) return objects;
   const none = { kind: "none", p: answer.none_probability };
   const shown = [...objects, none].sort((one, other) => other.p - one.p);
-  const rest = 1 - shown.reduce((sum, part) => sum + part.p, 0);
   const others = (answer.posterior?.objects ?? 0) - objects.length;
-  if (others > 0) shown.push({ kind: "rest", p: Math.max(0, rest), others });
+  const rest = answer.unlisted_probability; // absent in answers that a history keeps from before
+  if (others > 0 && rest !== undefined) shown.push({ kind: "rest", p: rest, others });
   return shown;
 }
 

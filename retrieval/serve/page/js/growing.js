@@ -2,7 +2,6 @@
 
 import * as api from "./api.js";
 import { h, problemCard, svg } from "./dom.js";
-import { certainBits, toldBits } from "./information.js";
 import { count, percent } from "./words.js";
 
 const MOST_LINES = 5;
@@ -33,7 +32,7 @@ function content(answers, alone) {
   if (answers.filter((answer) => answer.none_probability !== null).length < 2)
     return [h("p", { class: "faint" }, "Fewer than two grasps felt something; there is nothing to compare.")];
   const lines = linesOf(answers);
-  const told = alone.map(toldBits);
+  const told = alone.map((answer) => answer.information?.gained_bits ?? 0); // null: nothing was felt
   return [
     h("p", { class: "turn" }, turningPoint(answers, lines)),
     h("p", { class: "turn" }, mostByItself(alone, told)),
@@ -65,7 +64,7 @@ function linesOf(answers) {
 /** Which grasp would tell most, were it the only one. */
 function mostByItself(alone, told) {
   const most = told.indexOf(Math.max(...told));
-  const all = certainBits(alone[most].posterior);
+  const all = alone[most].information.possible_bits;
   return `By itself, grasp ${most + 1} would tell most: ${told[most].toFixed(1)} of the ${all.toFixed(1)} bits that name an object for certain.`;
 }
 

@@ -1,0 +1,53 @@
+"""Make docs/images/page.jpg: the page of the service with an answer from the index of a demo.
+
+    retrieve demo && python -m benchmarks.page_picture demo
+
+It shows the object that the demo shows, and two of its grasps, so nobody chooses them by their answer.
+"""
+
+import argparse
+import io
+import sys
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+from PIL import Image
+
+from retrieval.commands.demo import PHOTOS, example
+from retrieval.data.dataset import load_grasps
+from retrieval.serve.rig import of_index
+from tests.browser import address, ask, chromium, page
+from tests.serving import keeping
+
+OUT = Path(__file__).parents[1] / "docs" / "images" / "page.jpg"
+SIZE = {"width": 1280, "height": 960}
+GRASPS = 2
+
+
+def main():
+    """Ask the page in Chromium, and write what it shows."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("demo", type=Path, help="folder that `retrieve demo` wrote")
+    folder = parser.parse_args().demo
+    queries = defaultdict(list)
+    for grasp in load_grasps(folder / "recording"):
+        queries[grasp.object_id].append(grasp)
+    queries = {name: grasps[PHOTOS:] for name, grasps in queries.items()}
+    files = [path for grasp in queries[example(queries)][:GRASPS] for path in grasp.touches]
+    index = folder / "index"
+    with (
+        tempfile.TemporaryDirectory() as history,
+        keeping(index, Path(history), folder / "recording", of_index(index), address) as url,
+        chromium() as browser,
+        page(browser, url) as opened,
+    ):
+        opened.set_viewport_size(SIZE)
+        ask(opened, files)
+        opened.locator(".answer").get_by_text("would tell most").wait_for()
+        opened.wait_for_load_state("networkidle")
+        Image.open(io.BytesIO(opened.screenshot())).convert("RGB").save(OUT, quality=86, optimize=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
