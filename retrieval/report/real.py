@@ -1,6 +1,7 @@
 """The report of the benchmark of real data: its results.json and the recordings' pictures in, Markdown, HTML and
 figures out."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.measuring import QUARTILES, quartile_name
-from retrieval.evaluation.real.protocol import PHOTO
+from retrieval.evaluation.real.protocol import PHOTO, TOUCHES
 from retrieval.evaluation.real.references import with_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report import galleries
@@ -89,6 +90,8 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
 def _grasps(recording: Path, entry: str) -> list[Grasp]:
     """Those that a protocol asked, with what showed their objects."""
     grasps = load_grasps(recording)
+    if entry == TOUCHES:
+        return [dataclasses.replace(grasp, photo=grasp.touches[0]) for grasp in grasps]
     return grasps if entry == PHOTO else with_references(grasps)
 
 
@@ -149,7 +152,7 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
             file = f"{file_name(name)}-{kind}.jpg"
             figures.append(out / "figures" / file)
             draw(figures[-1], galleries.examples, queries, grasps)
-            entries = "photo" if entry["entry"] == PHOTO else "reference touch"
+            entries = {PHOTO: "photo", TOUCHES: "touch"}.get(entry["entry"], "reference touch")
             yield Picture(
                 f"figures/{file}",
                 f"{kind.capitalize()} queries: {', '.join(one['object_id'] for one in queries)}.",
@@ -286,7 +289,8 @@ def contact(entry: Entry) -> Table | None:
         rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
         rows.append((BLURRED, *(with_interval(row["blurred"][key]) for key in names)))
         for which, control in CONTROL_NAMES.items():
-            rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
+            if row[which]:
+                rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
     if not rows:
         return None
     header = ("by contact", "weakest quarter", "second", "third", "strongest quarter")
