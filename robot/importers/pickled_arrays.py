@@ -170,8 +170,14 @@ class _Reader:
 
 def _named(module: Any, name: Any) -> _Name:
     if not (isinstance(module, str) and isinstance(name, str)) or (module, name) not in _NAMES:
-        raise _refusal(f"it asks for {str(module)[:40]!r} {str(name)[:40]!r}")
+        raise _refusal(f"it asks for {_word(module)} {_word(name)}")
     return _Name(_NAMES[module, name])
+
+
+def _word(part: Any) -> str:
+    """A part of a pickle for an error. Of a tuple only its kind: written out, one that holds another twice, and so on,
+    has no end."""
+    return repr(part[:40]) if isinstance(part, str) else f"a {type(part).__name__}"
 
 
 def _made(what: Any, arguments: Any) -> _Dtype | _Array:
@@ -181,7 +187,7 @@ def _made(what: Any, arguments: Any) -> _Dtype | _Array:
         raise _refusal("a call has no arguments")
     if word == "dtype" and len(arguments) == 3:
         if arguments[0] not in _TYPES:
-            raise _refusal(f"its numbers are of the type {str(arguments[0])[:20]!r}")
+            raise _refusal(f"its numbers are of the type {_word(arguments[0])}")
         return _Dtype(arguments[0])
     if word == _RECONSTRUCT and len(arguments) == 3 and arguments[0] == _Name("ndarray"):
         return _Array()
