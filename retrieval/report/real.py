@@ -146,7 +146,9 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     for table in (choices(entry), contact(entry), reliability(entry)):
         if table:
             yield table
-    yield Details("Against the blurred control and the order of capture, all measures", (differences(entry),))
+    yield Details("Against the controls, all measures", (differences(entry),))
+    if compared := towers(entry):
+        yield compared
     for kind in ("best", "worst"):
         if grasps and (queries := entry["examples"][kind]):
             file = f"{file_name(name)}-{kind}.jpg"
@@ -252,6 +254,17 @@ def differences(entry: Entry) -> Table:
     ]
     header = ("method", "measure", "control", "touch less control, points", "p")
     return Table(header, tuple(rows), words=frozenset({1, 2}))
+
+
+def towers(entry: Entry) -> Table | None:
+    """Paired differences of each tower from the first one; None where there is one tower, or methods are compared."""
+    rows = [
+        (_label(name, row), entry["labels"][key], _points(one), probability(one["p"]))
+        for name, row in entry["rows"].items()
+        for key, one in (row.get("tower_differences") or {}).items()
+    ]
+    header = ("tower", "measure", "points over the first tower, same representation", "p")
+    return Table(header, tuple(rows), words=frozenset({1})) if rows else None
 
 
 def _points(one: Mapping[str, Any]) -> str:

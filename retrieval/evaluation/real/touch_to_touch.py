@@ -256,6 +256,7 @@ def touch_to_touch_entry(
     entries: dict[str, Any] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
     shown: tuple[str, ScoreTable] | None = None
+    frozen: dict[str, dict[str, Measure]] = {}
     for label, towers in _towers(rows):
         encoder = _Encoder(sequences, towers, common)
         untouched = _measures(protocol, sequences, encoder.untouched())
@@ -264,12 +265,14 @@ def touch_to_touch_entry(
             name = f"{label}-{representation}"
             table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
             blurred = _measures(protocol, sequences, encoder.vectors(representation, "blurred"))
-            measured = [_taken(protocol, table)]
+            measured = _taken(protocol, table)
             model = towers.checkpoint
+            first = frozen.setdefault(representation, measured)
             entries[name] = {
                 "method": "nearest",
                 "model": model.digest if model else None,
-                **row_entry(protocol, measured, [blurred], [order], summing, [untouched]),
+                **row_entry(protocol, [measured], [blurred], [order], summing, [untouched]),
+                "tower_differences": None if first is measured else summing.differences([measured], [first]),
                 "reliability": {},
                 "chosen": [],
             }
