@@ -34,6 +34,7 @@ DATA_SET = DataSet(
         "There are no photos: the gel image itself stands in place of each photo. Do not train a matcher on it.",
         "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone names "
         "the part far above chance. Print that control, and the contact difference on one common no-contact frame.",
+        "Videos were made in two sittings: those of 50 frames, 10 a second, show another light than those of 126 frames.",
         "Frames of one video are nearly alike: leave whole videos out, which are the sequences.",
     ),
     unverified=("that the first frame of every video is without contact",),
@@ -62,10 +63,10 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     sequence = name_of(path.stem)
     press = Press(path, frames)
-    before = Shared(name_of(sequence, "untouched"), press.untouched)
+    before = Shared(name_of(sequence, "untouched"), press.untouched)  # type: ignore[arg-type]  # import_items calls it
     for place in range(frames):
         name = name_of(sequence, str(place + 1))
-        touch = Shared(name, partial(press.frame, place))
+        touch = Shared(name, partial(press.frame, place))  # type: ignore[arg-type]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
 

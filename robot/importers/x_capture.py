@@ -58,8 +58,8 @@ def _items(points: list[Path]) -> Iterator[Item | Skip]:
         object_id = point.parent.name
         for match, touch in numbered(point, _TOUCH):
             name = name_of(object_id, point.name, f"{match['force']}N")
-            images: Images = {"photo": point / f"{match['point']}_rgb.png", "touch_a": touch}
-            images = images | _depth(point / f"{match['point']}_depth.png")
+            depth = _depth(point / f"{match['point']}_depth.png")
+            images: Images = {"photo": point / f"{match['point']}_rgb.png", "touch_a": touch, **depth}
             yield Item(name, object_id, images, {"sequence_id": object_id, "force_n": float(match["force"])})
 
 
