@@ -34,7 +34,7 @@ DATA_SET = DataSet(
         "There are no photos: the gel image itself stands in place of each photo. Do not train a matcher on it.",
         "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone names "
         "the part far above chance. Print that control, and the contact difference on one common no-contact frame.",
-        "Videos were made in two sittings: those of 50 frames, 10 a second, show another light than those of 126 frames.",
+        "Videos were made in two sittings: those of 50 frames show another light than those of 126 frames.",
         "Frames of one video are nearly alike: leave whole videos out, which are the sequences.",
     ),
     unverified=("that the first frame of every video is without contact",),
