@@ -23,6 +23,7 @@ from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
+from retrieval.search.defaults import NAMED, shipped_model
 
 HELP = "Judge methods on public data sets of real touches, with controls."
 PRESET = "real"
@@ -138,7 +139,7 @@ def _models(given: Iterable[str]) -> Mapping[str, Path]:
         name, equals, file = word.partition("=")
         if not equals or not name or "/" in name:
             raise BadInput(f"a model is given as NAME=FILE, got {word!r}")
-        models[name] = Path(file)
+        models[name] = shipped_model(NAMED[file]) if file in NAMED else Path(file)
     return models
 
 

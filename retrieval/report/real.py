@@ -1,15 +1,16 @@
 """The report of the benchmark of real data: its results.json and the recordings' pictures in, Markdown, HTML and
 figures out."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from retrieval.console.output import show
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.measuring import QUARTILES, quartile_name
-from retrieval.evaluation.real.protocol import PHOTO
+from retrieval.evaluation.real.protocol import PHOTO, TOUCHES
 from retrieval.evaluation.real.references import with_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report import galleries
@@ -59,9 +60,7 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     for name, entry in entries.items():
         grasps: Grasps = {}
         if recording := recordings.get(entry["recording"]["data_set"]):
-            asked = load_grasps(recording)
-            asked = asked if entry["entry"] == PHOTO else with_references(asked)
-            grasps = {grasp.grasp_id: grasp for grasp in asked}
+            grasps = {grasp.grasp_id: grasp for grasp in _grasps(recording, entry["entry"])}
         sections.append(Section(entry["title"], tuple(_section(name, entry, grasps, out, figures))))
     words = " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
     lead: tuple[Block, ...] = (
@@ -72,6 +71,14 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     settings = Section("How this was made", (Details("Settings", (Listing.of_json(results["setting"]),)),))
     document = Document("What a touch says, on real data", lead, (*sections, settings))
     return [*write_document(document, out), *figures]
+
+
+def _grasps(recording: Path, entry: str) -> list[Grasp]:
+    """Those that a protocol asked, with what showed their objects."""
+    grasps = load_grasps(recording)
+    if entry == TOUCHES:
+        return [dataclasses.replace(grasp, photo=grasp.touches[0]) for grasp in grasps]
+    return grasps if entry == PHOTO else with_references(grasps)
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -115,13 +122,15 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     for table in (choices(entry), contact(entry), reliability(entry)):
         if table:
             yield table
-    yield Details("Against the blurred control and the order of capture, all measures", (differences(entry),))
+    yield Details("Against the controls, all measures", (differences(entry),))
+    if compared := towers(entry):
+        yield compared
     for kind in ("best", "worst"):
         if grasps and (queries := entry["examples"][kind]):
             file = f"{file_name(name)}-{kind}.jpg"
             figures.append(out / "figures" / file)
             draw(figures[-1], galleries.examples, queries, grasps)
-            entries = "photo" if entry["entry"] == PHOTO else "reference touch"
+            entries = {PHOTO: "photo", TOUCHES: "touch"}.get(entry["entry"], "reference touch")
             yield Picture(
                 f"figures/{file}",
                 f"{kind.capitalize()} queries: {', '.join(one['object_id'] for one in queries)}.",
@@ -218,6 +227,17 @@ def differences(entry: Entry) -> Table:
     return Table(header, tuple(rows), words=frozenset({1, 2}))
 
 
+def towers(entry: Entry) -> Table | None:
+    """Paired differences of each tower from the first one; None where there is one tower, or methods are compared."""
+    rows = [
+        (_label(name, row), entry["labels"][key], _points(one), probability(one["p"]))
+        for name, row in entry["rows"].items()
+        for key, one in (row.get("tower_differences") or {}).items()
+    ]
+    header = ("tower", "measure", "points over the first tower, same representation", "p")
+    return Table(header, tuple(rows), words=frozenset({1})) if rows else None
+
+
 def _points(one: Mapping[str, Any]) -> str:
     return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}"
 
@@ -253,7 +273,8 @@ def contact(entry: Entry) -> Table | None:
         rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
         rows.append((BLURRED, *(with_interval(row["blurred"][key]) for key in names)))
         for which, control in CONTROL_NAMES.items():
-            rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
+            if row[which]:
+                rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
     if not rows:
         return None
     header = ("by contact", "weakest quarter", "second", "third", "strongest quarter")

@@ -22,6 +22,7 @@ from retrieval.evaluation.real.lines import CONTROL_METHOD, CONTROLS, Line, Row,
 from retrieval.evaluation.real.measuring import Measured, joined, measure, read_measured, write_measured
 from retrieval.evaluation.real.protocol import PHOTO, Facts, Protocol, read_facts
 from retrieval.evaluation.real.references import FITTED, referenced, references_of, shown_by_references
+from retrieval.evaluation.real.touch_to_touch import TouchToTouch, touch_to_touch_entry
 from retrieval.evaluation.real.verdict import BySeed, Summing, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import KNOW_NOTHING, METHODS
@@ -107,6 +108,11 @@ def benchmark(
             of = protocol.data_set
             if of not in rows:
                 rows[of] = _rows(facts[of], config, fitted, models, kept / "features", quiet)
+            if isinstance(protocol, TouchToTouch):
+                tables[name] = touch_to_touch_entry(
+                    protocol, facts[of], rows[of], list(range(seeds)), kept, DRAWS, quiet
+                )
+                continue
             taken = [row for row in rows[of] if protocol.entry == PHOTO or row.method in FITTED]
             if not taken:
                 left_out[name] = f"it shows objects by touches, which of the methods only {', '.join(FITTED)} can take"

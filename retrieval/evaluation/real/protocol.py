@@ -12,8 +12,9 @@ from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.metrics.registry import METRICS, Metric, guesses
 
-PHOTO, REFERENCE, BOTH = "photo", "reference", "both"
-"""What an entry of the catalogue shows: a photo, a reference touch, or the one with the other."""
+PHOTO, REFERENCE, BOTH, TOUCHES = "photo", "reference", "both", "touches"
+"""What an entry of the catalogue shows: a photo, a reference touch, the one with the other, or touches that nothing is
+fitted to (`retrieval.evaluation.real.touch_to_touch`)."""
 CHOOSING = 5
 """Objects, of those that do not test, by which methods choose their settings."""
 

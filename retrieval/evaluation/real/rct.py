@@ -8,7 +8,8 @@ from retrieval.evaluation.real.protocol import Facts, Protocol, first_guess, fol
 _FOLDS = 5
 
 
-def _materials(facts: Facts, seed: int) -> list[Split]:
+def five_folds(facts: Facts, seed: int) -> list[Split]:
+    """Objects dealt by lot into five folds."""
     names = facts.names
     order = [names[place] for place in np.random.default_rng([seed, 31]).permutation(len(names))]
     return folds(names, [order[turn::_FOLDS] for turn in range(_FOLDS)], seed)
@@ -19,7 +20,7 @@ MATERIALS = Protocol(
     "RCT: unseen materials",
     "Materials are dealt by lot into five folds, again for each seed; all presses of a material stay together. "
     "There is one photo of a material, which every press of it is shown.",
-    _materials,
+    five_folds,
     {**first_guess(10), **first_guess(5), **registered("pair_auc")},
     own_photos=True,
 )

@@ -14,10 +14,15 @@ from retrieval.metrics.intervals import LEVEL, compare, summarise
 from retrieval.metrics.measure import Measure
 
 RULE = (
-    "A result counts as touch only where its first measure beats two controls, each by more than the interval of the "
-    "paired difference: the same method on blurred touches, and the order of capture in place of the touch."
+    "A result counts as touch only where its first measure beats its controls, each by more than the interval of the "
+    "paired difference: the same method on blurred touches, and the order of capture in place of the touch; where "
+    "touches find touches, also the no-contact frame in place of the touch."
 )
-CONTROL_NAMES = {"differences": "the blurred control", "order_differences": "the order of capture"}
+CONTROL_NAMES = {
+    "differences": "the blurred control",
+    "order_differences": "the order of capture",
+    "untouched_differences": "the no-contact frame alone",
+}
 """Key of a row's paired differences -> what the control is called."""
 STATED_BINS = 10
 
@@ -55,10 +60,13 @@ def _shared(taken: BySeed) -> list[str]:
     return [name for name in taken[0] if all(name in one for one in taken)]
 
 
-def row_entry(protocol: Protocol, touch: BySeed, blurred: BySeed, order: BySeed, summing: Summing) -> dict[str, Any]:
+def row_entry(
+    protocol: Protocol, touch: BySeed, blurred: BySeed, order: BySeed, summing: Summing, untouched: BySeed = ()
+) -> dict[str, Any]:
     """The numbers of a row: measures of touches, of blurred touches, paired differences from the controls, verdict.
 
     blurred is empty for a method that looks at nothing, which has no verdict. order: of the control of that name.
+    untouched: of the no-contact frames alone, where the verdict counts them.
     """
     measures = summing.summaries(touch)
     entry: dict[str, Any] = {"measures": measures, "blurred": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
@@ -66,9 +74,13 @@ def row_entry(protocol: Protocol, touch: BySeed, blurred: BySeed, order: BySeed,
     if blurred:
         entry["blurred"] = summing.summaries(blurred)
         entry |= {
-            key: summing.differences(touch, one) for key, one in zip(CONTROL_NAMES, (blurred, order), strict=True)
+            key: summing.differences(touch, one)
+            for key, one in zip(CONTROL_NAMES, (blurred, order, untouched), strict=True)
+            if one
         }
-        entry["verdict"] = verdict(measures[protocol.main], *(entry[key][protocol.main] for key in CONTROL_NAMES))
+        entry["verdict"] = verdict(
+            measures[protocol.main], *(entry[key][protocol.main] for key in CONTROL_NAMES if entry[key])
+        )
     return entry
 
 
@@ -87,10 +99,11 @@ def control_entry(
 def verdict(summary: Mapping[str, Any], *differences: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a row's main measure counts as touch, and why, in words.
 
-    differences: paired, from each control of `CONTROL_NAMES` in turn; all must lie above 0 with their whole interval.
+    differences: paired, from the first controls of `CONTROL_NAMES` in turn; all must lie above 0 with their whole
+    interval.
     """
     counts = all(one["low"] > 0 for one in differences)
-    found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=True)]
+    found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=False)]
     words = f"{'counts' if counts else 'does not count'} as touch: {'; '.join(found)}"
     above = summary["low"][0] > summary["chance"][0]
     return {"counts_as_touch": counts, "above_chance": bool(above), "words": words}

@@ -265,6 +265,9 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
     assert "pair_accuracy" not in measured  # the miniature has too few validation objects to fit a threshold on
     assert any("64.3" in anchor for anchor in entries["feeling-of-success"]["anchors"])
     for name, entry in entries.items():
+        if name == "physiclear":
+            assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
+            continue
         heads = set() if "references" in name else {"late_fusion", "set_fusion"}
         assert set(entry["rows"]) == {"cca_towers", "cca_pca", "chance"} | heads
 

@@ -1,0 +1,13 @@
+"""HapticMatch: which material's surface was pressed, of materials that nothing has seen."""
+
+from retrieval.evaluation.real.protocol import Protocol, first_guess, registered
+from retrieval.evaluation.real.rct import five_folds
+
+MATERIALS = Protocol(
+    "hapticmatch",
+    "HapticMatch: unseen materials",
+    "Materials are randomly assigned to five folds, again for each seed; all samples of a material stay together. A "
+    "touch is never shown the photo of its own patch, so what must be recognised is the material.",
+    five_folds,
+    {**first_guess(10), **first_guess(5), **registered("pair_auc")},
+)

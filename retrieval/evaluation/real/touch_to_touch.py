@@ -1,0 +1,333 @@
+"""Touch to touch: an object is found by other touches of it, one sequence (such as one press video) left out at a time.
+
+A sequence is one vector: the mean of its touches' tower features, in one of two representations:
+
+    difference      features of the touches, minus those of the no-contact frame
+    common-frame    features of the contact difference (touch minus no-contact frame) on ONE common no-contact frame
+
+Where objects are touched one after the other, the no-contact frame of a sequence names its object by drift. The first
+representation keeps part of that leak, the second one removes what is additive in the picture. A sequence is compared
+with every other one by the cosine of their first principal components; scaling and components are fitted without it.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from _touch_retrieval.files import write_atomically
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.data.images import read_rgb
+from retrieval.errors import DatasetError
+from retrieval.evaluation.real.lines import CONTROLS, Row, Towers, clock, why_not_untouched
+from retrieval.evaluation.real.protocol import TOUCHES, Facts, Protocol
+from retrieval.evaluation.real.verdict import Summing, control_entry, row_entry
+from retrieval.evaluation.shown import Shown
+from retrieval.metrics import protocols
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.registry import Metric, Scored
+from retrieval.metrics.table import ScoreTable
+from retrieval.training.features import Features, encode_recording
+
+COMPONENTS = 60
+REPRESENTATIONS = ("difference", "common-frame")
+FROZEN = "frozen"
+"""What the rows of the configuration's own towers are called."""
+PERMUTED = "the objects of the sequences are permuted: what chance gives"
+
+Vectors = NDArray[np.float64]
+
+MEASURES = {
+    "recall_1": Metric("top-1", "top-1", "real", lambda of: protocols.recall(of.test, 1)),
+    "recall_5": Metric("R@5", "R@5", "real", lambda of: protocols.recall(of.test, 5)),
+    "map": Metric("mAP", "mAP", "real", lambda of: protocols.average_precision(of.test)),
+}
+"""Of sequences that find sequences; the first one decides."""
+
+
+def _no_folds(facts: Facts, seed: int) -> list[Split]:
+    return []
+
+
+@dataclass(frozen=True)
+class TouchToTouch(Protocol):
+    """A protocol without training: sequences of touches ask, and the other sequences are the gallery.
+
+    It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower in one of `REPRESENTATIONS`.
+    """
+
+    folds: Any = _no_folds
+    measures: Mapping[str, Metric] = dataclasses.field(default_factory=lambda: MEASURES)
+    entry: str = TOUCHES
+
+
+def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
+    """Return the cosine of each row's vector with every other's, after principal components that do not know the row.
+
+    Args:
+        vectors: (S, F), a vector for each sequence.
+        components: How many principal components, at most S - 2.
+
+    Returns:
+        (S, S) float32, 0 on the diagonal. Row q: mean, standard deviation and components of all vectors but q.
+    """
+    count = len(vectors)
+    scores = np.zeros((count, count), np.float32)
+    for row in range(count):
+        others = np.arange(count) != row
+        mean, deviation = vectors[others].mean(0), vectors[others].std(0)
+        scaled = (vectors - mean) / np.where(deviation > 1e-9 * max(1.0, np.abs(mean).max()), deviation, np.inf)
+        # Through the Gram matrix: there are fewer sequences than features.
+        gallery = scaled[others]
+        values, directions = np.linalg.eigh(gallery @ gallery.T)
+        kept = np.flatnonzero(values > 1e-9 * max(values[-1], 1e-12))[::-1][: min(components, count - 2)]
+        codes = scaled @ (gallery.T @ (directions[:, kept] / np.sqrt(values[kept])))
+        norms = np.maximum(np.linalg.norm(codes, axis=1), 1e-12)
+        scores[row, others] = (codes[others] @ codes[row]) / (norms[others] * norms[row])
+    return scores
+
+
+@dataclass(frozen=True, eq=False)
+class Sequences:
+    """The sequences of a recording, in the order in which they were recorded. rows: places of each one's grasps."""
+
+    grasps: Sequence[Grasp]
+    names: tuple[str, ...]
+    objects: tuple[str, ...]
+    rows: tuple[NDArray[np.int64], ...]
+
+    @classmethod
+    def of(cls, grasps: Sequence[Grasp]) -> "Sequences":
+        """Group grasps by object and sequence. Raises DatasetError where an object has fewer than two sequences, and
+        for fewer than two objects."""
+        places: dict[tuple[str, str], list[int]] = {}
+        for place, grasp in enumerate(grasps):
+            places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
+        objects = [name for name, _ in places]
+        lonely = sorted({name for name in objects if objects.count(name) < 2})
+        if lonely or len(set(objects)) < 2:
+            raise DatasetError(
+                "touch to touch needs two objects, and two sequences of each; "
+                + (f"{lonely[0]} has one" if lonely else f"there are {len(set(objects))} objects")
+            )
+        rows = tuple(np.array(each, np.int64) for each in places.values())
+        return cls(grasps, tuple(name for _, name in places), tuple(objects), rows)
+
+    @cached_property
+    def owner(self) -> NDArray[np.int64]:
+        """(S,) number of each sequence's object, among the sorted names."""
+        return np.unique(np.array(self.objects), return_inverse=True)[1].astype(np.int64)
+
+    @property
+    def middle(self) -> list[str]:
+        """The grasp that shows each sequence in a report."""
+        return [self.grasps[rows[len(rows) // 2]].grasp_id for rows in self.rows]
+
+    def mean(self, features: NDArray[np.float32]) -> Vectors:
+        """(S, F): the mean over each sequence's grasps of (G, F)."""
+        return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
+
+    def table(self, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None) -> ScoreTable:
+        """Scores (S, S) as a table: every sequence asks, and does not find itself."""
+        owner = self.owner if owner is None else owner
+        words = {"row_words": "sequences", "column_words": "sequences"}
+        return ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), **words)
+
+
+def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
+    """Return the grasps with each contact difference added to one common no-contact frame, as pictures in `folder`.
+
+    The common frame is that of the first grasp. A picture is common + touch - no-contact frame in 8 bits, clipped.
+    Pictures that are there are taken as they are. Raises DatasetError for frames of different sizes.
+    """
+    common = [read_rgb(path) for path in grasps[0].backgrounds]
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    with Bar("one common frame", len(grasps), "grasps", quiet=quiet) as bar:
+        for grasp in grasps:
+            files = []
+            for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
+                path = folder / f"{grasp.grasp_id}-{finger}.png"
+                if not path.is_file():
+                    write_atomically(path, _png(_moved(touch, before, common[finger])))
+                files.append(path)
+            found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
+            bar.advance()
+    return found
+
+
+def _moved(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np.float32]:
+    pressed, untouched = read_rgb(touch), read_rgb(before)
+    if not pressed.shape == untouched.shape == common.shape:
+        raise DatasetError(
+            f"{touch}, its no-contact frame and the first one of the recording must be of one size; got "
+            f"{pressed.shape}, {untouched.shape} and {common.shape}"
+        )
+    return common + pressed - untouched
+
+
+def _png(image: NDArray[np.float32]) -> bytes:
+    """(H, W, 3) in 0..1, red first, as the content of a PNG file."""
+    pixels = np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)
+    return bytes(cv2.imencode(".png", pixels[..., ::-1])[1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Encoder:
+    """The sequences of a recording as the towers of one row see them; each kind of picture is encoded once."""
+
+    sequences: Sequences
+    towers: Towers
+    common: Sequence[Grasp]
+
+    def vectors(self, representation: str, variant: str) -> Vectors:
+        """(S, F) of a representation; variant: "touch", or "blurred" for the low-pass control."""
+        if representation == "common-frame":
+            return self.sequences.mean(self._features(self.common, variant))
+        return self.sequences.mean(self._features(self.sequences.grasps, variant)) - self.untouched(variant)
+
+    def untouched(self, variant: str = "touch") -> Vectors:
+        """(S, F): features of each sequence's no-contact frame, that of its first grasp."""
+        first = [self.sequences.grasps[rows[0]] for rows in self.sequences.rows]
+        frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
+        return self._features(frames, variant).astype(np.float64)
+
+    def _features(self, grasps: Sequence[Grasp], variant: str) -> NDArray[np.float32]:
+        """(G, fingers * F) of these touches; photos are not looked at."""
+        fingers = self.towers.config.matcher.fingers
+        if fingers > 1 and len(grasps[0].touches) == 1:  # a model of two fingers feels with both what one felt
+            grasps = [
+                dataclasses.replace(one, touches=one.touches * fingers, backgrounds=one.backgrounds * fingers)
+                for one in grasps
+            ]
+        ids = tuple(grasp.grasp_id for grasp in grasps)
+        no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
+        towers = self.towers
+        found = encode_recording(
+            grasps,
+            towers.matcher,
+            towers.config,
+            towers.cache,
+            variant=variant,
+            photos_of=no_photos,
+            quiet=towers.quiet,
+        )
+        return found.touch.reshape(len(ids), -1)
+
+
+def touch_to_touch_entry(
+    protocol: TouchToTouch,
+    facts: Facts,
+    rows: Sequence[Row],
+    seeds: Sequence[int],
+    cache: Path,
+    draws: int,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Return the protocol's entry of results.json.
+
+    Args:
+        protocol: What is asked.
+        facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
+        rows: Of these the towers are taken, each once; methods are not fitted.
+        seeds: How often the objects are permuted.
+        cache: Folder for features and for pictures on the common frame.
+        draws: Resamples of an interval.
+        quiet: No progress.
+
+    Raises:
+        DatasetError: Where no-contact frames or second sequences are missing.
+    """
+    sequences = Sequences.of(facts.grasps)
+    if why_not := why_not_untouched(facts.grasps):
+        raise DatasetError(f"touch to touch needs the no-contact frame of each sequence: {why_not}")
+    digest = data_digest(facts.grasps)
+    common = with_common_frame(facts.grasps, cache / "common-frame" / digest[:32], quiet=quiet)
+    summing = Summing(draws, seeds[0])
+    order = _measures(protocol, sequences, clock(len(sequences.names)).astype(np.float64))
+    entries: dict[str, Any] = {}
+    controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
+    shown: tuple[str, ScoreTable] | None = None
+    frozen: dict[str, dict[str, Measure]] = {}
+    for label, towers in _towers(rows):
+        encoder = _Encoder(sequences, towers, common)
+        untouched = _measures(protocol, sequences, encoder.untouched())
+        controls.setdefault("untouched", [untouched])
+        for representation in REPRESENTATIONS:
+            name = f"{label}-{representation}"
+            table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
+            blurred = _measures(protocol, sequences, encoder.vectors(representation, "blurred"))
+            measured = _taken(protocol, table)
+            model = towers.checkpoint
+            first = frozen.setdefault(representation, measured)
+            entries[name] = {
+                "method": "nearest",
+                "model": model.digest if model else None,
+                **row_entry(protocol, [measured], [blurred], [order], summing, [untouched]),
+                "tower_differences": None if first is measured else summing.differences([measured], [first]),
+                "reliability": {},
+                "chosen": [],
+            }
+            controls.setdefault("permuted", list(_permuted(protocol, sequences, table.scores, seeds)))
+            shown = shown or (name, table)
+    assert shown is not None
+    objects = sorted(set(sequences.objects))
+    examples = Shown(shown[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
+    return {
+        "title": protocol.title,
+        "rule": protocol.rule,
+        "anchors": list(protocol.anchors),
+        "main": protocol.main,
+        "labels": [[name, metric.label] for name, metric in protocol.measures.items()],
+        "entry": protocol.entry,
+        "unit": "object",
+        "recording": {
+            "data_set": protocol.data_set,
+            "source": facts.source,
+            "digest": digest,
+            "objects": len(objects),
+            "grasps": len(facts.grasps),
+        },
+        "folds": [[{"test": [name]} for name in sequences.names]],
+        "rows": entries,
+        "controls": {
+            name: control_entry(protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, taken, summing)
+            for name, taken in controls.items()
+        },
+        "examples": {"row": shown[0], **examples},
+    }
+
+
+def _towers(rows: Sequence[Row]) -> Iterator[tuple[str, Towers]]:
+    """The towers under the rows, each once, and what they are called."""
+    seen: list[Towers] = []
+    for row in rows:
+        if not any(row.towers is one for one in seen):
+            seen.append(row.towers)
+            yield (row.name if row.towers.checkpoint else FROZEN), row.towers
+
+
+def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:
+    return _taken(protocol, sequences.table(leave_one_out_scores(vectors)))
+
+
+def _taken(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
+    """The measures of a table, queries in the order of their objects."""
+    found = {name: metric.take(Scored(table, table, {}, None, 0)) for name, metric in protocol.measures.items()}
+    same = {int(name): int(name) for name in table.objects}
+    return {name: pooled([one], [same]) for name, one in found.items() if one is not None}
+
+
+def _permuted(
+    protocol: Protocol, sequences: Sequences, scores: NDArray[np.float32], seeds: Sequence[int]
+) -> Iterator[dict[str, Measure]]:
+    for seed in seeds:
+        owner = np.random.default_rng([seed, 41]).permutation(sequences.owner)
+        yield _taken(protocol, sequences.table(scores, owner))

@@ -1,0 +1,110 @@
+"""HapticMatch: height maps of a GelSight Mini on surfaces of materials, each with a close photo of the same patch.
+
+    Texture/<material>/<k>.jpg    the photo of the patch, 320 x 240
+    Texture/<material>/<k>.pkl    the height map, a pickled NumPy array, which is read without unpickling
+
+A material is an object and a sequence; a sample is a grasp. There is no gel image: the touch is made of the height map,
+a picture of its normals. Red is the slope across, green the slope down, blue the rest; a flat surface is (128, 128,
+255). Slopes are of heights in pixels; the option `scale` multiplies them.
+"""
+
+import re
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Item, Progress, Skip, folders, import_items, name_of, numbered
+from robot.importers.pickled_arrays import MAX_BYTES, read_array
+from robot.recording.folder import Recording
+from robot.storage import content_of
+
+DATA_SET = DataSet(
+    source="HapticMatch",
+    licence="not stated in its files; see github.com/MXMX0811/GelSight_Texture_Dataset",
+    citation="Zhang, Yao, Makino, Shinoda, Sugiyama, HapticMatch: An Exploration for Generative Material Haptic "
+    "Simulation and Interaction, arXiv 2601.16639",
+    sensor="GelSight Mini, height maps",
+    rig="by hand; a camera at the same patch",
+    expects="`Texture/<material>/<k>.jpg` and `<k>.pkl`, or be `Texture` itself",
+    traps=(
+        "The touch is a picture of the normals of a height map, not a gel image: a model that is trained on gel images "
+        "does not know it.",
+        "The samples of a material were captured in one sitting, and there is no no-contact frame: drift of the sensor "
+        "may name the material. Print the low-pass control and the order of capture beside every result.",
+    ),
+    unverified=(
+        "everything but the names of the files and the authors' program that saved them: this importer was not run on "
+        "the real data",
+        "the unit of the heights; slopes take them for pixels",
+        "that a photo and its height map show the same patch in the same direction",
+    ),
+)
+_HEIGHTS = re.compile(r"(\d{1,9})\.pkl", re.IGNORECASE)
+_MAX_SIDE = 4096
+
+
+def import_hapticmatch(src: Path, out: Path, progress: Progress | None = None, *, scale: float = 1.0) -> Recording:
+    """Import the samples below `src`. Raises ImporterError where there is none."""
+    src = Path(src)
+    if not 0 < scale < float("inf"):
+        raise ImporterError(f"scale must be above 0 and finite, got {scale:g}")
+    root = src / "Texture" if (src / "Texture").is_dir() else src
+    if not root.is_dir():
+        raise DATA_SET.refusal(src, "it is no folder")
+    materials = [(folder, numbered(folder, _HEIGHTS)) for folder in folders(root)]
+    if not (total := sum(len(samples) for _, samples in materials)):
+        raise DATA_SET.refusal(src, "it holds no such height map")
+    items = (item for folder, samples in materials for item in _items(folder.name, samples, scale))
+    return import_items(DATA_SET, items, out, total=total, progress=progress)
+
+
+def _items(material: str, samples: Any, scale: float) -> Iterator[Item | Skip]:
+    sequence = name_of(material)
+    for match, path in samples:
+        images = {"photo": path.with_name(f"{match[1]}.jpg"), "touch_a": partial(_touch, path, scale)}
+        yield Item(name_of(material, match[1]), material, images, {"sequence_id": sequence})
+
+
+def _touch(path: Path, scale: float) -> NDArray[np.uint8]:
+    """The picture of a height map. Raises ImporterError, which says no file's name."""
+    try:
+        too_large = path.stat().st_size > MAX_BYTES
+        data = b"" if too_large else content_of(path, ImporterError)
+    except (OSError, ImporterError) as error:
+        raise ImporterError("its height map cannot be read") from error
+    if too_large:
+        raise ImporterError(f"its height map has more than {MAX_BYTES:,} bytes")
+    try:
+        heights = read_array(data)
+    except ImporterError as error:
+        raise ImporterError(f"its height map cannot be read: {error}") from error
+    return normals(heights, scale)
+
+
+def normals(heights: NDArray[Any], scale: float = 1.0) -> NDArray[np.uint8]:
+    """Return the normals of a height map as a picture.
+
+    Args:
+        heights: (H, W), in pixels, downwards first.
+        scale: What the heights are multiplied by.
+
+    Returns:
+        (H, W, 3) uint8; 128 in red and green where the surface is flat.
+
+    Raises:
+        ImporterError: For another shape, and for heights that are not finite.
+    """
+    if heights.ndim != 2 or min(heights.shape) < 2 or max(heights.shape) > _MAX_SIDE:
+        raise ImporterError(f"its height map must have two sides of 2 to {_MAX_SIDE} pixels")
+    if heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
+        raise ImporterError("its height map must hold finite numbers")
+    with np.errstate(over="ignore"):
+        down, across = np.gradient(np.clip(heights.astype(np.float64), -1e12, 1e12) * scale)
+    steep = np.sqrt(1 + down**2 + across**2)
+    picture = np.stack([-across / steep, -down / steep, 1 / steep], axis=2)
+    return np.clip(np.rint(127.5 * (picture + 1)), 0, 255).astype(np.uint8)

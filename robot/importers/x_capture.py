@@ -1,0 +1,77 @@
+"""X-Capture: DIGIT-like touches, photos, depth and force at points of everyday objects, captured in the wild.
+
+    <object>/<point>/<point>_rgb.png             the photo of the point
+    <object>/<point>/<point>_10N_tactile.png     the touch, at 10 N
+    <object>/<point>/<point>_depth.png           depth at the camera
+
+An object is a folder, a point a grasp; the points of an object are one sequence. The force of a touch is the one in its
+file's name. The readings of force, acceleration and sound are not opened. Depth is kept where it is a picture of 16
+bits.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from robot.errors import ImporterError
+from robot.importers.base import DataSet, Images, Item, Progress, Skip, folders, import_items, name_of, numbered
+from robot.recording.folder import Recording
+from robot.storage import content_of, decoded
+
+DATA_SET = DataSet(
+    source="X-Capture",
+    licence="as xcapture.github.io says",
+    citation="X-Capture: An Open-Source Portable Device for Multi-Sensory Learning, ICCV 2025",
+    sensor="DIGIT-like",
+    rig="by hand, a portable device",
+    expects="`<object>/<point>/<point>_<force>N_tactile.png` and `<point>_rgb.png`",
+    traps=(
+        "No no-contact frame is there, and an object was captured in one sitting: light and gel of it may name the "
+        "object. Print the order of capture and the low-pass control beside every result.",
+    ),
+    unverified=(
+        "everything but the names of the files of a few published example objects: this importer was not run on the "
+        "real data",
+        "that depth is in millimetre",
+        "that the photo of a point is taken before its touch",
+    ),
+)
+_TOUCH = re.compile(r"(?P<point>.+)_(?P<force>\d{1,3})N_tactile\.png", re.IGNORECASE)
+
+
+def import_x_capture(src: Path, out: Path, progress: Progress | None = None) -> Recording:
+    """Import the points below `src`. Raises ImporterError where there is none."""
+    src = Path(src)
+    if not src.is_dir():
+        raise DATA_SET.refusal(src, "it is no folder")
+    points = [point for each in folders(src) for point in folders(each) if len(numbered(point, _TOUCH))]
+    if not points:
+        raise DATA_SET.refusal(src, "it holds no such touch")
+    total = sum(len(numbered(point, _TOUCH)) for point in points)
+    return import_items(DATA_SET, _items(points), out, total=total, progress=progress)
+
+
+def _items(points: list[Path]) -> Iterator[Item | Skip]:
+    for point in points:
+        object_id = point.parent.name
+        for match, touch in numbered(point, _TOUCH):
+            name = name_of(object_id, point.name, f"{match['force']}N")
+            depth = _depth(point / f"{match['point']}_depth.png")
+            images: Images = {"photo": point / f"{match['point']}_rgb.png", "touch_a": touch, **depth}
+            yield Item(name, object_id, images, {"sequence_id": object_id, "force_n": float(match["force"])})
+
+
+def _depth(path: Path) -> Images:
+    """The depth picture where it is one of 16 bits and one channel; a grasp without depth is as good."""
+    import cv2
+
+    if not path.is_file():
+        return {}
+    try:
+        data = content_of(path, ImporterError)
+    except ImporterError:
+        return {}
+    image = decoded(data, cv2.IMREAD_UNCHANGED)
+    return {"depth": image} if image is not None and image.ndim == 2 and image.dtype == np.uint16 else {}

@@ -1,0 +1,28 @@
+"""HapticMatch: three materials of four samples, one height map without a photo and one folder that holds no sample."""
+
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tests.miniatures import picture
+
+MATERIALS, SAMPLES = ("AbsorbentMat1", "Denim", "RubberPlate3"), (1, 2, 9, 10)
+GRASPS = len(MATERIALS) * len(SAMPLES)
+
+
+def heights(seed: int) -> np.ndarray:
+    """(24, 32) float64: ridges of a pitch and direction of their own."""
+    rows, columns = np.mgrid[:24, :32].astype(np.float64)
+    return np.sin(rows * (0.3 + 0.1 * (seed % 7)) + columns * 0.05 * (seed % 5) + seed)
+
+
+def write(folder: Path, materials: Sequence[str] = MATERIALS) -> None:
+    for number, material in enumerate(materials):
+        at = folder / "Texture" / material
+        for sample in SAMPLES:
+            picture(at / f"{sample}.jpg", 100 * number + sample, (24, 32))
+            (at / f"{sample}.pkl").write_bytes(pickle.dumps(heights(100 * number + sample), protocol=4))
+    (folder / "Texture" / materials[0] / "11.pkl").write_bytes(pickle.dumps(heights(1), protocol=4))
+    picture(folder / "Texture" / "Removed" / "preview.png", 3)

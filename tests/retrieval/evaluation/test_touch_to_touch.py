@@ -1,0 +1,219 @@
+"""Touch to touch: the left-out sequence is known to nothing, the common frame takes the leak away, controls stand."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from retrieval.commands.main import main
+from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.images import read_rgb
+from retrieval.errors import DatasetError
+from retrieval.evaluation.real.touch_to_touch import Sequences, leave_one_out_scores, with_common_frame
+from retrieval.metrics import protocols
+from robot.importers.physiclear import import_physiclear
+from tests.miniatures import physiclear
+
+RNG = np.random.default_rng(3)
+
+
+# Scores ----------------------------------------------------------------------------------------------------
+
+
+def by_plain_loops(vectors, components):
+    """Standardise and find components by an SVD without row q; then a cosine at a time."""
+    scores = np.zeros((len(vectors), len(vectors)))
+    for q in range(len(vectors)):
+        others = np.delete(vectors, q, axis=0)
+        mean, deviation = others.mean(0), others.std(0)
+        axes = np.linalg.svd((others - mean) / deviation, full_matrices=False)[2][:components]
+        codes = (vectors - mean) / deviation @ axes.T
+        for other in range(len(vectors)):
+            if other != q:
+                length = np.linalg.norm(codes[q]) * np.linalg.norm(codes[other])
+                scores[q, other] = codes[q] @ codes[other] / length
+    return scores
+
+
+@pytest.mark.parametrize("components", [1, 3, 8])
+def test_scores_are_cosines_of_principal_components_that_do_not_know_the_row(components):
+    vectors = RNG.normal(size=(11, 20)) * np.linspace(0.1, 30, 20) + 5
+    np.testing.assert_allclose(
+        leave_one_out_scores(vectors, components), by_plain_loops(vectors, components), atol=1e-5
+    )
+
+
+def test_components_of_all_rows_would_know_the_row_that_asks():
+    """The naive way: noise alone, 30 sequences; components fitted with the query change its scores."""
+    vectors = RNG.normal(size=(30, 200))
+    scaled = (vectors - vectors.mean(0)) / vectors.std(0)
+    codes = scaled @ np.linalg.svd(scaled, full_matrices=False)[2][:20].T
+    codes /= np.linalg.norm(codes, axis=1, keepdims=True)
+    naive = codes @ codes.T
+    strict = leave_one_out_scores(vectors, 20)
+    off = ~np.eye(30, dtype=bool)
+    assert np.abs(naive - strict)[off].max() > 0.1
+
+
+def test_a_feature_that_never_changes_and_vectors_that_are_all_equal_say_nothing():
+    vectors = RNG.normal(size=(8, 5))
+    flat = np.concatenate([vectors, np.full((8, 2), 1e6)], axis=1)
+    np.testing.assert_allclose(leave_one_out_scores(flat, 3), leave_one_out_scores(vectors, 3), atol=1e-5)
+    assert not leave_one_out_scores(np.full((8, 5), 0.3), 3).any()
+
+
+def test_vectors_that_say_nothing_get_exactly_chance():
+    """Three objects of two videos: a random order has the one right video of five first in 1 of 5."""
+    sequences = Sequences.of(grasps({"a": 2, "b": 2, "c": 2}))
+    measure = protocols.recall(sequences.table(leave_one_out_scores(np.zeros((6, 4)))), 1)
+    assert measure.values.ravel().tolist() == [pytest.approx(0.2)] * 6
+    assert measure.chance.tolist() == [pytest.approx(0.2)]
+
+
+# Sequences -------------------------------------------------------------------------------------------------
+
+
+def grasps(counts, frames=2):
+    return [
+        Grasp(
+            f"{name}-{video}-{frame}",
+            name,
+            f"{name}-{video}",
+            Path("p"),
+            (Path(f"{name}{video}{frame}"),),
+            (Path("u"),),
+        )
+        for name, count in counts.items()
+        for video in range(count)
+        for frame in range(frames)
+    ]
+
+
+def test_a_sequence_is_the_mean_of_its_own_grasps():
+    sequences = Sequences.of(grasps({"a": 2, "b": 2}))
+    assert sequences.names == ("a-0", "a-1", "b-0", "b-1")
+    assert sequences.owner.tolist() == [0, 0, 1, 1]
+    features = np.arange(8, dtype=np.float32)[:, None]
+    assert sequences.mean(features).ravel().tolist() == [0.5, 2.5, 4.5, 6.5]
+    assert sequences.middle == ["a-0-1", "a-1-1", "b-0-1", "b-1-1"]
+
+
+@pytest.mark.parametrize(("counts", "said"), [({"a": 2, "b": 1}, "b has one"), ({"a": 3}, "there are 1 objects")])
+def test_an_object_of_one_sequence_and_one_object_alone_cannot_be_asked(counts, said):
+    with pytest.raises(DatasetError, match=said):
+        Sequences.of(grasps(counts))
+
+
+def test_a_sequence_never_finds_itself():
+    sequences = Sequences.of(grasps({"a": 2, "b": 2}))
+    scores = np.eye(4, dtype=np.float32)
+    assert protocols.recall(sequences.table(scores), 1).values.ravel().tolist() == [pytest.approx(1 / 3)] * 4
+
+
+# The common no-contact frame -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """The miniature as a recording: 2 parts, 3 videos each; the gel's colour names the part."""
+    folder = tmp_path_factory.mktemp("physiclear")
+    physiclear.write(folder / "data" / "physiclear")
+    import_physiclear(folder / "data" / "physiclear", folder / "recording")
+    return folder
+
+
+def test_on_the_common_frame_is_the_contact_difference_and_nothing_else(recording, tmp_path):
+    own = load_grasps(recording / "recording")
+    moved = with_common_frame(own, tmp_path / "common")
+    common = np.rint(255 * read_rgb(own[0].backgrounds[0]))
+    for before, after in zip(own, moved, strict=True):
+        touch, rest = (np.rint(255 * read_rgb(path)) for path in (before.touches[0], before.backgrounds[0]))
+        wanted = np.clip(common + touch - rest, 0, 255)
+        np.testing.assert_array_equal(np.rint(255 * read_rgb(after.touches[0])), wanted)
+        assert after.backgrounds == own[0].backgrounds
+
+
+def test_drift_that_names_the_object_is_gone_on_the_common_frame(tmp_path):
+    """Planted: touches without contact on gels of each object's own colour. Each picture becomes the common frame."""
+    made = []
+    for number in range(3):
+        for video in range(2):
+            path = tmp_path / f"{number}-{video}.png"
+            cv2.imwrite(str(path), np.full((6, 8, 3), 60 + 40 * number, np.uint8))
+            made.append(Grasp(f"{number}-{video}", f"o{number}", f"{number}-{video}", path, (path,), (path,)))
+    moved = with_common_frame(made, tmp_path / "common")
+    assert {read_rgb(one.touches[0]).tobytes() for one in moved} == {read_rgb(made[0].touches[0]).tobytes()}
+
+
+def test_pictures_that_are_there_are_not_made_again(recording, tmp_path, monkeypatch):
+    own = load_grasps(recording / "recording")[:4]
+    with_common_frame(own, tmp_path / "common")
+    monkeypatch.setattr("retrieval.evaluation.real.touch_to_touch.write_atomically", None)
+    with_common_frame(own, tmp_path / "common")
+
+
+def test_frames_of_two_sizes_are_refused(recording, tmp_path):
+    own, small = load_grasps(recording / "recording")[:1], tmp_path / "small.png"
+    cv2.imwrite(str(small), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(DatasetError, match="must be of one size"):
+        with_common_frame([*own, dataclasses.replace(own[0], grasp_id="x", touches=(small,))], tmp_path / "other")
+
+
+# The protocol ----------------------------------------------------------------------------------------------
+
+
+def benchmark(recording, out, *more):
+    asked = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
+    return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *asked])
+
+
+@pytest.fixture(scope="module")
+def out(recording, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "report"
+    assert benchmark(recording, folder) == 0
+    return folder
+
+
+def test_each_representation_has_its_low_pass_and_three_controls_that_decide(out):
+    entry = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]
+    assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
+    for row in entry["rows"].values():
+        assert (row["measures"]["recall_1"]["queries"], row["measures"]["recall_1"]["objects"]) == (6, 2)
+        assert row["measures"]["recall_1"]["chance"][0] == pytest.approx(2 / 5)  # two of five other videos
+        lows = [row[key]["recall_1"]["low"] for key in ("differences", "order_differences", "untouched_differences")]
+        assert row["verdict"]["counts_as_touch"] == all(low > 0 for low in lows)
+        assert "the no-contact frame alone" in row["verdict"]["words"]
+        assert row["tower_differences"] is None
+    assert set(entry["controls"]) == {"untouched", "order", "permuted"}
+    assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2
+    # Gels of each part's own colour: the untouched frame finds the part, and so does a clock within it.
+    assert entry["controls"]["untouched"]["measures"]["recall_1"]["value"][0] == 1.0
+    assert entry["controls"]["order"]["measures"]["recall_1"]["value"][0] >= 2 / 3
+
+
+def test_the_report_shows_touches_that_find_touches(out):
+    text = (out / "report.md").read_text().replace("\\", "")
+    for words in ("one video left out", "control: permuted", "frozen-common-frame", "the best touch of each object"):
+        assert words in text
+    assert (out / "figures" / "physiclear-best.jpg").is_file()
+
+
+def test_a_second_run_comes_out_the_same_to_the_byte(recording, out):
+    before = (out / "results.json").read_bytes()
+    assert benchmark(recording, out) == 0
+    assert (out / "results.json").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_shipped_model_is_called_by_its_name_and_compared_with_the_frozen_towers(recording, out):
+    assert benchmark(recording, out, "--model", "shipped=shipped-one-finger") == 0
+    rows = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]["rows"]
+    for representation in ("difference", "common-frame"):
+        mine, frozen = (rows[f"{name}-{representation}"] for name in ("shipped", "frozen"))
+        by_hand = mine["measures"]["map"]["value"][0] - frozen["measures"]["map"]["value"][0]
+        assert mine["tower_differences"]["map"]["difference"] == pytest.approx(by_hand)
+        assert mine["model"]
+    assert "points over the first tower" in (out / "report.md").read_text()

@@ -1,0 +1,88 @@
+"""PhysiCLeAR: what is its own; what holds of every importer stands in test_importers."""
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.errors import ImporterError
+from robot.importers.physiclear import Press, import_physiclear
+from tests.data import touch_data
+from tests.miniatures import physiclear
+
+pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+
+
+@pytest.fixture
+def source(tmp_path):
+    physiclear.write(tmp_path / "src")
+    return tmp_path / "src"
+
+
+def pixels(recording, path):
+    return cv2.imread(str(recording.folder / path)).astype(float)
+
+
+def test_a_part_is_an_object_and_a_video_a_sequence_of_five_frames(source, tmp_path):
+    recording = import_physiclear(source, tmp_path / "out")
+    found = [(grasp.grasp_id, grasp.object_id, grasp.sequence_id) for grasp in recording.grasps]
+    assert found[:6] == [(f"apple_0-{place}", "apple", "apple_0") for place in range(1, 6)] + [
+        ("apple_1-1", "apple", "apple_1")
+    ]
+    assert {name for _, name, _ in found} == set(physiclear.PARTS)
+
+
+def test_the_frames_of_strongest_contact_are_kept_in_order_of_time_with_the_first_frame_as_no_contact_frame(tmp_path):
+    """Contact rises to frame 6 of 12 and falls: frames 4 to 8 differ most from frame 0."""
+    physiclear.write_video(tmp_path / "pen_0.mov", physiclear.presses(0, 0))
+    press = Press(tmp_path / "pen_0.mov", 5)
+    made = physiclear.presses(0, 0)
+    for place, frame in enumerate((4, 5, 6, 7, 8)):
+        assert np.abs(press.frame(place).astype(float) - made[frame]).mean() < 3  # the codec's loss
+        others = [
+            np.abs(press.frame(place).astype(float) - made[other]).mean() for other in (3, 6, 9) if other != frame
+        ]
+        assert min(others) > np.abs(press.frame(place).astype(float) - made[frame]).mean() or frame in (4, 8)
+    assert np.abs(press.untouched().astype(float) - made[0]).mean() < 3
+
+
+def test_the_no_contact_frame_of_a_video_is_kept_once_and_is_not_that_of_another(source, tmp_path):
+    recording = import_physiclear(source, tmp_path / "out")
+    before = {grasp.sequence_id: grasp.touches_before["a"] for grasp in recording.grasps}
+    assert len(set(before.values())) == len(before) == 6
+    for grasp in recording.grasps:
+        assert grasp.touches_before["a"] == before[grasp.sequence_id]
+    one, other = (pixels(recording, before[name]) for name in ("apple_0", "usb_3_plug_0"))
+    assert np.median(other - one) == pytest.approx(8, abs=2)
+
+
+def test_without_photos_the_gel_image_stands_in_its_place_as_one_file(source, tmp_path):
+    recording = import_physiclear(source, tmp_path / "out")
+    assert all(grasp.photo == grasp.touches["a"] for grasp in recording.grasps)
+    assert len(list((recording.folder / "images").iterdir())) == physiclear.GRASPS + 6
+    assert any("no photos" in note for note in recording.notes)
+
+
+def test_the_repositorys_own_folder_is_found_and_the_option_says_how_many_frames(source, tmp_path):
+    (tmp_path / "clone").mkdir()
+    source.rename(tmp_path / "clone" / "dataset")
+    recording = import_physiclear(tmp_path / "clone", tmp_path / "out", frames=2)
+    assert len(recording.grasps) == 2 * 6
+    with pytest.raises(ImporterError, match="frames must be at least 1, got 0"):
+        import_physiclear(tmp_path / "clone", tmp_path / "out2", frames=0)
+
+
+def test_a_video_too_short_or_without_change_costs_its_own_grasps(source, tmp_path):
+    physiclear.write_video(source / "apple_0.mov", physiclear.presses(0, 0)[:4])
+    physiclear.write_video(source / "apple_1.mov", [np.full((48, 64, 3), 90, np.uint8)] * 8)
+    recording = import_physiclear(source, tmp_path / "out")
+    assert recording.info["skipped"] == {
+        "its video has 4 frames, fewer than 6": 5,
+        "its video has too few frames that differ from the first one": 5,
+    }
+
+
+@pytest.mark.slow
+def test_the_real_videos_import_whole(tmp_path):
+    recording = import_physiclear(touch_data("physiclear"), tmp_path / "out")
+    assert len(recording.grasps) == 241 * 5
+    assert len({grasp.object_id for grasp in recording.grasps}) == 44
