@@ -92,7 +92,7 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
     for part in parts:
         for each in kinds:
             _require_known(part, each, name, complete)
-    if not is_dataclass(kind) or not isinstance(document, Mapping):
+    if not (isinstance(kind, type) and is_dataclass(kind) and isinstance(document, Mapping)):
         return
     known = _hints(kind)
     if complete and (lacking := [key for key in known if key not in document]):
