@@ -139,6 +139,17 @@ def folder_pairs(src: Path, rows: int) -> Options:
     return {"pairs": "pairs.csv"}
 
 
+def hapticmatch(src: Path, rows: int) -> Options:
+    from tests.miniatures.hapticmatch import write_sample
+
+    material = src / ".material"
+    for k in range(100):
+        write_sample(material, k, seed=k)
+    for number in range(rows // 100):
+        link(src / "Texture" / f"M{number}", material)
+    return {}
+
+
 def lerobot(src: Path, rows: int) -> Options:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -192,6 +203,16 @@ def open_x_tactile(src: Path, rows: int) -> Options:
         chunks = (min(100, len(values)), *values.shape[1:]) if values.ndim > 1 else values.shape
         group.create_array(name.split("/")[1], shape=values.shape, chunks=chunks, dtype=values.dtype)[...] = values
     return {}
+
+
+def physiclear(src: Path, rows: int) -> Options:
+    from tests.miniatures.physiclear import presses, write_video
+
+    film = src / ".press.mov"
+    write_video(film, presses(0, 0, frames=130))
+    for number in range(rows // 100):
+        link(src / f"part{number // 5}_{number % 5}.mov", film)
+    return {"frames": 100}
 
 
 def rct(src: Path, rows: int) -> Options:
@@ -277,6 +298,14 @@ def vt60(src: Path, rows: int) -> Options:
     return {}
 
 
+def x_capture(src: Path, rows: int) -> Options:
+    one = src / ".point"
+    pictures(one, ["p_rgb.png", *(f"p_{newton}N_tactile.png" for newton in range(100))])
+    for number in range(rows // 100):
+        link(src / f"object{number // 10}" / str(number % 10), one)
+    return {}
+
+
 def ycb_slide(src: Path, rows: int) -> Options:
     names = [f"frame_{frame:07}.jpg" for frame in range(100)]
     log = pictures(src / ".log" / "frames", names).parent
@@ -291,15 +320,18 @@ WIDE: Mapping[str, Callable[[Path, int], Options]] = {
     "feeling-of-success": feeling_of_success,
     "folder": folder,
     "folder (pairs)": folder_pairs,
+    "hapticmatch": hapticmatch,
     "lerobot": lerobot,
     "objectfolder": objectfolder,
     "open-x-tactile": open_x_tactile,
+    "physiclear": physiclear,
     "rct": rct,
     "ssvtp": ssvtp,
     "touch-and-go": touch_and_go,
     "tvl": tvl,
     "visgel": visgel,
     "vt60": vt60,
+    "x-capture": x_capture,
     "ycb-slide": ycb_slide,
 }
 """Importer -> draws so many rows below a folder; returns the importer's options. Rows come in whole folders: 1,000s."""

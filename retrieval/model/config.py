@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
@@ -120,7 +120,7 @@ class TrainingConfig:
     validate_every: Count = 500
     precision: str = "auto"
     seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
-    workers: Count | Literal["auto"] = field(default="auto", compare=False)
+    workers: Count | str = field(default="auto", compare=False)
     prefetch: Count = field(default=2, compare=False)
     pinned_memory: bool = field(default=True, compare=False)
 
@@ -131,6 +131,8 @@ class TrainingConfig:
             weights[name] = typed(weight, Weight, f"training.{name}{WEIGHT}", error=ConfigError)
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
+        auto = not isinstance(self.workers, str) or self.workers == "auto"
+        _require(auto, f'training.workers must be "auto" or a whole number >= 1, got {self.workers!r}')
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
             _require(value in known, f"training.{name} must be one of {', '.join(known)}, got {value!r}")

@@ -22,7 +22,11 @@ def write(folder: Path, materials: Sequence[str] = MATERIALS) -> None:
     for number, material in enumerate(materials):
         at = folder / "Texture" / material
         for sample in SAMPLES:
-            picture(at / f"{sample}.jpg", 100 * number + sample, (24, 32))
-            (at / f"{sample}.pkl").write_bytes(pickle.dumps(heights(100 * number + sample), protocol=4))
+            write_sample(at, sample, 100 * number + sample)
     (folder / "Texture" / materials[0] / "11.pkl").write_bytes(pickle.dumps(heights(1), protocol=4))
     picture(folder / "Texture" / "Removed" / "preview.png", 3)
+
+
+def write_sample(folder: Path, sample: int, seed: int) -> None:
+    picture(folder / f"{sample}.jpg", seed, (24, 32))
+    (folder / f"{sample}.pkl").write_bytes(pickle.dumps(heights(seed), protocol=4))

@@ -15,6 +15,7 @@ import typer
 
 from benchmarks.reference import COMMANDS
 from benchmarks.reference import commands as commands_page
+from retrieval import load_config
 from retrieval.commands.main import main
 from retrieval.model.towers import build_tower
 from retrieval.search.query.answer import EXIT_CODES
@@ -112,13 +113,16 @@ def test_nothing_stands_in_a_shell_block_that_no_test_runs():
     assert {line[0] for line in commands()} == {"make", "retrieve", "python", "pip"}
 
 
-def test_the_settings_of_the_pages_make_a_rig(tmp_path, monkeypatch):
+def test_the_settings_of_the_pages_make_a_rig_or_a_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text(POINTS)
     assert main(["rig", "calibrate", "points.csv"]) == 0
     kinds = []
     for number, block in enumerate(blocks("toml")):
         (tmp_path / f"{number}.toml").write_text(block)
+        if "training" in tomllib.loads(block):
+            load_config(str(tmp_path / f"{number}.toml"))
+            continue
         rig = load_rig(str(tmp_path / f"{number}.toml"), seed=0)
         assert len(rig.object_ids(1)) == 1
         kinds.append(tomllib.loads(block)["rig"])

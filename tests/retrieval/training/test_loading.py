@@ -87,11 +87,11 @@ def test_a_file_sets_the_loader_and_a_checkpoint_says_nothing_of_it(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"workers": 0}, 'workers must be "auto" or at least 1; got 0'),
-        ({"workers": "many"}, "workers must be \"auto\" or at least 1; got 'many'"),
-        ({"workers": True}, "training.workers must be of type int or str; got True"),
-        ({"prefetch": 0}, "prefetch must be at least 1; got 0"),
-        ({"pinned_memory": 1}, "training.pinned_memory must be of type bool; got 1"),
+        ({"workers": 0}, "training.workers must be a whole number >= 1, got 0"),
+        ({"workers": "many"}, "training.workers must be \"auto\" or a whole number >= 1, got 'many'"),
+        ({"workers": True}, "training.workers must be a whole number or a text in quotes, got True"),
+        ({"prefetch": 0}, "training.prefetch must be a whole number >= 1, got 0"),
+        ({"pinned_memory": 1}, "training.pinned_memory must be true or false, got 1"),
     ],
 )
 def test_a_wrong_setting_of_the_loader_is_refused(settings, said):
