@@ -1,5 +1,6 @@
 """Plain documents, as JSON and TOML give them, as typed values: msgspec checks, this words its refusals."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -31,8 +32,8 @@ def typed(
     """Return a plain document as a value of a type.
 
     Lists become tuples and whole numbers become floats where the type says so, a scalar of numpy becomes a number;
-    nothing else is converted. A table with
-    a key that its dataclass does not have is refused, and so is a number that is not finite or not within 64 bits.
+    nothing else is converted. A table with a key that its dataclass does not have is refused, and so are numbers that
+    are not finite and whole numbers beyond 64 bits.
 
     Args:
         document: What `json.loads` or `tomllib.loads` returns, or a part of it.
@@ -104,9 +105,12 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
 
 
 def _require_finite(document: Any, name: str) -> None:
-    if isinstance(document, int | float):
-        if not abs(document) < 2**63:  # also refuses NaN
-            raise ValueError(f"{name or 'it'} must be a finite number, within 64 bits, got {str(document)[:40]}")
+    if isinstance(document, float):
+        if not math.isfinite(document):
+            raise ValueError(f"{name or 'it'} must be a finite number, got {document}")
+    elif isinstance(document, int):
+        if not abs(document) < 2**63:
+            raise ValueError(f"{name or 'it'} must fit into 64 bits, got {str(document)[:40]}")
     elif isinstance(document, Mapping):
         for key, value in document.items():
             _require_finite(value, f"{name}.{key}" if name else str(key))

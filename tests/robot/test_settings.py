@@ -48,9 +48,9 @@ def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken()
         ({"port": "a", "box": 3}, r"\[thing\]: box must be a list, got 3"),
         ({"port": "a", "names": ["b", 3]}, r"\[thing\]: names\[1\] must be a text in quotes, got 3"),
         ({"port": "a", "exposure": "long"}, r"\[thing\]: exposure must be a whole number or nothing, got 'long'"),
-        ({"port": "a", "rate": float("nan")}, r"\[thing\]: rate must be a finite number, within 64 bits, got nan"),
-        ({"port": "a", "box": [1, float("inf")]}, r"\[thing\]: box must be a finite number, within 64 bits, got inf"),
-        ({"port": "a", "tries": 10**400}, r"\[thing\]: tries must be a finite number, within 64 bits, got 1000"),
+        ({"port": "a", "rate": float("nan")}, r"\[thing\]: rate must be a finite number, got nan"),
+        ({"port": "a", "box": [1, float("inf")]}, r"\[thing\]: box must be a finite number, got inf"),
+        ({"port": "a", "tries": 10**400}, r"\[thing\]: tries must fit into 64 bits, got 1000"),
         ({"port": "a", "table": 3}, r"\[thing\]: table must be a table, got 3"),
     ],
 )
