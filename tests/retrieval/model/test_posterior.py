@@ -277,7 +277,7 @@ def test_it_is_written_and_read_back():
     ],
 )
 def test_forged_numbers_are_refused(change):
-    with pytest.raises(BadInput, match=r"posterior(\.\w+ (must be|is not)| has no setting)"):
+    with pytest.raises(BadInput, match=r"posterior(\.\w+ (must be|must fit|is not)| has no setting)"):
         Posterior.from_dict(ADDING.to_dict() | change)
 
 
