@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from benchmarks.common import Line, duration
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.readings import Pose
 from robot.rig import load_rig
 from robot.sim.pinch import Grip

@@ -23,7 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.readings import Pose
 from robot.rig import load_rig
 from robot.sim.camera import PinholeCamera

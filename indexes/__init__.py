@@ -15,6 +15,7 @@ Importing this package needs only numpy; FAISS is imported when one of its kinds
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from _touch_retrieval.registry import Registry
@@ -62,6 +63,25 @@ def load_kind(name: str) -> "type[VectorIndex]":
     return kind
 
 
+def open(folder: str | Path, *, verify: bool = True) -> "Generation":
+    """Return the current generation of an index folder, ready to be searched.
+
+    Args:
+        folder: The index folder, as `retrieve build-index` writes it.
+        verify: Compare the SHA-256 of every file with the manifest's.
+
+    Raises:
+        IndexesError: There is no index, it is damaged, or its format is another one.
+
+    >>> generation = indexes.open("index")
+    >>> generation.count, generation.manifest.kind
+    (4, 'flat')
+    """
+    from indexes.store.folder import IndexStore
+
+    return IndexStore(Path(folder)).open(verify=verify)
+
+
 _PLACES = {
     "Generation": "store.generation",
     "IndexStore": "store.folder",
@@ -71,7 +91,7 @@ _PLACES = {
 }
 """Public name -> its module in this package, imported when it is used."""
 
-__all__ = ["KINDS", "load_kind", *_PLACES]
+__all__ = ["KINDS", "load_kind", "open", *_PLACES]
 
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 

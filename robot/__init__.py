@@ -12,6 +12,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from robot.collection import CollectSettings as CollectSettings
+    from robot.collection import collect as collect
     from robot.devices import Arm as Arm
     from robot.devices import Camera as Camera
     from robot.devices import Gripper as Gripper
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "Arm": "devices",
     "Camera": "devices",
+    "CollectSettings": "collection",
     "Frame": "readings",
     "GraspPlan": "grasping.planner",
     "GraspPlanner": "grasping.planner",
@@ -51,6 +54,7 @@ _PLACES = {
     "Scene": "sim.scene",
     "Shared": "recording.folder",
     "TactileSensor": "devices",
+    "collect": "collection",
     "draw_object": "sim.objects.draw",
     "draw_sensor": "sim.gel.sensor",
     "load_importer": "importers",

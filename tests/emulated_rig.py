@@ -21,7 +21,7 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.devices import Arm, Camera
 from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.sawyer.driver import Sawyer

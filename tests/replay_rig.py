@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye

@@ -30,8 +30,7 @@ from pathlib import Path
 
 import numpy as np
 
-import robot.collect
-import robot.rig
+import robot
 from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
 from retrieval.methods.base import Setting
@@ -205,12 +204,12 @@ def tell_shipped(arguments: argparse.Namespace) -> int:
 
 def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:
     """Of the world that `make` collects, these objects."""
-    robot.collect.collect(
-        functools.partial(robot.rig.load_rig, str(RIG), seed=SEED_TRAINED),
+    robot.collect(
+        functools.partial(robot.load_rig, str(RIG), seed=SEED_TRAINED),
         recording,
         objects=names,
         seed=SEED_TRAINED,
-        settings=robot.collect.CollectSettings(grasps=grasps),
+        settings=robot.CollectSettings(grasps=grasps),
         jobs=jobs,
     )
     return load_grasps(recording)

@@ -40,7 +40,7 @@ from retrieval.model.posterior import JudgedTouches, Questions
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
 from retrieval.training.foreign import draw_foreign
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 from robot.sim.objects.draw import draw_object
 

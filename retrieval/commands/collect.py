@@ -50,8 +50,8 @@ def collect(
         return
     from functools import partial
 
-    from robot.collect import CollectSettings
-    from robot.collect import collect as collect_grasps
+    from robot.collection import CollectSettings
+    from robot.collection import collect as collect_grasps
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 

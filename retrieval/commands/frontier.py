@@ -78,7 +78,7 @@ def _recording(given: Path | None, out: Path, quick: bool) -> Path:
     if given is not None:
         return given
     from retrieval.console.progress import CountedBar
-    from robot.collect import CollectSettings, collect
+    from robot.collection import CollectSettings, collect
     from robot.rig import load_rig
 
     objects, grasps = (6, 2) if quick else (30, 4)

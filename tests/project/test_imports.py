@@ -132,7 +132,7 @@ HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "P
 
 
 def test_robot_imports_without_torch():
-    code = "import robot, robot.recording.folder, robot.importers, robot.importers.billets, robot.collect, robot.rig"
+    code = "import robot, robot.recording.folder, robot.importers, robot.importers.billets, robot.collection, robot.rig"
     done = run_blocked(code, ("torch", "faiss"))
     assert done.returncode == 0, done.stderr
 
@@ -204,7 +204,7 @@ def test_the_simulated_rig_without_numba_says_in_one_line_what_to_install(comman
 
 def test_the_collector_knows_the_contract_and_no_rig():
     """A rig is imported when it is asked for by name."""
-    code = "import sys, robot.collect, robot.rig; print([name for name in sys.modules if name.startswith('robot.sim')])"
+    code = "import sys, robot.collection, robot.rig; print([one for one in sys.modules if one.startswith('robot.sim')])"
     done = run_blocked(code, ("torch", "faiss", "scipy", "trimesh"))
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 

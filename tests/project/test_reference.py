@@ -91,7 +91,7 @@ def test_all_names_what_there_is_and_nothing_else_is_got():
 
 
 def test_a_public_name_is_no_module_of_its_package():
-    """`import robot.collect` would put the module in the name's place."""
+    """`import robot.collection` would put the module in the name's place."""
     for package in PACKAGES:
         modules = {path.stem for path in Path(package.__file__).parent.iterdir()}
         assert not modules & set(package.__all__), package

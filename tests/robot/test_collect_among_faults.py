@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.motion import Motions
 from robot.errors import DeviceError

@@ -11,13 +11,13 @@ from pathlib import Path
 import cv2
 import pytest
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, RobotError, StorageError
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.robot.recording.test_crash import Failing
-from tests.robot.test_collect import files
+from tests.robot.test_collection import files
 from tests.waiting import running, until
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +62,7 @@ def unsynced(monkeypatch):
 
 CHILD = """
 import functools, os, signal, sys
-from robot.collect import collect
+from robot.collection import collect
 from tests.fake_rig import FakeRig
 from tests.robot.test_collect_crash import NAMES, SETTINGS
 real, left = os.fsync, int(sys.argv[2])
@@ -183,7 +183,7 @@ def test_threads_are_limited_only_in_the_workers(tmp_path, monkeypatch):
 
 ENDLESS = """
 import functools, sys
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from tests.fake_rig import FakeRig
 if __name__ == "__main__":
     collect(functools.partial(FakeRig, 3), sys.argv[1], objects=10**4, seed=3, settings=CollectSettings(44), jobs=2)

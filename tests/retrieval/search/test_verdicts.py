@@ -14,7 +14,7 @@ from retrieval.model.stored import read_stored
 from retrieval.search.defaults import SHIPPED, shipped_model
 from retrieval.search.query.answer import EXIT_CODES, in_words
 from retrieval.search.query.searcher import Searcher
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 
 SEED = 41_000  # a world of its own

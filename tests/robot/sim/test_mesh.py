@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.errors import RecordingError, RobotConfigError, SceneError, UnknownName
 from robot.rig import load_rig
 from robot.sim.objects.mesh import Mesh

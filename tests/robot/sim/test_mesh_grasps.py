@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.errors import RobotConfigError, UngraspableError
 from robot.grasping.attempt import Attempter
 from robot.grasping.settings import GraspSettings

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collect import CollectSettings, collect
+from robot.collection import CollectSettings, collect
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import load_rig

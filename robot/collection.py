@@ -47,9 +47,12 @@ _TOUCH = re.compile(r"touch_([a-z])")
 
 @dataclass(frozen=True)
 class CollectSettings:
-    """What is wanted of each object: so many accepted grasps, in at most so many attempts (None: 4 a grasp and 10).
+    """Accepted grasps of each object, and the most attempts (None: 4 a grasp and 10).
 
     attempt: how they are made (None: as the rig has it).
+
+    >>> robot.CollectSettings(grasps=2).limit
+    18
     """
 
     grasps: int = 44
@@ -102,13 +105,34 @@ def collect(
     jobs: int = 1,
     progress: Callable[[Progress], None] | None = None,
 ) -> list[Tally]:
-    """Collect into the folder `out`, or go on with what is there; returns what came of every object.
+    """Collect grasps into a recording, or go on with the one that is there.
 
-    make_rig builds the rig; it is called once, and with jobs > 1 in every process too. objects: names, or how many of
-    the rig's. gate: see robot.grasping.gates; gate_name says which one it is, for it must be the same when a collection
-    goes on. Raises RobotConfigError, RecordingError (the folder holds something else, or was collected otherwise),
-    DeviceError (a device failed too often), StorageError; what was recorded before is whole, and the rig is closed with
-    its jaws open, unless the error says that they could not be opened. KeyboardInterrupt likewise.
+    Args:
+        make_rig: Builds the rig. It is called once, and with jobs > 1 in every process too.
+        out: Folder of the recording.
+        objects: Names, or how many of the rig's objects.
+        seed: Of the planner's and the rig's random choices.
+        settings: How many grasps of each object, in how many attempts.
+        gate: Decides which grasps are accepted (`robot.grasping.gates`).
+        gate_name: Which gate it is; it must be the same when a collection goes on.
+        jobs: Processes, each with a rig of its own.
+        progress: Called after each attempt.
+
+    Returns:
+        What came of every object.
+
+    Raises:
+        RobotConfigError: An argument is out of range.
+        RecordingError: The folder holds something else, or was collected otherwise.
+        DeviceError: A device failed too often.
+        StorageError: The disk refused.
+        What was recorded before is whole, and the rig is closed with its jaws open, unless the error says that they
+        could not be opened. After Ctrl-C, too.
+
+    >>> import functools
+    >>> rig, settings = functools.partial(robot.load_rig, "sim", seed=3), robot.CollectSettings(grasps=1)
+    >>> [tally.accepted for tally in robot.collect(rig, "collected", objects=2, seed=3, settings=settings)]
+    [1, 1]
     """
     settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
     rig = make_rig()

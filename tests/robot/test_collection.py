@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collect import CollectSettings, Progress, RecordedTouches, collect, name_of
+from robot.collection import CollectSettings, Progress, RecordedTouches, collect, name_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import Attempter, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
