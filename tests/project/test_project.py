@@ -48,6 +48,11 @@ def test_only_our_packages_are_installed():
     }
 
 
+def test_every_folder_of_modules_is_a_package_and_thus_installed():
+    folders = {path.parent for name in ("retrieval", "robot", "indexes") for path in (ROOT / name).rglob("*.py")}
+    assert [folder for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
+
+
 def test_what_stands_beside_the_tests_is_told():
     there = {
         path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
