@@ -84,6 +84,17 @@ def test_a_package_outside_the_repository_trains_evaluates_builds_and_answers(wo
 
 
 @pytest.mark.slow
+def test_the_program_of_two_steps_prints_its_method_and_the_weight_of_its_loss(workplace):
+    folder = workplace / "alone"
+    shutil.copytree(workplace / "made", folder / "tiny")
+    shutil.copy(workplace / "try_parts.py", folder)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_STATE_HOME": str(workplace)}
+    code, said, error = run([sys.executable, "try_parts.py"], folder, environment)
+    assert code == 0, error
+    assert [line.split()[0] for line in said.splitlines()] == ["late_fusion", "__main__:Brightness", "chance", "0.5"]
+
+
+@pytest.mark.slow
 def test_the_driver_of_the_package_is_read_by_its_table(workplace, installed):
     (table,) = (tomllib.loads(block)["sensors"]["a"] for block in blocks("toml", PAGE) if "[sensors.a]" in block)
     code = f"""
