@@ -38,8 +38,9 @@ ours = ("retrieval.commands.main", "retrieval.search.query.searcher")
 for name in ("numpy", "PIL.Image", *ours, backend, "indexes.kinds.flat"):
     step("import " + name, lambda: import_module(name))
 from pathlib import Path
+import retrieval.search.query.opening as opening
 import retrieval.search.query.searcher as search
-generation = step("open the index", lambda: search.IndexStore(index).open(threads=1))
+generation = step("open the index", lambda: opening.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
 encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))
 judge = step("read the head", lambda: search.read_judge(Path(model)))

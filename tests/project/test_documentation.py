@@ -23,6 +23,7 @@ from robot.rig import load_rig
 from tests import real_data_sets, serving, synthetic
 from tests.documents import PAGES, README, ROOT, RUN_TOGETHER, blocks, text_of
 from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.miniatures import physiclear
 from tests.project.test_project import pins
 from tests.replay_rig import replay_file
 from tests.retrieval.commands.test_rig import POINTS
@@ -78,6 +79,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
     real_data_sets.write_billets(tmp_path / "data" / "billets")
+    physiclear.write(tmp_path / "data" / "physiclear")
     (tmp_path / "benchmarks" / "models").mkdir(parents=True)
     shutil.copy(ROOT / "benchmarks" / "models" / "shipped_rig.toml", tmp_path / "benchmarks" / "models")
     (tmp_path / "points.csv").write_text(POINTS)

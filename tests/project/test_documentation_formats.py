@@ -15,6 +15,7 @@ from retrieval.serve.store import Store
 from robot.recording.folder import RecordingWriter, read_recording
 from tests import real_data_sets
 from tests.documents import ROOT, text_of
+from tests.miniatures import physiclear
 
 PAGE = ROOT / "docs" / "formats.md"
 
@@ -89,7 +90,8 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
 @pytest.mark.slow
 def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     real_data_sets.write_billets(tmp_path / "billets")
-    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,rct"]
+    physiclear.write(tmp_path / "physiclear")
+    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,physiclear,rct"]
     assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     check(9, results)
@@ -99,9 +101,9 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     row, control = entry["rows"]["cca_pca"], entry["controls"]["dealt"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     said = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
-    assert {*row, *row["verdict"], *row["differences"]["pair_auc"]} == set(re.findall(r"`(\w+)`", said["rows"])) - {
-        "rows"
-    }
+    touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
+    keys = {*row, *row["verdict"], *row["differences"]["pair_auc"], *touch_to_touch}
+    assert keys == set(re.findall(r"`(\w+)`", said["rows"])) - {"rows"}
     assert set(control) == set(re.findall(r"`(\w+)`", said["controls"])) - {"controls"}
 
 

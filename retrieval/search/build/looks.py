@@ -20,7 +20,7 @@ from _touch_retrieval.files import encoded
 from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
 from indexes.store.rows import key_of, keys_of
-from indexes.store.stat_cache import SETTLED_NS, STATUS, Statuses, StatRecords
+from indexes.store.stat_cache import SETTLED_NS, STATUS, StatRecords, Statuses
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
 from retrieval.data.sources import Fetched
 

@@ -252,7 +252,9 @@ def all_judged(photos: int, asked: SearchRequirements) -> dict[str, Any]:
     return {"k": photos, "winner_recall": 1.0, "queries": 0, "asked": asdict(asked), "photos": photos, "changed": 0}
 
 
-def carried_over(previous: Mapping[str, Any] | None, asked: SearchRequirements, photos: int, changed: int) -> dict[str, Any] | None:
+def carried_over(
+    previous: Mapping[str, Any] | None, asked: SearchRequirements, photos: int, changed: int
+) -> dict[str, Any] | None:
     """The record of what was measured before, brought up to date, where the same was asked for and too few of `photos`
     have changed since to measure again; else None. changed: how many photos this build changed."""
     if not previous or not previous.get("queries") or previous["asked"] != asdict(asked):
