@@ -1,8 +1,5 @@
 """Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
 
-import hashlib
-import inspect
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +18,9 @@ from retrieval.methods.late_fusion import LateFusion
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
+from retrieval.model.losses import LOSSES
 from retrieval.training.features import Features
+from retrieval.training.state import code_of
 from retrieval.version import __version__
 
 
@@ -68,6 +67,7 @@ class Experiment:
 
     def made_by(self, name: str, seed: int) -> dict[str, Any]:
         """Return everything that decides the predictions of a method, in JSON types."""
+        losses = [LOSSES.load(loss) for loss, weight in self.config.training.weights.items() if weight > 0]
         return {
             "method": name,
             "seed": seed,
@@ -80,7 +80,7 @@ class Experiment:
             "shuffled": self.shuffled,
             "all_teach": self.all_teach,
             "software": __version__,
-            **code_of(METHODS.load(name)),
+            **code_of(METHODS.load(name), *losses),
         }
 
     def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
@@ -104,14 +104,3 @@ def _shuffled(features: Features, seed: int) -> Features:
     """Every touch with a grasp drawn at random; photos stay where they are."""
     order = np.random.default_rng([seed, 13]).permutation(len(features))
     return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)
-
-
-def code_of(method: type[Method]) -> dict[str, str]:
-    """Return what predictions say of code that is not this project's, so that a method edited in between is fitted
-    anew: the SHA-256 of its module's source, or of the class where it was written in a notebook; nothing for our
-    own."""
-    if method.__module__.startswith("retrieval."):
-        return {}
-    module = sys.modules[method.__module__]
-    source = inspect.getsource(module if getattr(module, "__file__", None) else method)
-    return {"code": hashlib.sha256(source.encode()).hexdigest()}

@@ -1,6 +1,9 @@
 """The state of an unfinished training, next to its output: weights, optimiser, step, and what must not change."""
 
+import hashlib
+import inspect
 import json
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +104,22 @@ def load_state(
     return header
 
 
+def code_of(*classes: type) -> dict[str, str]:
+    """Return {"code": SHA-256} of the source of classes that are not this project's; {} where all are ours.
+
+    An edited loss or method is then fitted again. The source is that of the module, or of a class in a notebook.
+    """
+    sources = []
+    for each in classes:
+        if not each.__module__.startswith("retrieval."):
+            module = sys.modules[each.__module__]
+            try:
+                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
+            except (OSError, TypeError):  # typed into an interpreter, which keeps no source
+                sources.append(each.__qualname__)
+    return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}
+
+
 def unfinished(done: Path) -> Path:
     """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
     return done.parent / "unfinished" / done.name
@@ -117,10 +136,10 @@ def finish(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
     Raises:
         Interrupted: After Ctrl-C; the next call resumes.
     """
-    mine = (trainer.config, trainer.split, trainer.data_digest)
+    mine = (trainer.config, trainer.split, trainer.data_digest, trainer.code.get("code"))
     if done.is_file():
         kept = load_checkpoint(done)
-        if (kept.config, kept.split, kept.provenance.get("data_digest")) == mine:
+        if (kept.config, kept.split, *map(kept.provenance.get, ("data_digest", "code"))) == mine:
             return kept
     if state_path(trainer.out).is_file():
         try:

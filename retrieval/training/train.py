@@ -46,6 +46,7 @@ from retrieval.model.checkpoint import (
 from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
+from retrieval.model.towers.base import Tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
@@ -55,7 +56,7 @@ from retrieval.training.features import Features, by_image
 from retrieval.training.fit import Plan, fit
 from retrieval.training.judgement import with_verdicts
 from retrieval.training.loading import ahead, worker_count
-from retrieval.training.state import load_state, require_fresh, save_state, state_path
+from retrieval.training.state import code_of, load_state, require_fresh, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 
 
@@ -146,6 +147,8 @@ class Trainer:
         self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
+        towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
+        self.code = code_of(*map(type, (*self.losses.terms, *towers)))
         trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
@@ -297,6 +300,7 @@ class Trainer:
             "source": self.source,
             "data_digest": self.data_digest,
             "metrics": metrics,
+            **self.code,
         }
         save_checkpoint(
             self.out,
@@ -312,6 +316,7 @@ class Trainer:
             "config": self.config.to_dict(),
             "split": self.split.to_dict(),
             "data_digest": self.data_digest,
+            **self.code,
         }
 
     def _save_state(self) -> None:

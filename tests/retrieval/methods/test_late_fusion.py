@@ -122,6 +122,28 @@ def test_another_setting_or_other_features_are_trained_anew(parts, tmp_path):
     assert fit(LateFusion, (moved, *parts[1:]), tmp_path).chosen != first.chosen
 
 
+LOSS = """
+import retrieval
+
+class Own(retrieval.Loss):
+    def forward(self, batch):
+        return batch.touch.embedding.square().mean()
+"""
+
+
+def test_a_loss_of_ones_own_that_was_edited_is_trained_with_anew(parts, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    module = tmp_path / "edited_loss.py"
+    module.write_text(LOSS)
+    config = FROZEN.using(losses={"contrastive": 1.0, "edited_loss:Own": 0.5})
+    trained, run = [], Trainer.run
+    monkeypatch.setattr(Trainer, "run", lambda trainer, quiet: trained.append(trainer.step) or run(trainer, quiet))
+    for text, times in ((LOSS, 1), (LOSS, 1), (LOSS + "# edited\n", 2), (LOSS + "# edited\n", 2)):
+        module.write_text(text)
+        fit(LateFusion, parts, tmp_path, config)
+        assert len(trained) == times
+
+
 def stopped(parts, folder, monkeypatch, config=FROZEN):
     """A fit that a power cut ends in its fourth step, after the state of the third is on disk."""
     loss = Trainer.loss
