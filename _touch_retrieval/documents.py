@@ -43,7 +43,7 @@ def typed(
         error: What to raise instead of ValueError.
 
     Raises:
-        ValueError: Says which value must be what, and what it is.
+        ValueError: A value does not fit. The message names it, what it must be and what it is.
 
     >>> typed({"low": 1, "high": 2}, dict[str, float])
     {'low': 1.0, 'high': 2.0}
@@ -66,14 +66,14 @@ def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) 
 
     Args:
         instance: A frozen dataclass.
-        name: What messages call it.
+        name: What messages call it; empty: they name the field alone.
         error: What to raise instead of ValueError.
 
     Raises:
         ValueError: As `typed` does.
     """
     for field, hint in _hints(instance.__class__).items():
-        value = typed(getattr(instance, field), hint, f"{name}.{field}", error=error)
+        value = typed(getattr(instance, field), hint, f"{name}.{field}" if name else field, error=error)
         object.__setattr__(instance, field, value)
 
 

@@ -25,9 +25,9 @@ import numpy as np
 from benchmarks.common import Line, as_text, in_turns
 from benchmarks.training import matching
 from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.loading import in_order, worker_count
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, load_config
-from retrieval.training.loading import in_order, worker_count
 from robot.recording.folder import RecordingWriter
 
 REPETITIONS, MAX_IMAGES, STEPS = 5, 32, 2
@@ -81,7 +81,7 @@ def _all(pool: Executor, settings: Preprocessing, files: Sequence[tuple[bool, tu
 
 
 def lines(recording: Path, config: Config, counts: Sequence[int]) -> Iterator[Line]:
-    """What is printed."""
+    """Measure the loader and the towers, and give the lines to print."""
     rates, found = decoding(load_grasps(recording), config, counts)
     yield from found
     if config.training.freeze_towers:

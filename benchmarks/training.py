@@ -36,13 +36,13 @@ from benchmarks.common import Line, as_text, config_of, duration, in_turns
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import ImageCache, load_grasps, make_split
 from retrieval.data.labelled import load_labelled
+from retrieval.data.loading import ahead
 from retrieval.model.config import PRECISIONS, Config, load_config
 from retrieval.model.encode import has_fast_bfloat16
 from retrieval.model.towers import TOWERS
 from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
 from retrieval.training.fit import Plan, fit
-from retrieval.training.loading import ahead
 from retrieval.training.relief import ReliefTraining
 from retrieval.training.train import Trainer
 from tests import synthetic

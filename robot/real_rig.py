@@ -51,6 +51,7 @@ from typing import Any
 
 import numpy as np
 
+from _touch_retrieval.documents import typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
@@ -59,7 +60,7 @@ from robot.grasping.planner import load_planner
 from robot.grasping.settings import AttemptSettings, GraspSettings, attempt_of
 from robot.readings import Region
 from robot.rig import Rig, ask_on_terminal
-from robot.settings import TypedSettings, build, build_named, checked, limited
+from robot.settings import TypedSettings, build, build_named, limited
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
@@ -206,8 +207,8 @@ def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
     file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", HAND_EYE_DAYS)
-    checked("[camera]: hand_eye", str | None, file)
-    checked("[camera]: hand_eye_days", float, days)
+    typed(file, str | None, "[camera]: hand_eye", error=RobotConfigError)  # type: ignore[arg-type]  # mypy: a union
+    typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
     extrinsics = np.eye(4) if file is None else hand_eye.load(Path(file), max_age_days=days).rigid
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:

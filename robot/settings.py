@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, TypeVar
 
-from _touch_retrieval.documents import typed
+from _touch_retrieval.documents import check_fields, typed
 from _touch_retrieval.registry import Registry
 from robot.errors import RobotConfigError, UnknownName
 
@@ -29,11 +29,9 @@ class TypedSettings:
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError."""
-        hints = typing.get_type_hints(type(self))
+        check_fields(self, "", RobotConfigError)
         for each in fields(self):
-            value = checked(each.name, hints[each.name], getattr(self, each.name))
-            object.__setattr__(self, each.name, value)
-            if value is not None and "range" in each.metadata:
+            if (value := getattr(self, each.name)) is not None and "range" in each.metadata:
                 check_range(each.name, value, *each.metadata["range"])
 
 
@@ -53,8 +51,10 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
     if missing := sorted(required - set(settings)):
         raise RobotConfigError(f"{where or cls.__name__} must say {missing[0]!r}; it knows {known}")
     try:
-        typed_settings = {name: checked(name, keywords[name][0], value) for name, value in settings.items()}
-        return cls(**typed_settings, **{name: value for name, value in given.items() if name in taken})
+        checked = {
+            name: typed(value, keywords[name][0], name, error=RobotConfigError) for name, value in settings.items()
+        }
+        return cls(**checked, **{name: value for name, value in given.items() if name in taken})
     except RobotConfigError as error:
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
 
@@ -101,14 +101,6 @@ def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
                 if parameter.kind is not parameter.VAR_KEYWORD:
                     found[name] = hints.get(name, Any), parameter.default is parameter.empty
     return found
-
-
-def checked(name: str, hint: Any, value: object) -> Any:
-    """Return a plain value as one of the annotated type, as `typed` converts it. Raises RobotConfigError."""
-    try:
-        return typed(value, hint, name)
-    except ValueError as error:
-        raise RobotConfigError(str(error)) from error
 
 
 def check_range(name: str, value: float, least: float, most: float, unit: str = "") -> None:

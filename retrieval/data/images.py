@@ -273,6 +273,13 @@ def _rgb(image: Image.Image) -> npt.NDArray[np.uint8]:
     return rgb
 
 
+def encode_image(pixels: npt.NDArray[np.uint8], ending: str = ".png") -> bytes:
+    """Return pixels (H, W, 3), red first, as the content of a file, of the kind that `ending` names."""
+    import cv2
+
+    return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1])
+
+
 def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
     """Decode 16-bit samples with OpenCV, which gives blue first and neither inverts nor un-premultiplies."""
     import cv2

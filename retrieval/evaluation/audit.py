@@ -18,7 +18,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.check.copies import PictureSet, Thumbnail, look_at
 from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Grasp, Split, finger_count
-from retrieval.training.loading import worker_pool
+from retrieval.data.loading import worker_pool
 
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
 UNIT = "1 less the correlation of shapes (0: a copy; about 1: unlike pictures)"

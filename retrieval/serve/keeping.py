@@ -14,10 +14,9 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 
-from retrieval.data.images import decode
+from retrieval.data.images import decode, encode_image
 from retrieval.errors import RetrievalError
 from retrieval.model.judge import CONTACT
 from retrieval.serve.errors import Problem
@@ -101,8 +100,8 @@ def recordable(data: bytes) -> bytes:
     if data.startswith(_RECORDABLE):
         return data
     samples = decode(data, "a picture")
-    pixels = samples if samples.dtype == np.uint8 else np.rint(255 * samples).astype(np.uint8)
-    return bytes(cv2.imencode(".png", pixels[..., ::-1])[1].tobytes())
+    pixels = samples if samples.dtype == np.uint8 else np.rint(255 * samples)
+    return encode_image(pixels.astype(np.uint8, copy=False))
 
 
 class Keeping:

@@ -11,13 +11,13 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, cast
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from indexes.errors import IndexesError
 from indexes.store.cluster import is_cluster, read_cluster
 from indexes.store.folder import IndexStore
+from retrieval.data.images import encode_image
 from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
 from retrieval.search.query.objects import listed_photo
@@ -46,7 +46,7 @@ def of_rig(spec: str, index: str | Path) -> LiveRig:
 
     def picture(sensor: TactileSensor, lock: Lock) -> bytes:
         with lock:
-            return _encoded(".jpg", sensor.read().pixels)
+            return encode_image(sensor.read().pixels, ".jpg")
 
     return LiveRig({name: partial(picture, sensor, Lock()) for name, sensor in rig.sensors.items()})
 
@@ -94,8 +94,8 @@ class _Jaws:
                 if felt:
                     fingers = sorted(self._rig.sensors)
                     self._gels = {finger: felt[f"touch_{finger}"] for finger in fingers}
-                    before = [_encoded(".png", felt[f"touch_{finger}_before"]) for finger in fingers]
-                    return Grasped(name, [_encoded(".png", self._gels[finger]) for finger in fingers], before)
+                    before = [encode_image(felt[f"touch_{finger}_before"]) for finger in fingers]
+                    return Grasped(name, [encode_image(self._gels[finger]) for finger in fingers], before)
         raise BadInput(f"{_TRIES} times the jaws closed on air; try again")
 
     def picture(self, finger: str) -> bytes:
@@ -104,14 +104,10 @@ class _Jaws:
             if finger not in self._gels:
                 self._rig.prepare(self._rig.object_ids(1)[0], 0)
                 self._gels[finger] = self._rig.world.now().image(f"touch_{finger}_before")
-            return _encoded(".jpg", self._gels[finger])
+            return encode_image(self._gels[finger], ".jpg")
 
 
 def _simulated(rig: "SimRig") -> LiveRig:
     jaws = _Jaws(rig)
     sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
     return LiveRig(sensors, jaws.grasp)
-
-
-def _encoded(ending: str, pixels: npt.NDArray[np.uint8]) -> bytes:
-    return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes())

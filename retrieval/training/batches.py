@@ -14,13 +14,13 @@ from torch import Tensor
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, ImageCache, PairBatch
+from retrieval.data.loading import Timed, in_order, worker_count, worker_pool
 from retrieval.errors import DatasetError, Interrupted
 from retrieval.model.config import Config
 from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
 from retrieval.training.kept import KeptImages
-from retrieval.training.loading import Timed, in_order, worker_count, worker_pool
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Loaded:
 
 
 class BatchImages:
-    """Loads the images of batches on worker threads (`retrieval.training.loading`), some batches ahead.
+    """Loads the images of batches on worker threads (`retrieval.data.loading`), some batches ahead.
 
     No result depends on the settings of the loader (`TrainingConfig.workers`, `prefetch`, `pinned_memory`).
     """

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
+from retrieval.data.loading import in_order, worker_pool
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
@@ -29,7 +30,6 @@ from retrieval.model.encode import batches, default_device, photo_features, touc
 from retrieval.model.fusion import Matcher
 from retrieval.training.batches import BatchImages
 from retrieval.training.kept import Files, part_path
-from retrieval.training.loading import in_order, worker_pool
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

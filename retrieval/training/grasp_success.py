@@ -30,6 +30,7 @@ from torch import Tensor
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Attempt, ImageCache, Split, data_digest, load_attempts, make_split, recording_source
+from retrieval.data.loading import worker_pool
 from retrieval.errors import ConfigError, DatasetError
 from retrieval.metrics.guesses import grouped_interval
 from retrieval.metrics.intervals import FEW_OBJECTS
@@ -39,7 +40,6 @@ from retrieval.model.losses.match import match_loss
 from retrieval.training.fit import Plan, fit
 from retrieval.training.gate import TASK, Gate, GateSettings, GraspNet
 from retrieval.training.gate import load_gate as load_gate
-from retrieval.training.loading import worker_pool
 
 BATCH = 32
 LEARNING_RATE = 3e-3  # and halved after each quarter of the steps, as by the authors

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from _touch_retrieval.files import file_digest, naming, open_regular, replacing
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
+from retrieval.data.loading import in_order, worker_pool
 from retrieval.errors import BadInput, DatasetError
 from retrieval.model.encode import batches, default_device
 from retrieval.training import distributed
-from retrieval.training.loading import in_order, worker_pool
 
 log = logging.getLogger(__name__)
 _PART, _FORMAT = 128, 1
@@ -40,7 +40,7 @@ class KeptImages:
     """`load(*files)`, for images that were kept without decoding anything.
 
     load: gives images of one shape and type. kind: begins the names of the parts. seen_by: what decides what `load`
-    gives beside the files, as a digest. workers: as `retrieval.training.loading.worker_count` takes it.
+    gives beside the files, as a digest. workers: as `retrieval.data.loading.worker_count` takes it.
     """
 
     def __init__(

@@ -23,6 +23,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import ImageCache
 from retrieval.data.images import to_float
 from retrieval.data.labelled import FAMILIES, SIZES, LabelledPicture, labels_digest, load_labelled
+from retrieval.data.loading import ahead, worker_pool
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError, DatasetError, Interrupted
 from retrieval.model.checkpoint import require_writable, write_tensors
@@ -32,7 +33,6 @@ from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.fit import Plan, fit
 from retrieval.training.kept import KeptImages
-from retrieval.training.loading import ahead, worker_pool
 from retrieval.training.state import load_state, require_fresh, save_state, state_path
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4

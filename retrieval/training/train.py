@@ -34,6 +34,7 @@ from retrieval.data.dataset import (
     recording_source,
 )
 from retrieval.data.labelled import pair_by_label
+from retrieval.data.loading import ahead, worker_count
 from retrieval.errors import CheckpointError, ConfigError, Interrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
@@ -55,7 +56,6 @@ from retrieval.training.distil import add_pruner
 from retrieval.training.features import Features, by_image
 from retrieval.training.fit import Plan, fit
 from retrieval.training.judgement import with_verdicts
-from retrieval.training.loading import ahead, worker_count
 from retrieval.training.state import code_of, load_state, require_fresh, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 

@@ -40,6 +40,7 @@ _ENDS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
 _DIGITS = re.compile(r"[0-9]{1,4000}")
 _TAIL = 65536
 """Bytes after the end of a JPEG that a camera may have put there."""
+_MAX_VIDEO_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -302,3 +303,11 @@ def library(name: str, what: str) -> Any:
         raise ImporterError(
             f"{what} needs {name}, which is missing; run pip install 'touch-retrieval[importers]'"
         ) from error
+
+
+def video_stream(film: Any) -> Any:
+    """Return the video stream of a film that PyAV opened. Raises ImporterError for too many pixels."""
+    stream = film.streams.video[0]
+    if stream.codec_context.width * stream.codec_context.height > _MAX_VIDEO_PIXELS:
+        raise ImporterError(f"its video has more than {_MAX_VIDEO_PIXELS} pixels")
+    return stream

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of
+from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of, video_stream
 from robot.importers.episodes import ENDINGS, Episode, Picture, Step
 from robot.recording.folder import Recording
 from robot.storage import decoded, document_of
@@ -54,7 +54,6 @@ _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 _MOMENTS = tuple(ENDINGS)
 _WHAT = "a LeRobot data set"
-_MOST_PIXELS = 50_000_000
 
 _Row = dict[str, Any]
 
@@ -222,9 +221,7 @@ class _Source:
         end = start + (row["length"] - 0.5) / self._fps
         try:
             film = self._film(key, path)
-            stream = film.streams.video[0]
-            if stream.codec_context.width * stream.codec_context.height > _MOST_PIXELS:
-                raise ImporterError(f"its video has more than {_MOST_PIXELS} pixels")
+            stream = video_stream(film)
             film.seek(int(start / stream.time_base), stream=stream)
             for frame in film.decode(stream):
                 if frame.time is not None and frame.time >= start - 0.5 / self._fps:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, import_items, library, name_of, numbered
+from robot.importers.base import DataSet, Item, Progress, Skip, import_items, library, name_of, numbered, video_stream
 from robot.recording.folder import Recording, Shared
 
 DATA_SET = DataSet(
@@ -40,7 +40,6 @@ DATA_SET = DataSet(
     unverified=("that the first frame of every video is without contact",),
 )
 _VIDEO = re.compile(r"(?P<part>.+)_(\d{1,9})\.mov", re.IGNORECASE)
-_MAX_PIXELS = 50_000_000
 _WHAT = "a video"
 
 Frame = NDArray[np.uint8]
@@ -113,10 +112,7 @@ class Press:
         av = library("av", _WHAT)
         try:
             with av.open(str(self._path)) as film:
-                stream = film.streams.video[0]
-                if stream.codec_context.width * stream.codec_context.height > _MAX_PIXELS:
-                    raise ImporterError(f"its video has more than {_MAX_PIXELS} pixels")
-                for frame in film.decode(stream):
+                for frame in film.decode(video_stream(film)):
                     yield frame.to_ndarray(format="rgb24")
         except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
             raise ImporterError("its video cannot be decoded") from error

@@ -17,14 +17,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
-from retrieval.data.images import read_rgb
+from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
 from retrieval.evaluation.real.lines import CONTROLS, Row, Towers, clock, why_not_untouched
 from retrieval.evaluation.real.protocol import TOUCHES, Facts, Protocol
@@ -175,8 +174,7 @@ def _moved(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np
 
 def _png(image: NDArray[np.float32]) -> bytes:
     """(H, W, 3) in 0..1, red first, as the content of a PNG file."""
-    pixels = np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)
-    return bytes(cv2.imencode(".png", pixels[..., ::-1])[1])
+    return encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,9 @@ Each thread takes a whole batch from its files to its codes and computes alone. 
 the towers, PyTorch's default, waits for its members whose core is decoding a file.
 """
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from indexes.store.tables import Block, Layouts
 from indexes.store.unfinished import Unfinished
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, Photos, decode_photo, read_photo
+from retrieval.data.loading import in_order
 from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import NoPhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
@@ -293,15 +294,9 @@ def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: 
 
     Waiting items are dropped when the reader stops or an item fails; running ones are waited for.
     """
-    waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) >= window:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        yield from in_order(pool, function, items, window - 1)
     finally:
         pool.shutdown(cancel_futures=True)
 

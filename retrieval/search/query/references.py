@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import typed
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from retrieval.data.storage import is_inside
@@ -42,8 +43,6 @@ class References:
 
     def __init__(self, generation: Generation, objects: Objects, hidden: int) -> None:
         """hidden: numbers of a half before its embedding. Raises CorruptIndex."""
-        from _touch_retrieval.documents import typed  # slow to import, and most indexes have no references
-
         where, documents = generation.folder, generation.documents
         try:
             listed = typed(documents[ROWS], _Listed)

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.data.loading import ahead, in_order, worker_count
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, load_config
 from retrieval.training.batches import TrainedFeatures
-from retrieval.training.loading import ahead, in_order, worker_count
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import same_weights, trainer_for, with_training
 
